@@ -1,0 +1,35 @@
+"""The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12)."""
+
+from heli_jax.naming import Scalar
+from heli_jax.vehicle import Helicopter
+
+
+def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
+    r"""Cyclic pitch of the blades [rad], eq. 11.
+
+    $$\theta_{cyc} L_1 = \frac{L_3}{L_2+L_3} x_{cyc} + \frac{L_2 L_4}{L_2+L_3} \beta$$
+
+    `x_cyc` is the cyclic input displacement [m], `beta` the flybar's flapping angle [rad].
+    """
+    return (p.L3 * x_cyc + p.L2 * p.L4 * beta) / (p.L1 * (p.L2 + p.L3))
+
+
+def flapping_rate_gain(p: Helicopter) -> Scalar:
+    r"""$k_1 = \rho \Omega^2 a c (R_2^4 - R_1^4) / (8 I_f)$ [1/s^2]: eq. 12 divided by If."""
+    return p.rho * p.Omega**2 * p.a * p.c * (p.R2**4 - p.R1**4) / (8.0 * p.If)
+
+
+def flapping_acceleration(
+    p: Helicopter, x_cyc: Scalar, beta: Scalar, dbeta: Scalar, omega: Scalar
+) -> Scalar:
+    r"""Flapping acceleration of the flybar [rad/s^2], eq. 12.
+
+    $$I_f \ddot\beta + \Omega^2 I_f \beta = \tfrac18 \rho \Omega^2 a c
+      \left(\frac{x_{cyc}}{L_5} - \frac{\dot\beta + \omega}{\Omega}\right)(R_2^4 - R_1^4)$$
+
+    `omega` is the body's rate about the same axis [rad/s]. The paper's text prints
+    $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the denominator of eq. 23.
+    """
+    return (
+        flapping_rate_gain(p) * (x_cyc / p.L5 - (dbeta + omega) / p.Omega) - p.Omega**2 * beta
+    )

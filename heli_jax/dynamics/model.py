@@ -1,0 +1,70 @@
+"""Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heli_jax import naming
+
+
+class Model(eqx.Module):
+    r"""Pure dynamics $\dot x = f(p, x, u)$, $y = h(p, x, u)$ of one machine, with named parts.
+
+    `Params`, `State`, `Inputs` and `Outputs` are classes built by keyword with one scalar a field
+    (an `eqx.Module` or a `NamedTuple`; see `heli_jax.naming` for units). `vector_field` returns a
+    `State` of derivatives per second. Nothing here knows about batches: use `jax.vmap`.
+
+    `linear=True` says that `vector_field` and `output` are linear in (state, inputs) and vanish
+    where both do; the exact zero-order-hold discretisation may then be used, with matrices taken
+    by differentiation.
+    """
+
+    name: str = eqx.field(static=True)
+    vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
+    output: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
+    Params: type = eqx.field(static=True)
+    State: type = eqx.field(static=True)
+    Inputs: type = eqx.field(static=True)
+    Outputs: type = eqx.field(static=True)
+    linear: bool = eqx.field(static=True, default=False)
+    start: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+
+    def initial_state(self, params: Any) -> Any:
+        """The state at the first sample: `start(params)`, or all zeros."""
+        if self.start is not None:
+            return self.start(params)
+        return zeros(self.State)
+
+
+def zeros(record: type, dtype: Any = None) -> Any:
+    """A record of scalar zeros of the default float type (or `dtype`)."""
+    dtype = jnp.result_type(float) if dtype is None else dtype
+    return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
+
+
+def linear_misfit(model: Model, params: Any) -> float:
+    """How far a model is from `linear=True`: 0 where f(x, u) and h(x, u) are linear, else ~1.
+
+    Compares f and h at two states with the sum of both, relative to their size. Concrete
+    parameters only.
+    """
+    key = jax.random.key(7)
+
+    def draw(record: type, key: Any) -> Any:
+        values = jax.random.normal(key, (len(naming.names(record)),))
+        return record(**dict(zip(naming.names(record), values, strict=True)))
+
+    def both(state: Any, inputs: Any) -> Any:
+        parts = model.vector_field(params, state, inputs), model.output(params, state, inputs)
+        return jnp.stack([jnp.asarray(v, jnp.result_type(float)) for v in jax.tree.leaves(parts)])
+
+    keys = jax.random.split(key, 4)
+    x1, x2 = draw(model.State, keys[0]), draw(model.State, keys[1])
+    u1, u2 = draw(model.Inputs, keys[2]), draw(model.Inputs, keys[3])
+    summed = both(jax.tree.map(jnp.add, x1, x2), jax.tree.map(jnp.add, u1, u2))
+    parts = both(x1, u1) + both(x2, u2)
+    size = jnp.max(jnp.abs(summed)) + jnp.max(jnp.abs(parts))
+    return float(jnp.max(jnp.abs(summed - parts)) / jnp.maximum(size, 1e-300))

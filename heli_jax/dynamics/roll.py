@@ -1,0 +1,218 @@
+"""The reduced model of one axis (eqs 21-22), its transfer function (eq. 23), and the stand.
+
+Roll and pitch share the functions; they differ in the inertia and in the names of the states.
+`Ixx` and `If` found with these equations are numbers of this model: see `cyclic_moment` and the
+README on where the paper and physics part.
+"""
+
+import functools
+from typing import Annotated, Any, NamedTuple
+
+from heli_jax import naming
+from heli_jax.dynamics.aerodynamics import cyclic_moment
+from heli_jax.dynamics.flybar import cyclic_pitch, flapping_acceleration, flapping_rate_gain
+from heli_jax.dynamics.model import Model
+from heli_jax.naming import Scalar
+from heli_jax.vehicle import Helicopter
+
+
+class RollState(NamedTuple):
+    phi: Annotated[Scalar, "rad", "roll angle"]
+    dphi: Annotated[Scalar, "rad/s", "roll rate"]
+    beta_roll: Annotated[Scalar, "rad", "flybar angle"]
+    dbeta_roll: Annotated[Scalar, "rad/s", "flybar rate"]
+
+
+class RollInputs(NamedTuple):
+    x_roll: Annotated[Scalar, "m", "cyclic input displacement, roll"]
+
+
+class RollOutputs(NamedTuple):
+    roll: Annotated[Scalar, "rad", "roll angle"]
+    roll_rate: Annotated[Scalar, "rad/s", "roll rate"]
+
+
+class PitchState(NamedTuple):
+    theta: Annotated[Scalar, "rad", "pitch angle"]
+    dtheta: Annotated[Scalar, "rad/s", "pitch rate"]
+    beta_pitch: Annotated[Scalar, "rad", "flybar angle"]
+    dbeta_pitch: Annotated[Scalar, "rad/s", "flybar rate"]
+
+
+class PitchInputs(NamedTuple):
+    x_pitch: Annotated[Scalar, "m", "cyclic input displacement, pitch"]
+
+
+class PitchOutputs(NamedTuple):
+    pitch: Annotated[Scalar, "rad", "pitch angle"]
+    pitch_rate: Annotated[Scalar, "rad/s", "pitch rate"]
+
+
+def roll_inertia(p: Helicopter) -> Scalar:
+    """Ixx and what is fixed to the fuselage [kg m^2]."""
+    return p.Ixx + p.Ixx_added
+
+
+def pitch_inertia(p: Helicopter) -> Scalar:
+    """Iyy and what is fixed to the fuselage [kg m^2]."""
+    return p.Iyy + p.Iyy_added
+
+
+def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
+    r"""Roll acceleration [rad/s^2], eq. 22: eqs 5, 11 and 14.
+
+    $$\ddot\phi = \frac{\rho\Omega^2 a c R^4}{2 I_{xx} L_1 (L_2+L_3)}
+      (L_3 x_{roll} + L_2 L_4 \beta)$$
+    """
+    return cyclic_moment(p, cyclic_pitch(p, x_roll, beta)) / roll_inertia(p)
+
+
+def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
+    """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll."""
+    return cyclic_moment(p, cyclic_pitch(p, x_pitch, beta)) / pitch_inertia(p)
+
+
+def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
+    """Eqs 21 and 22."""
+    return RollState(
+        phi=s.dphi,
+        dphi=roll_acceleration(p, u.x_roll, s.beta_roll),
+        beta_roll=s.dbeta_roll,
+        dbeta_roll=flapping_acceleration(p, u.x_roll, s.beta_roll, s.dbeta_roll, s.dphi),
+    )
+
+
+def _pitch_field(p: Helicopter, s: PitchState, u: PitchInputs) -> PitchState:
+    """Eqs 21 and 22 for the pitch axis."""
+    return PitchState(
+        theta=s.dtheta,
+        dtheta=pitch_acceleration(p, u.x_pitch, s.beta_pitch),
+        beta_pitch=s.dbeta_pitch,
+        dbeta_pitch=flapping_acceleration(p, u.x_pitch, s.beta_pitch, s.dbeta_pitch, s.dtheta),
+    )
+
+
+def _roll_output(p: Helicopter, s: RollState, u: RollInputs) -> RollOutputs:
+    return RollOutputs(roll=s.phi, roll_rate=s.dphi)
+
+
+def _pitch_output(p: Helicopter, s: PitchState, u: PitchInputs) -> PitchOutputs:
+    return PitchOutputs(pitch=s.theta, pitch_rate=s.dtheta)
+
+
+roll = Model(
+    "roll", _roll_field, _roll_output, Helicopter, RollState, RollInputs, RollOutputs, linear=True
+)
+"""Free roll at constant rotor speed: eqs 21-22."""
+
+pitch = Model(
+    "pitch",
+    _pitch_field,
+    _pitch_output,
+    Helicopter,
+    PitchState,
+    PitchInputs,
+    PitchOutputs,
+    linear=True,
+)
+"""Free pitch at constant rotor speed: eqs 21-22 with Iyy."""
+
+
+class _Axis(NamedTuple):
+    angle: str
+    rate: str
+    inertia: str
+    added: str
+
+
+_AXES = (_Axis("phi", "dphi", "Ixx", "Ixx_added"), _Axis("theta", "dtheta", "Iyy", "Iyy_added"))
+
+
+@functools.cache
+def on_stand(model: Model) -> Model:
+    r"""The model with the stand's stiffness and damping on its roll (and pitch) axis.
+
+    $$\ddot\phi \mathrel{-}= (\kappa\phi + \zeta\dot\phi)\,I_{xx}/(I_{xx} + I_{xx,added})$$
+
+    `kappa` [1/s^2] and `zeta` [1/s] belong to the machine without added inertia, so that the
+    stand's stiffness kappa Ixx [N m/rad] and damping zeta Ixx are the same in all runs.
+
+    Raises:
+        ValueError: the model has neither phi, dphi nor theta, dtheta among its states.
+    """
+    have = naming.names(model.State)
+    axes = [axis for axis in _AXES if axis.angle in have and axis.rate in have]
+    if not axes:
+        raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
+
+    def vector_field(p: Any, s: Any, u: Any) -> Any:
+        rates = model.vector_field(p, s, u)
+        for axis in axes:
+            inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
+            pull = p.kappa * getattr(s, axis.angle) + p.zeta * getattr(s, axis.rate)
+            slowed = getattr(rates, axis.rate) - pull * inertia / (inertia + added)
+            rates = naming.replace(rates, **{axis.rate: slowed})
+        return rates
+
+    return Model(
+        f"{model.name}-on-stand",
+        vector_field,
+        model.output,
+        model.Params,
+        model.State,
+        model.Inputs,
+        model.Outputs,
+        linear=model.linear,
+        start=model.start,
+    )
+
+
+class TransferFunction(NamedTuple):
+    """Polynomials in s, highest power first."""
+
+    num: tuple[Scalar, ...]
+    den: tuple[Scalar, ...]
+
+
+def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFunction:
+    r"""$H(s) = \phi/x_{roll}$ in closed form, eq. 23, with the stand where asked.
+
+    $$H = \frac{d_1 s^2 + d_2 s + d_3}{s(s^3 + c_1 s^2 + c_2 s + c_3)}$$
+
+    On the stand the denominator is $(s^2 + \zeta s + \kappa)(s^2 + c_1 s + c_2) + c_3 s$.
+    The second numerator $d_3 = k_2 (L_3\Omega^2 + L_2 L_4 k_1/L_5)$. num has 3, den 5 numbers.
+    """
+    k1 = flapping_rate_gain(p)
+    k2 = cyclic_moment(p, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
+    share = p.Ixx / roll_inertia(p)
+    c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
+    kappa, zeta = (share * p.kappa, share * p.zeta) if stand else (0.0 * k1, 0.0 * k1)
+    num = (k2 * p.L3, k1 * k2 * p.L3 / p.Omega, k2 * (p.L3 * c2 + p.L2 * p.L4 * k1 / p.L5))
+    one = k1 / k1
+    den = (one, c1 + zeta, c2 + zeta * c1 + kappa, zeta * c2 + kappa * c1 + c3, kappa * c2)
+    return TransferFunction(num, den)
+
+
+def ratios_from_denominator(p: Helicopter, den: Any) -> dict[str, Scalar]:
+    r"""a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
+
+    `den` holds (1, p1, p2, p3, p4), highest power first, p0 = 1. The stand's damping zeta, the
+    geometry and Omega are taken from `p`; the stand's stiffness is read from p4 = kappa c2.
+    With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. What the
+    model says of p2 = c2 + zeta c1 + kappa is left over as a check: `p2_expected`.
+    """
+    share = p.Ixx / roll_inertia(p)
+    zeta, c2 = share * p.zeta, p.Omega**2
+    _, p1, p2, p3, p4 = den
+    kappa, c1 = p4 / c2, p1 - zeta
+    c3 = p3 - zeta * c2 - kappa * c1
+    k1 = c1 * p.Omega
+    k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
+    unit_a = naming.replace(p, a=1.0, Ixx=1.0, Ixx_added=0.0, If=1.0)
+    k2_per_ratio = cyclic_moment(unit_a, 1.0 / (p.L1 * (p.L2 + p.L3)))
+    return {
+        "a/Ixx": k2 / k2_per_ratio,
+        "a/If": k1 / flapping_rate_gain(unit_a),
+        "p2": p2,
+        "p2_expected": c2 + zeta * c1 + kappa,
+    }

@@ -1,0 +1,25 @@
+"""The one error that a user's files and configurations can raise."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """A file or a configuration is wrong.
+
+    Its text is one whole sentence that names the file, the place, what was found and what is
+    wanted. The command line prints it and ends with exit code 2.
+    """
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if not close:
+        lower = {k.lower(): k for k in known}
+        close = [lower[c] for c in difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)]
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    return f"; known are {shown}" if known else ""

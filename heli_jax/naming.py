@@ -1,0 +1,77 @@
+"""Names and units of a record class: what makes a model's parameters, states, inputs and outputs
+readable by the configuration, the readers and the report.
+
+A record class is any class built by keyword with one scalar a field: an `eqx.Module`, a
+`NamedTuple`, a dataclass. Units and meanings are optional and stand in the annotation:
+`roll: Annotated[Scalar, "rad", "roll angle"]`.
+"""
+
+import functools
+import inspect
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+from jaxtyping import Array, Float
+
+type Scalar = Float[Array, ""] | float
+"""One number: a traced or concrete array of shape (), or a Python float."""
+
+
+@functools.cache
+def names(record: type) -> tuple[str, ...]:
+    """The field names of a record class, in order."""
+    fields = getattr(record, "__dataclass_fields__", None)
+    return tuple(fields) if fields is not None else tuple(inspect.signature(record).parameters)
+
+
+@functools.cache
+def _notes(record: type) -> Mapping[str, tuple[Any, ...]]:
+    hints = get_type_hints(record, include_extras=True)
+    return {
+        name: get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        for name, hint in hints.items()
+    }
+
+
+def unit(record: type, name: str) -> str | None:
+    """The SI unit of a field, or None where the class does not say."""
+    notes = _notes(record).get(name, ())
+    return notes[0] if notes else None
+
+
+def meaning(record: type, name: str) -> str:
+    """What a field is, in words; empty where the class does not say."""
+    notes = _notes(record).get(name, ())
+    return notes[1] if len(notes) > 1 else ""
+
+
+def defaults(record: type) -> dict[str, Any]:
+    """The fields that need not be given, with their values."""
+    signature = inspect.signature(record).parameters
+    return {n: p.default for n, p in signature.items() if p.default is not inspect.Parameter.empty}
+
+
+def asdict(record: Any) -> dict[str, Any]:
+    """A record's fields by name, not copied."""
+    return {name: getattr(record, name) for name in names(type(record))}
+
+
+def replace(record: Any, **changes: Any) -> Any:
+    """A new record of the same class with some fields changed."""
+    return type(record)(**{**asdict(record), **changes})
+
+
+def extended(record: type, title: str, fields: Mapping[str, tuple[Any, Any]]) -> type:
+    """A record class with the fields of `record` and more of them, given as (annotation, default).
+
+    The fields without a default come first, as Python wants.
+    """
+    hints = {**get_type_hints(record, include_extras=True)}
+    known = {name: hints[name] for name in names(record)}
+    given = {**defaults(record), **{n: d for n, (_, d) in fields.items() if d is not None}}
+    known.update({n: annotation for n, (annotation, _) in fields.items()})
+    ordered = sorted(known, key=lambda n: n in given)
+    made: Any = NamedTuple(title, [(n, known[n]) for n in ordered])  # type: ignore[misc]
+    made.__new__.__defaults__ = tuple(given[n] for n in ordered if n in given)
+    made._field_defaults = {n: given[n] for n in ordered if n in given}
+    return made

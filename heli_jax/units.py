@@ -1,0 +1,130 @@
+"""Units: everything inside is SI; conversion happens once, where a file is read.
+
+The angle is a dimension of its own here, so that a length cannot pass for an angle and a
+frequency in Hz means turns per second: 25 Hz of rotor speed is 157 rad/s.
+"""
+
+import functools
+import math
+import re
+from typing import Any
+
+from heli_jax.errors import nearest
+
+_DEFINITIONS = """
+milli- = 1e-3 = m-
+micro- = 1e-6 = u- = µ-
+nano- = 1e-9 = n-
+centi- = 1e-2 = c-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+meter = [length] = m = metre
+second = [time] = s = sec
+gram = [mass] = g
+radian = [angle] = rad
+stick = [] = stick
+percent = 0.01 = %
+permille = 0.001
+degree = 0.017453292519943295 * radian = deg = °
+turn = 6.283185307179586 * radian = rev = revolution
+inch = 0.0254 * meter = in
+foot = 0.3048 * meter = ft
+minute = 60 * second = min
+hour = 3600 * second = h
+pound = 0.45359237 * kilogram = lb
+newton = kilogram * meter / second ** 2 = N
+watt = newton * meter / second = W
+pascal = newton / meter ** 2 = Pa
+hertz = turn / second = Hz
+rpm = turn / minute
+g_0 = 9.80665 * meter / second ** 2 = gee
+slug = 14.593902937206 * kilogram
+pound_force = 4.4482216152605 * newton = lbf
+"""
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint  # kept out of the library's import time
+
+    registry = pint.UnitRegistry(None)
+    for line in _DEFINITIONS.strip().splitlines():
+        registry.define(line)
+    return registry
+
+
+# A unit is names with small whole exponents, multiplied or divided: nothing that computes.
+_FACTOR = r"(?:1|[A-Za-zµ°%_]+)(?:\s*(?:\^|\*\*)\s*-?\d)?"
+_UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/·]\s*{_FACTOR}|\s+{_FACTOR})*")
+_EXAMPLES = "m mm cm km s ms us min rad mrad deg rev rpm Hz kg g N W Pa lb ft in stick".split()
+
+
+@functools.cache
+def _parse(unit: str) -> Any:
+    registry = _registry()
+    text = unit.strip().replace("·", "*")
+    if text in ("", "1", "-", "dimensionless"):
+        return registry.Quantity(1.0)
+    try:
+        if len(text) > 60 or not _UNIT.fullmatch(text):
+            raise ValueError
+        expression = text.replace("%", "percent").replace("°", "degree")
+        quantity = registry.Quantity(
+            1.0 * registry.parse_expression(expression, case_sensitive=True)
+        )
+        if not math.isfinite(quantity.magnitude):  # 'nan' and 'inf' parse as numbers
+            raise ValueError
+        return quantity
+    except Exception as e:  # pint raises many kinds for text that is no unit
+        raise ValueError(f"unknown unit {unit[:60]!r}{nearest(text[:60], _EXAMPLES)}") from e
+
+
+def factor(unit: str, si: str) -> float:
+    """The number that turns a value in `unit` into the SI unit `si`.
+
+    A plain number is taken for an angle in radians, as SI does (`1/s` for `rad/s`).
+
+    Raises:
+        ValueError: the unit is unknown, or of another kind than `si`.
+    """
+    have, want = _parse(unit), _parse(si)
+    if have.dimensionality == want.dimensionality:
+        return float((have / want).to_base_units().magnitude)
+    if _angle_free(have) and _without_angle(have) == _without_angle(want):
+        base = have.to_base_units()
+        if float(base.magnitude) == 1.0 or dict(base.dimensionality):
+            return float(base.magnitude / want.to_base_units().magnitude)
+    raise ValueError(f"unit {unit!r} is {_kind(have)}, wanted is {_kind(want)} such as {si!r}")
+
+
+def is_plain(unit: str) -> bool:
+    """Whether `unit` is a plain ratio: `1`, `%`, `stick`."""
+    return not dict(_parse(unit).dimensionality)
+
+
+def _without_angle(quantity: Any) -> dict[str, float]:
+    return {k: v for k, v in dict(quantity.dimensionality).items() if k != "[angle]"}
+
+
+def _angle_free(quantity: Any) -> bool:
+    return "[angle]" not in dict(quantity.dimensionality)
+
+
+_KINDS = {
+    "rad": "an angle",
+    "m": "a length",
+    "s": "a time",
+    "rad/s": "an angular speed",
+    "rad/s^2": "an angular acceleration",
+    "m/s": "a speed",
+    "kg": "a mass",
+    "kg m^2": "a moment of inertia",
+    "1": "a plain number",
+}
+
+
+def _kind(quantity: Any) -> str:
+    for unit, words in _KINDS.items():
+        if _parse(unit).dimensionality == quantity.dimensionality:
+            return words
+    return f"of the kind {quantity.dimensionality}"

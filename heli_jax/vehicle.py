@@ -1,0 +1,199 @@
+"""Helicopter: every constant of the paper's nomenclature, in SI.
+
+Symbols are those of Kim & Tilbury (1997), appendix; `R1` is the inner and `R2` the outer end of
+the flybar paddle (the paper's nomenclature exchanges the two, which would make the flybar's
+damping negative).
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming, units
+from heli_jax.errors import InputError, nearest
+from heli_jax.naming import Scalar
+from heli_jax.yaml_file import read_mapping
+
+
+def _scalar(value: Any) -> Any:
+    """Python and NumPy numbers become arrays of the default float; anything else passes."""
+    if isinstance(value, (bool, int, float, np.floating, np.integer)):
+        return jnp.asarray(value, dtype=jnp.result_type(float))
+    return value
+
+
+def _field(default: float | None = None) -> Any:
+    if default is None:
+        return eqx.field(converter=_scalar)
+    return eqx.field(converter=_scalar, default=default)
+
+
+class Helicopter(eqx.Module):
+    """A single-rotor helicopter with a Bell-Hiller flybar; every field a scalar in SI."""
+
+    Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
+    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field()
+    R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field()
+    c: Annotated[Scalar, "m", "main rotor blade chord"] = _field()
+    a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field()
+    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _field()
+    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _field()
+    L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
+    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
+    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
+    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
+    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _field()
+    Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field()
+    rho: Annotated[Scalar, "kg/m^3", "air density"] = _field(1.2)
+    g: Annotated[Scalar, "m/s^2", "gravitational acceleration"] = _field(9.80665)
+    B: Annotated[Scalar, "1", "tip loss factor"] = _field(0.97)
+    m: Annotated[Scalar, "kg", "total mass"] = _field(math.nan)
+    Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _field(math.nan)
+    Izz: Annotated[Scalar, "kg m^2", "fuselage inertia about the yaw axis"] = _field(math.nan)
+    Ir: Annotated[Scalar, "kg m^2", "rotor inertia about its shaft"] = _field(math.nan)
+    Cd0: Annotated[Scalar, "1", "profile drag coefficient of the blade"] = _field(math.nan)
+    hr: Annotated[Scalar, "m", "rotor disk above the centre of gravity"] = _field(math.nan)
+    lr: Annotated[Scalar, "m", "rotor axis behind the centre of gravity"] = _field(math.nan)
+    R_T: Annotated[Scalar, "m", "length of a tail rotor blade"] = _field(math.nan)
+    c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _field(math.nan)
+    a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _field(math.nan)
+    L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _field(math.nan)
+    K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _field(math.nan)
+    K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _field(math.nan)
+    K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
+    K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
+    K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
+    Ixx_added: Annotated[Scalar, "kg m^2", "known inertia fixed to the fuselage, roll"] = _field(0.0)
+    Iyy_added: Annotated[Scalar, "kg m^2", "known inertia fixed to the fuselage, pitch"] = _field(
+        0.0
+    )
+    kappa: Annotated[Scalar, "1/s^2", "stand stiffness over the fuselage's own inertia"] = _field(
+        0.0
+    )
+    zeta: Annotated[Scalar, "1/s", "stand damping over the fuselage's own inertia"] = _field(0.0)
+    cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
+
+
+# A vehicle may leave out what the model at hand does not read; what it gives must be possible.
+_MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}
+_MAY_BE_ZERO = {"Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
+
+
+def impossible(params: Mapping[str, float]) -> str | None:
+    """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
+
+    `params` are numbers by name; a name that is missing is not judged.
+    """
+    for name, value in params.items():
+        if name not in naming.names(Helicopter):
+            continue
+        if name in _MAY_BE_NEGATIVE:
+            continue
+        if name in _MAY_BE_ZERO:
+            if value < 0:
+                return f"{name} is {value:g}, wanted is zero or more"
+        elif value <= 0:
+            return f"{name} is {value:g}, wanted is more than zero"
+    r1, r2 = params.get("R1"), params.get("R2")
+    if r1 is not None and r2 is not None and r1 >= r2:
+        return (
+            f"R1 is {r1:g} and R2 is {r2:g}, wanted is R1 < R2: R1 is the inner and R2 the outer "
+            "end of the flybar paddle (the paper's nomenclature exchanges them)"
+        )
+    if (b := params.get("B")) is not None and b > 1:
+        return f"B is {b:g}, wanted is a tip loss factor of at most 1"
+    return None
+
+
+class Constant(NamedTuple):
+    """One constant of a vehicle file as it was written."""
+
+    value: float
+    """in SI"""
+    unit: str
+    source: str
+
+
+class Vehicle(NamedTuple):
+    """A vehicle file: the parameters, and where each number comes from."""
+
+    params: Any
+    constants: dict[str, Constant]
+    path: str
+
+
+def load_vehicle(path: str | Path, params: type = Helicopter) -> Any:
+    """Read a vehicle file into `params` (a Helicopter unless another class is named), in SI.
+
+    Raises:
+        InputError: the file or a value in it is wrong; the sentence names both.
+    """
+    return read_vehicle(path, params).params
+
+
+def read_vehicle(path: str | Path, params: type = Helicopter) -> Vehicle:
+    """As `load_vehicle`, with each constant's unit and source beside the parameters."""
+    return vehicle_from_mapping(read_mapping(path), str(path), params)
+
+
+def vehicle_from_mapping(
+    content: Mapping[str, Any], where: str, params: type = Helicopter
+) -> Vehicle:
+    """Build the parameters from a mapping of names to numbers or {value, unit, source}.
+
+    Raises:
+        InputError: an unknown name, a missing or an impossible value; `where` is named.
+    """
+    known = naming.names(params)
+    constants = {}
+    for name, entry in content.items():
+        if name not in known:
+            raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
+        constants[name] = _constant(entry, name, naming.unit(params, name), where)
+    missing = [n for n in known if n not in constants and n not in naming.defaults(params)]
+    if missing:
+        raise InputError(f"{where}: {', '.join(missing)} missing, wanted is a number for each")
+    if params is Helicopter:
+        wrong = impossible({n: c.value for n, c in constants.items()})
+        if wrong:
+            raise InputError(f"{where}: {wrong}")
+    values = {n: _scalar(c.value) for n, c in constants.items()}
+    return Vehicle(params(**values), constants, where)
+
+
+def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
+    place = f"{where}: {name}"
+    unit, source = si or "1", ""
+    if isinstance(entry, Mapping):
+        unknown = [k for k in entry if k not in ("value", "unit", "source")]
+        if unknown:
+            raise InputError(
+                f"{place}: unknown key {unknown[0]!r}, known are value, unit and source"
+            )
+        if "value" not in entry:
+            raise InputError(f"{place}: no value, wanted is a number")
+        unit, source = str(entry.get("unit", unit)), str(entry.get("source", ""))
+        entry = entry["value"]
+    if isinstance(entry, bool) or not isinstance(entry, int | float):
+        raise InputError(f"{place}: found {entry!r:.40}, wanted is a number")
+    try:
+        scale = units.factor(unit, si) if si is not None else 1.0
+    except ValueError as e:
+        raise InputError(f"{place}: {e}") from e
+    value = float(entry) * scale if abs(entry) < 1e300 else math.inf
+    if not math.isfinite(value):
+        raise InputError(f"{place}: found {entry!r:.40}, wanted is a finite number")
+    return Constant(value, si or unit, source)
+
+
+def missing_for(params: Any, needed: set[str]) -> list[str]:
+    """The names among `needed` that the vehicle leaves open (NaN), in field order."""
+    have = naming.asdict(params)
+    concrete = {n: v for n, v in have.items() if not isinstance(v, jax.core.Tracer)}
+    return [n for n, v in concrete.items() if n in needed and np.isnan(np.asarray(v)).any()]

@@ -1,0 +1,136 @@
+"""YAML files, read with care: plain data alone, every key once, numbers as YAML 1.2 has them."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from heli_jax.errors import InputError
+
+_LIMIT_BYTES = 1_000_000
+_LIMIT_NODES = 100_000
+_LIMIT_DEPTH = 40
+
+
+class _Loader(yaml.CSafeLoader if hasattr(yaml, "CSafeLoader") else yaml.SafeLoader):
+    """SafeLoader without YAML 1.1's traps: `1e-4` is a number; `on`, `yes` and dates are text."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, rx) for tag, rx in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]{0,17})$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def read_mapping(path: str | Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds.
+
+    Raises:
+        InputError: no such file, no text, no YAML, not a mapping, a key twice, or more nested or
+            larger (aliases written out) than any configuration would be.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _LIMIT_BYTES:
+            raise InputError(f"{path}: larger than 1 MB, wanted is a configuration in YAML")
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as e:
+        raise InputError(f"{path}: no such file") from e
+    except IsADirectoryError as e:
+        raise InputError(f"{path}: is a folder, wanted is a YAML file") from e
+    except UnicodeDecodeError as e:
+        raise InputError(f"{path}: is not text, wanted is a YAML file") from e
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+    return parse_mapping(text, str(path))
+
+
+def parse_mapping(text: str, where: str) -> dict[str, Any]:
+    """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
+    value = _load(text, where)
+    if not isinstance(value, dict):
+        found = "nothing" if value is None else f"a {type(value).__name__}"
+        raise InputError(f"{where}: holds {found}, wanted are keys with values")
+    return value
+
+
+def parse_value(text: str, where: str) -> Any:
+    """One value as it would stand behind a key: for `--set key=value`."""
+    return _load(text, where)
+
+
+def _load(text: str, where: str) -> Any:
+    loader = None
+    try:
+        if _deepest(text) > _LIMIT_DEPTH:
+            raise InputError(f"{where}: nested more than {_LIMIT_DEPTH} deep")
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _inspect(node, where, 0, set(), [0])
+        return loader.construct_document(node)
+    except yaml.MarkedYAMLError as e:
+        mark = e.problem_mark or e.context_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = " ".join(str(e.problem or e.context or "broken").split())
+        raise InputError(f"{where}{line}: {problem}; wanted is plain YAML") from e
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as e:
+        if isinstance(e, InputError):
+            raise
+        text = " ".join(str(e).split())[:120]
+        raise InputError(f"{where}: broken YAML ({text})") from e
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def _deepest(text: str) -> int:
+    """A bound on the nesting, found before the parser recurses into it."""
+    depth = most = 0
+    for character in text:
+        if character in "[{":
+            depth += 1
+            most = max(most, depth)
+        elif character in "]}":
+            depth -= 1
+    indents = {len(line) - len(line.lstrip(" ")) for line in text.splitlines() if line.strip()}
+    dashes = max((len(m.group()) // 2 for m in re.finditer(r"(?:- )+", text)), default=0)
+    return max(most, len(indents), dashes)
+
+
+def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int]) -> None:
+    """Refuse doubled keys, cycles, and aliases that blow up when they are written out."""
+    count[0] += 1
+    if count[0] > _LIMIT_NODES or depth > _LIMIT_DEPTH or id(node) in above:
+        line = node.start_mark.line + 1
+        raise InputError(f"{where}, line {line}: larger or deeper than any configuration")
+    above = above | {id(node)}
+    if isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, value in node.value:
+            line = key.start_mark.line + 1
+            if not isinstance(key, yaml.ScalarNode):
+                raise InputError(f"{where}, line {line}: a key must be a name")
+            if key.value in seen and key.value != "<<":
+                raise InputError(f"{where}, line {line}: key {key.value!r} stands here twice")
+            seen.add(key.value)
+            _inspect(value, where, depth + 1, above, count)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            _inspect(value, where, depth + 1, above, count)
