@@ -1,0 +1,86 @@
+"""Between discrete and continuous transfer functions: c2d, d2c, and what can go wrong."""
+
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+from numpy.typing import ArrayLike
+
+Polynomials = tuple[np.ndarray, np.ndarray]
+
+
+def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
+    """The zero-order-hold equivalent of H(s) = num/den for steps of `dt` [s].
+
+    Polynomials with the highest power first; both results have the length of `den`, and the
+    denominator begins with 1.
+
+    Raises:
+        ValueError: not a proper transfer function, or `dt` is not positive.
+    """
+    A, B, C, D = _state_space(num, den, dt)
+    n = A.shape[0]
+    M = np.zeros((n + 1, n + 1))
+    M[:n, :n], M[:n, n:] = A, B
+    E = scipy.linalg.expm(M * dt)
+    return _polynomials(E[:n, :n], E[:n, n:], C, D)
+
+
+def d2c(
+    num: ArrayLike, den: ArrayLike, dt: float, method: Literal["zoh", "real-log"] = "zoh"
+) -> Polynomials:
+    """A continuous H(s) for the discrete Hd(z) = num/den with steps of `dt` [s].
+
+    "zoh" inverts the zero-order hold and refuses where no inverse of the same order exists.
+    "real-log" takes the real part of the matrix logarithm of [[Ad, Bd], [0, 1]], as the numbers
+    of Kim & Tilbury's eq. 35 were made from eq. 34; where "zoh" refuses, its result is another
+    system than Hd.
+
+    Raises:
+        ValueError: no such method, not a proper transfer function, a pole at z = 0 (its logarithm
+            does not exist), or, with "zoh", a pole on the negative real axis, which is named.
+    """
+    if method not in ("zoh", "real-log"):
+        raise ValueError(f"unknown method {method!r}: use 'zoh' or 'real-log'")
+    A, B, C, D = _state_space(num, den, dt)
+    n = A.shape[0]
+    poles = np.linalg.eigvals(A)
+    size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
+    if np.any(np.abs(poles) < 1e-12 * size):
+        raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")
+    negative = poles[(poles.real < 0) & (np.abs(poles.imag) < 1e-9 * size)].real
+    if method == "zoh" and negative.size:
+        named = ", ".join(f"{p:.3f}" for p in sorted(negative))
+        raise ValueError(
+            f"no inverse of the zero-order hold exists: the discrete system has a real pole at "
+            f"z = {named}, which no continuous system of order {n} gives when sampled; "
+            "method='real-log' gives a real approximation, which is another system"
+        )
+    M = np.eye(n + 1)
+    M[:n, :n], M[:n, n:] = A, B
+    # logm warns where eigenvalues are negative; that case was named above.
+    L = np.asarray(scipy.linalg.logm(M.astype(complex))).real / dt
+    if not np.isfinite(L).all():
+        raise ValueError("the matrix logarithm of the discrete system does not exist")
+    return _polynomials(L[:n, :n], L[:n, n:], C, D)
+
+
+def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray, ...]:
+    num, den = np.atleast_1d(np.asarray(num, float)), np.atleast_1d(np.asarray(den, float))
+    if not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt is {dt}, wanted is a sample time in seconds above zero")
+    if num.ndim != 1 or den.ndim != 1 or not (np.isfinite(num).all() and np.isfinite(den).all()):
+        raise ValueError("num and den must be lists of finite numbers")
+    num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
+    if den.size < 2:
+        raise ValueError("den must have a power of one at least")
+    if num.size > den.size:
+        raise ValueError("num is of higher order than den: not a proper transfer function")
+    A, B, C, D = scipy.signal.tf2ss(num if num.size else np.zeros(1), den)
+    return A, B, C, D
+
+
+def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
+    num, den = scipy.signal.ss2tf(A, B, C, D)
+    return num[0], den

@@ -1,0 +1,292 @@
+"""simulate: a model, its parameters and inputs in; the trajectory out."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.discretize import discretize
+from heli_jax.simulation.solvers import (
+    RK4,
+    Accumulating,
+    Exact,
+    Held,
+    Now,
+    PerSample,
+    at,
+)
+
+
+class Trajectory(NamedTuple):
+    """What a simulation gives, sample by sample; batched from outside by vmap."""
+
+    times: Float[Array, " N"]
+    """[s], from 0"""
+    states: Any
+    """the model's State with arrays (N,)"""
+    outputs: Any
+    """the model's Outputs with arrays (N,)"""
+    result: dfx.RESULTS
+    """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
+    finite: Bool[Array, ""]
+    """whether every state is a finite number"""
+
+
+def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:
+    """The model's Inputs as arrays (N,) and the sample time, from a Flight or from Inputs with dt.
+
+    Raises:
+        ValueError: a needed input is missing, the lengths differ, or dt is missing.
+    """
+    given = getattr(flight, "inputs", None)
+    if isinstance(given, dict):
+        missing = [n for n in naming.names(model.Inputs) if n not in given]
+        if missing:
+            raise ValueError(f"the flight has no input {missing[0]!r}, which {model.name} needs")
+        inputs = model.Inputs(**{n: jnp.asarray(given[n]) for n in naming.names(model.Inputs)})
+        dt = flight.dt if dt is None else dt
+    else:
+        inputs = jax.tree.map(jnp.asarray, flight)
+    if dt is None:
+        raise ValueError("inputs given as arrays need dt, the sample time in seconds")
+    shapes = {u.shape for u in jax.tree.leaves(inputs)}
+    if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
+        raise ValueError(f"inputs have shapes {sorted(shapes)}, wanted is (N,) for all, N >= 2")
+    return inputs, dt
+
+
+def simulate(
+    model: Model,
+    params: Any,
+    flight: Any,
+    *,
+    dt: Any = None,
+    initial_state: Any = None,
+    solver: str | dfx.AbstractSolver | None = None,
+    substeps: int = 4,
+    controller: dfx.AbstractStepSizeController | None = None,
+    delay: Any = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    max_steps: int = 1_000_000,
+) -> Trajectory:
+    """Simulate one machine; each input sample is held until the next (zero-order hold).
+
+    Args:
+        flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
+        initial_state: the model's State at the first sample; `model.initial_state` unless given.
+        solver: "exact" (linear models, the default there), "rk4" (the default elsewhere), or any
+            diffrax solver.
+        substeps: steps per sample for fixed-step solvers.
+        controller: a diffrax step-size controller makes the steps adaptive; they then end at
+            every change of the input (`jump_ts`).
+        delay: the inputs act this much later (+) or earlier (-) than given [s]; differentiable
+            with fixed steps (with adaptive ones its derivative is NaN).
+            Before the first sample its value holds, after the last the last one's.
+        adjoint: `diffrax.DirectAdjoint()` unless given: forward and reverse mode both work.
+            `ForwardMode()` compiles faster, `RecursiveCheckpointAdjoint()` saves memory in
+            reverse mode.
+        max_steps: bound on adaptive steps; where it ends a run, `result` says so.
+
+    Returns:
+        A Trajectory; a failed integration is in its `result` and `finite`, never an exception.
+
+    Raises:
+        ValueError: "exact" for a model that is not linear, an unknown solver, or wrong shapes.
+    """
+    inputs, dt = held_inputs(model, flight, dt)
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    x0 = _start(model, params, initial_state, inputs, dt)
+    adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
+    if controller is not None:
+        sol = _adaptive(
+            model, params, inputs, dt, x0, solver, controller, delay, adjoint, max_steps
+        )
+    else:
+        method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
+        sol = dfx.diffeqsolve(
+            term,
+            method,
+            t0=0.0,
+            t1=float(n - 1),
+            dt0=1.0,
+            y0=x0,
+            args=held,
+            saveat=dfx.SaveAt(t0=True, steps=True),
+            max_steps=n - 1,
+            adjoint=adjoint,
+            throw=False,
+        )
+    states: Any = sol.ys
+    outputs = _outputs(model, params, states, inputs, dt, delay)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
+    times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
+    return Trajectory(times, states, outputs, sol.result, finite)
+
+
+def accumulate(
+    model: Model,
+    params: Any,
+    flight: Any,
+    update: Callable[[Any, Any, Any], Any],
+    start: Any,
+    *,
+    data: Any = (),
+    dt: Any = None,
+    initial_state: Any = None,
+    solver: str | dfx.AbstractSolver | None = None,
+    substeps: int = 4,
+    adjoint: dfx.AbstractAdjoint | None = None,
+) -> tuple[Any, dfx.RESULTS]:
+    """Reduce a run to a value without keeping it: for large batches.
+
+    At every sample value = update(value, outputs, data at that sample), from `start`; `data` is
+    a pytree of arrays (N,) such as the measured outputs. Other arguments as `simulate`.
+
+    Returns:
+        The final value and diffrax's result.
+    """
+    inputs, dt = held_inputs(model, flight, dt)
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    x0 = _start(model, params, initial_state, inputs, dt)
+    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, None)
+
+    def per_sample(value: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
+        return update(value, model.output(params, state, inputs_now), data_now)
+
+    sol = dfx.diffeqsolve(
+        term,
+        Accumulating(method, per_sample),
+        t0=0.0,
+        t1=float(n - 1),
+        dt0=1.0,
+        y0=(x0, start),
+        args=(held, data),
+        saveat=dfx.SaveAt(t1=True),
+        max_steps=n - 1,
+        adjoint=dfx.DirectAdjoint() if adjoint is None else adjoint,
+        throw=False,
+    )
+    state, value = jax.tree.map(lambda v: v[0], sol.ys)
+    return per_sample(value, state, at(inputs, n - 1), at(data, n - 1)), sol.result
+
+
+def _start(model: Model, params: Any, initial_state: Any, inputs: Any, dt: Any) -> Any:
+    """The initial state in the dtype that the parameters and inputs give together."""
+    state = model.initial_state(params) if initial_state is None else initial_state
+    leaves = (*jax.tree.leaves(params), *jax.tree.leaves(inputs))
+    dtype = jnp.result_type(*(jnp.asarray(v) for v in leaves))
+    dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
+
+
+def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.AbstractSolver:
+    if solver is None:
+        solver = "exact" if model.linear else "rk4"
+    if solver == "exact":
+        if not model.linear:
+            raise ValueError(f"model {model.name!r} is not linear: use solver='rk4' or another")
+        return Exact()
+    if solver == "rk4":
+        return RK4()
+    if isinstance(solver, dfx.AbstractSolver):
+        return solver
+    raise ValueError(f"unknown solver {solver!r}: use 'exact', 'rk4' or a diffrax solver")
+
+
+def _split(delay: Any, dt: Any) -> tuple[Any, Any]:
+    """A delay as whole samples and the rest as a fraction of a sample in [0, 1)."""
+    samples = jnp.asarray(delay) / dt
+    whole = jnp.floor(jax.lax.stop_gradient(samples))
+    return whole.astype(int), samples - whole
+
+
+def _per_sample(
+    model: Model, params: Any, inputs: Any, dt: Any, solver: Any, substeps: int, delay: Any
+) -> tuple[dfx.AbstractSolver, Held, dfx.ODETerm]:
+    """The solver, its arguments and the term for time counted in samples."""
+    method = _method(model, solver)
+    parts = None if delay is None else _split(delay, dt)
+
+    term = _term(model, dt)
+    if isinstance(method, Exact):
+        late = None if parts is None else parts[1] * dt
+        return method, Held(params, inputs, parts, discretize(model, params, dt, late)), term
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps}, wanted is at least 1")
+    return PerSample(method, substeps), Held(params, inputs, parts, None), term
+
+
+def _term(model: Model, scale: Any) -> dfx.ODETerm:
+    """The vector field per `scale` seconds.
+
+    diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
+    """
+
+    def field(t: Any, x: Any, now: Any) -> Any:
+        if not isinstance(x, model.State):
+            return jax.tree.map(jnp.zeros_like, x)
+        if isinstance(now, Held):
+            now = Now(now.params, at(now.inputs, 0))
+        rates = model.vector_field(now.params, x, now.inputs)
+        return jax.tree.map(lambda v: v * scale, rates)
+
+    return dfx.ODETerm(field)
+
+
+def _adaptive(
+    model: Model,
+    params: Any,
+    inputs: Any,
+    dt: Any,
+    x0: Any,
+    solver: Any,
+    controller: Any,
+    delay: Any,
+    adjoint: Any,
+    max_steps: int,
+) -> dfx.Solution:
+    method = _method(model, dfx.Dopri8() if solver is None else solver)
+    if isinstance(method, Exact | RK4):
+        raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
+    shift = jnp.zeros((), times.dtype) if delay is None else jnp.asarray(delay, times.dtype)
+    jumps = times + shift
+    clipped = dfx.ClipStepSizeController(controller, jump_ts=jumps)
+
+    def field(t: Any, x: Any, args: Any) -> Any:
+        # A step ends one float before a jump and the next begins one after it, so the sample is
+        # told apart exactly; the first sample holds before the first jump.
+        params, inputs, jumps = args
+        k = jnp.searchsorted(jumps, jax.lax.stop_gradient(t), side="right") - 1
+        return model.vector_field(params, x, at(inputs, k))
+
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        method,
+        t0=times[0],
+        t1=times[-1],
+        dt0=None,
+        y0=x0,
+        args=(params, inputs, jumps),
+        saveat=dfx.SaveAt(ts=times),
+        stepsize_controller=clipped,
+        max_steps=max_steps,
+        adjoint=adjoint,
+        throw=False,
+    )
+
+
+def _outputs(model: Model, params: Any, states: Any, inputs: Any, dt: Any, delay: Any) -> Any:
+    """The outputs at the samples, with the input that acts there."""
+    if delay is not None:
+        n = jax.tree.leaves(inputs)[0].shape[0]
+        whole, rest = _split(delay, dt)
+        k = jnp.arange(n) - whole - (rest > 0).astype(int)
+        inputs = at(inputs, k)
+    return jax.vmap(lambda x, u: model.output(params, x, u))(states, inputs)

@@ -1,0 +1,215 @@
+"""Solver classes of our own: one step a sample, the input held, named scalar leaves.
+
+A Runge-Kutta method that reads the input by time sees the next sample in its last stage, an error
+of first order. Here the input of an interval is picked once and held while the step is made.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heli_jax.simulation.discretize import Discrete
+
+
+class Held(NamedTuple):
+    """What a step needs to know: the parameters and the inputs, sample by sample.
+
+    `inputs` holds arrays (N,). `delay` is None, or the whole samples (integer) and the rest
+    (fraction of a sample in [0, 1)) by which the inputs act later than given.
+    """
+
+    params: Any
+    inputs: Any
+    delay: Any
+    discrete: Discrete | None
+
+
+class Now(NamedTuple):
+    """The arguments of a vector field within one interval: parameters and the held inputs."""
+
+    params: Any
+    inputs: Any
+
+
+def at(inputs: Any, k: Any) -> Any:
+    """The inputs of sample k; before the first the first, after the last the last."""
+    return jax.tree.map(lambda u: u[jnp.clip(k, 0, u.shape[0] - 1)], inputs)
+
+
+def _sample(t: Any) -> Any:
+    return jnp.floor(t + 1e-3).astype(int)
+
+
+class Exact(dfx.AbstractSolver):
+    """Exact zero-order hold for linear models: a recurrence with scalar coefficients."""
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
+        dfx.LocalLinearInterpolation
+    )
+
+    def order(self, terms: Any) -> None:
+        return None
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+    ) -> Any:
+        k, Ad, Bd, Bp = _sample(t0), *args.discrete  # type: ignore[misc]
+        if args.delay is not None:
+            k = k - args.delay[0]
+        x = jax.tree.leaves(y0)
+        rows = list(zip(Ad, Bd, strict=True))
+        u = jax.tree.leaves(at(args.inputs, k))
+        new = [_dot(a, x) + _dot(b, u) for a, b in rows]
+        if Bp is not None:
+            before = jax.tree.leaves(at(args.inputs, k - 1))
+            new = [x + _dot(b, before) for x, b in zip(new, Bp, strict=True)]
+        y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
+        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+
+
+def _dot(coefficients: Any, values: Any) -> Any:
+    total = coefficients[0] * values[0]
+    for c, v in zip(coefficients[1:], values[1:], strict=True):
+        total = total + c * v
+    return total
+
+
+class RK4(dfx.AbstractSolver):
+    """The classical Runge-Kutta method of fourth order on named scalar leaves."""
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
+        dfx.LocalLinearInterpolation
+    )
+
+    def order(self, terms: Any) -> int:
+        return 4
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> Any:
+        h = t1 - t0
+
+        def f(t: Any, y: Any) -> Any:
+            return terms.vf(t, y, args)
+
+        def along(y: Any, slope: Any, step: Any) -> Any:
+            return jax.tree.map(lambda a, b: a + step * b, y, slope)
+
+        k1 = f(t0, y0)
+        k2 = f(t0 + 0.5 * h, along(y0, k1, 0.5 * h))
+        k3 = f(t0 + 0.5 * h, along(y0, k2, 0.5 * h))
+        k4 = f(t1, along(y0, k3, h))
+        y1 = jax.tree.map(
+            lambda y, a, b, c, d: y + (h / 6.0) * (a + 2.0 * (b + c) + d), y0, k1, k2, k3, k4
+        )
+        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+
+
+class PerSample(dfx.AbstractSolver):
+    """Any solver inside one sample: the input held, `substeps` equal steps.
+
+    With a delayed input the interval has two parts, before and after the change of the input,
+    with `substeps` steps each.
+    """
+
+    solver: dfx.AbstractSolver
+    substeps: int = eqx.field(static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
+        dfx.LocalLinearInterpolation
+    )
+
+    def order(self, terms: Any) -> int | None:
+        return self.solver.order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return self.solver.func(terms, t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+    ) -> Any:
+        k = _sample(t0)
+        if args.delay is None:
+            parts = [(t0, t1, k)]
+        else:
+            whole, rest = args.delay
+            parts = [(t0, t0 + rest, k - whole - 1), (t0 + rest, t1, k - whole)]
+        y, result = y0, dfx.RESULTS.successful
+        for begin, end, sample in parts:
+            now = Now(args.params, at(args.inputs, sample))
+            y, one = self._steps(terms, begin, end, y, now)
+            result = dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)
+        return y, None, dict(y0=y0, y1=y), None, result
+
+    def _steps(self, terms: Any, begin: Any, end: Any, y0: Any, now: Now) -> Any:
+        h = (end - begin) / self.substeps
+
+        def body(carry: Any, i: Any) -> Any:
+            y, result = carry
+            a, b = begin + i * h, begin + (i + 1.0) * h
+            state = self.solver.init(terms, a, b, y, now)
+            y, _, _, _, one = self.solver.step(terms, a, b, y, now, state, False)
+            return (y, dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)), None
+
+        carry = (y0, dfx.RESULTS.successful)
+        steps = jnp.arange(self.substeps, dtype=jnp.result_type(begin))
+        (y, result), _ = jax.lax.scan(body, carry, steps)
+        return y, result
+
+
+class Accumulating(dfx.AbstractSolver):
+    """A per-sample solver that carries a running value beside the state.
+
+    y = (state, value); at each sample, before the step, value = update(value, state, held inputs
+    at that sample, k). Nothing else of the trajectory is kept.
+    """
+
+    solver: dfx.AbstractSolver
+    update: Callable[..., Any] = eqx.field(static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
+        dfx.LocalLinearInterpolation
+    )
+
+    def order(self, terms: Any) -> int | None:
+        return self.solver.order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return y0
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> Any:
+        held, data = args
+        state, value = y0
+        k = _sample(t0)
+        value = self.update(value, state, at(held.inputs, k), at(data, k))
+        state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
+        y1 = (state, value)
+        return y1, None, dict(y0=y0, y1=y1), None, result
