@@ -193,26 +193,35 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
     return TransferFunction(num, den)
 
 
-def ratios_from_denominator(p: Helicopter, den: Any) -> dict[str, Scalar]:
+class Ratios(NamedTuple):
+    """What a fourth-order denominator says of the physical parameters."""
+
+    values: dict[str, Scalar]
+    """a over the inertia of the axis, and a/If"""
+    p2: Scalar
+    p2_expected: Scalar
+    """the coefficient of s^2 that the other coefficients and Omega ask for"""
+
+
+def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Ratios:
     r"""a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
 
-    `den` holds (1, p1, p2, p3, p4), highest power first, p0 = 1. The stand's damping zeta, the
-    geometry and Omega are taken from `p`; the stand's stiffness is read from p4 = kappa c2.
-    With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. What the
-    model says of p2 = c2 + zeta c1 + kappa is left over as a check: `p2_expected`.
+    `den` holds (1, p1, p2, p3, p4), highest power first, of the angle `roll` or `pitch`. The
+    stand's damping zeta, the geometry and Omega are taken from `p`; the stand's stiffness is read
+    from p4 = kappa c2. With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and
+    k2 follow. What the model says of p2 = c2 + zeta c1 + kappa is left over as a check.
     """
-    share = p.Ixx / roll_inertia(p)
-    zeta, c2 = share * p.zeta, p.Omega**2
+    axis = {"roll": _AXES[0], "pitch": _AXES[1]}[angle]
+    inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
+    zeta, c2 = p.zeta * inertia / (inertia + added), p.Omega**2
     _, p1, p2, p3, p4 = den
     kappa, c1 = p4 / c2, p1 - zeta
     c3 = p3 - zeta * c2 - kappa * c1
     k1 = c1 * p.Omega
     k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
-    unit_a = naming.replace(p, a=1.0, Ixx=1.0, Ixx_added=0.0, If=1.0)
-    k2_per_ratio = cyclic_moment(unit_a, 1.0 / (p.L1 * (p.L2 + p.L3)))
-    return {
-        "a/Ixx": k2 / k2_per_ratio,
-        "a/If": k1 / flapping_rate_gain(unit_a),
-        "p2": p2,
-        "p2_expected": c2 + zeta * c1 + kappa,
-    }
+    unit_a = naming.replace(p, a=1.0, If=1.0)
+    moment_per_a = cyclic_moment(unit_a, 1.0 / (p.L1 * (p.L2 + p.L3)))
+    over = f"a/{axis.inertia}"
+    total = k2 / moment_per_a  # a over the whole inertia, what is added included
+    ratios = {over: total * (inertia + added) / inertia, "a/If": k1 / flapping_rate_gain(unit_a)}
+    return Ratios(ratios, p2, c2 + zeta * c1 + kappa)

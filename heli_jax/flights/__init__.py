@@ -1,0 +1,18 @@
+"""Logged runs: the one place where log files are read, units converted and clocks checked."""
+
+from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.read import read_flight, require_moving_inputs
+
+__all__ = [
+    "ColumnInfo",
+    "Flight",
+    "Gap",
+    "LogInfo",
+    "Signal",
+    "Source",
+    "TimeInfo",
+    "describe_log",
+    "read_flight",
+    "require_moving_inputs",
+]

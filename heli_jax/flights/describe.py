@@ -1,0 +1,196 @@
+"""What a log holds, before anybody asks for anything."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from heli_jax import units
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
+from heli_jax.flights.table import Survey, Table, column, open_table, require_columns, wrong
+
+_TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+_UNIT_AT_END = re.compile(
+    r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))(s|sec|ms|us|µs|ns|min)(?(open)[\])])$"
+)
+_GAP_STEPS = 1.5
+
+
+@dataclass(frozen=True)
+class ColumnInfo:
+    """One column: `count` cells are filled; the numbers are NaN for text or where none is finite.
+
+    The numbers are over the finite values, in the log's unit.
+    """
+
+    name: str
+    kind: Literal["number", "text"]
+    count: int
+    n_nan: int
+    min: float
+    max: float
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A step of more than one and a half usual ones: when it starts, from the first sample [s]."""
+
+    start: float
+    length: float
+
+
+@dataclass(frozen=True)
+class TimeInfo:
+    """The log's clock.
+
+    `rate` [Hz] is that of the usual step; `jitter` the largest error of a step in steps, NaN where
+    the stamps are no uniform grid; `problem` says why they are no clock at all, otherwise empty.
+    """
+
+    column: str
+    unit: str
+    duration: float
+    rate: float
+    uniform: bool
+    jitter: float
+    gaps: tuple[Gap, ...]
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """What a log holds; `time` is None where no column looks like a clock."""
+
+    path: str
+    format: str
+    size: int
+    sha256: str
+    n_rows: int
+    columns: tuple[ColumnInfo, ...]
+    time: TimeInfo | None
+
+
+def describe_log(path: str | Path, time: str | Signal | None = None) -> LogInfo:
+    """Signals, rates, duration and gaps of a log.
+
+    Args:
+        path: the log, in a format that `read_flight` reads.
+        time: the column of time stamps, in seconds where only its name is given; by default a
+            column with a usual name (its unit from an ending such as `_ms`), or the first that
+            increases from row to row.
+
+    Raises:
+        InputError: the log cannot be read, or has no such column.
+    """
+    table = open_table(path)
+    survey = table.survey()
+    signal = _guess_time(table, survey) if time is None else _asked_time(table, survey, time)
+    return LogInfo(
+        path=table.path,
+        format=table.format,
+        size=table.size,
+        sha256=table.sha256,
+        n_rows=_n_rows(table, survey),
+        columns=tuple(_describe_column(found) for found in survey),
+        time=None if signal is None else _describe_time(table, survey, signal),
+    )
+
+
+def _n_rows(table: Table, survey: list[Survey]) -> int:
+    return max(
+        (found.n_filled if found.values is None else found.values.size for found in survey),
+        default=0,
+    )
+
+
+def _describe_column(found: Survey) -> ColumnInfo:
+    nan = float("nan")
+    if found.values is None:
+        return ColumnInfo(found.name, "text", found.n_filled, 0, nan, nan, nan, nan)
+    n_nan = int(np.count_nonzero(np.isnan(found.values)))
+    x = found.values[np.isfinite(found.values)]
+    numbers = (nan, nan, nan, nan)
+    if x.size:
+        with np.errstate(all="ignore"):
+            numbers = (float(x.min()), float(x.max()), float(x.mean()), float(x.std()))
+    return ColumnInfo(found.name, "number", found.n_filled, n_nan, *numbers)
+
+
+def _asked_time(table: Table, survey: list[Survey], time: str | Signal) -> Signal:
+    signal = Signal(time, "s", "s") if isinstance(time, str) else time
+    require_columns(table.path, table.names, [signal.name])
+    if _values(survey, signal.name) is None:
+        raise wrong(table.path, "holds text, wanted are times", column(signal.name))
+    try:
+        units.factor(signal.unit, "s")
+    except ValueError as e:
+        raise wrong(table.path, str(e), column(signal.name)) from e
+    return signal
+
+
+def _guess_time(table: Table, survey: list[Survey]) -> Signal | None:
+    numeric = [found.name for found in survey if found.values is not None]
+    for name in numeric:
+        stem, unit = _split_unit(name)
+        if stem.casefold() in _TIME_NAMES or table.time_unit(name):
+            return Signal(name, unit, "s")
+    for name in numeric:
+        values = _values(survey, name)
+        if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
+            return Signal(name, _split_unit(name)[1], "s")
+    return None
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    match = _UNIT_AT_END.fullmatch(name)
+    return (match[1], match[3]) if match else (name, "s")
+
+
+def _values(survey: list[Survey], name: str) -> np.ndarray | None:
+    return next(found.values for found in survey if found.name == name)
+
+
+def _describe_time(table: Table, survey: list[Survey], signal: Signal) -> TimeInfo:
+    unit = table.time_unit(signal.name) or signal.unit
+    stamps = _values(survey, signal.name)
+    assert stamps is not None
+    with np.errstate(all="ignore"):
+        seconds = stamps * units.factor(unit, "s")
+        steps = np.diff(seconds)
+    problem = _clock_problem(seconds, steps)
+    nan = float("nan")
+    if problem:
+        return TimeInfo(signal.name, unit, nan, nan, False, nan, (), problem)
+    usual = float(np.median(steps))
+    grid = uniform_grid(seconds, rounding_of(stamps) * units.factor(unit, "s"))
+    uneven = isinstance(grid, Uneven)
+    long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
+    return TimeInfo(
+        column=signal.name,
+        unit=unit,
+        duration=float(seconds[-1] - seconds[0]),
+        rate=1.0 / (usual if uneven else grid.dt),
+        uniform=not uneven,
+        jitter=nan if uneven else grid.jitter,
+        gaps=tuple(Gap(float(seconds[i] - seconds[0]), float(steps[i])) for i in long),
+    )
+
+
+def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
+    if seconds.size < 2:
+        return "a single sample"
+    bad = int(np.count_nonzero(~np.isfinite(seconds)))
+    if bad:
+        return f"{bad} stamps are empty or no finite numbers"
+    if not np.all(np.isfinite(steps)):
+        return "the stamps are too far apart"
+    if not np.all(steps > 0):
+        row = int(np.flatnonzero(steps <= 0)[0])
+        what = "stands still" if steps[row] == 0 else "runs backwards"
+        return f"the time {what} after {seconds[row] - seconds[0]:.6g} s"
+    return ""

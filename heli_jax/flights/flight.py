@@ -1,0 +1,116 @@
+"""What a flight is, whichever log it came from."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One signal of a log.
+
+    Attributes:
+        name: the column's name in the log.
+        unit: the unit in the log, such as `deg`.
+        si: the SI unit that the model wants, such as `rad`.
+        sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
+    """
+
+    name: str
+    unit: str
+    si: str
+    sd: float | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did."""
+
+    path: str
+    sha256: str
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One run on a uniform time grid, in SI units.
+
+    The arrays are copied and made read-only.
+
+    Attributes:
+        dt: time between samples [s].
+        inputs: samples (N,) by the model's name; each holds until the next sample.
+        outputs: samples (N,) by the model's name.
+        t0: time in the log of the first sample [s].
+        sd: standard deviation of the measurement noise by output, only where it was stated.
+        known: parameters that differ in this run, SI.
+        hold_out: whether the run serves for validation alone.
+
+    Raises:
+        ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
+            not finite; `sd` names no output or is not positive; `known` is not finite.
+    """
+
+    dt: float
+    inputs: dict[str, np.ndarray]
+    outputs: dict[str, np.ndarray]
+    t0: float = 0.0
+    sd: dict[str, float] = field(default_factory=dict)
+    known: dict[str, float] = field(default_factory=dict)
+    hold_out: bool = False
+    name: str = ""
+    source: Source | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.dt) and self.dt > 0):
+            raise ValueError(f"dt is {self.dt}, wanted is a positive number of seconds")
+        if not math.isfinite(self.t0):
+            raise ValueError(f"t0 is {self.t0}, wanted is a finite number of seconds")
+        for kind in ("inputs", "outputs"):
+            signals = {name: _samples(name, x) for name, x in getattr(self, kind).items()}
+            object.__setattr__(self, kind, signals)
+        lengths = {name: x.size for name, x in (*self.inputs.items(), *self.outputs.items())}
+        if not lengths:
+            raise ValueError("a flight needs at least one input or output")
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"the signals differ in length: {lengths}")
+        object.__setattr__(self, "sd", dict(self.sd))
+        object.__setattr__(self, "known", dict(self.known))
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        for name, sd in self.sd.items():
+            if name not in self.outputs:
+                raise ValueError(f"sd is stated for {name!r}, which is no output of this flight")
+            if not (math.isfinite(sd) and sd > 0):
+                raise ValueError(f"sd of {name!r} is {sd}, wanted is a positive number")
+        for name, value in self.known.items():
+            if not math.isfinite(value):
+                raise ValueError(f"known {name!r} is {value}, wanted is a finite number")
+
+    @property
+    def n_samples(self) -> int:
+        """N, the number of samples of every signal."""
+        return next(iter((*self.inputs.values(), *self.outputs.values()))).size
+
+    @property
+    def times(self) -> np.ndarray:
+        """Time of each sample from the first one on, shape (N,) [s]."""
+        return self.dt * np.arange(self.n_samples)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return self.dt * (self.n_samples - 1)
+
+
+def _samples(name: str, values: np.ndarray) -> np.ndarray:
+    samples = np.array(values, dtype=np.float64)
+    if samples.ndim != 1 or samples.size == 0:
+        raise ValueError(f"{name!r} has shape {samples.shape}, wanted is (N,) with N >= 1")
+    bad = np.flatnonzero(~np.isfinite(samples))
+    if bad.size:
+        raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, wanted are numbers")
+    samples.setflags(write=False)
+    return samples

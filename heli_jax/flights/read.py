@@ -1,0 +1,221 @@
+"""From a log to a `Flight`: columns, units, window, clock."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax import units
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.grid import Grid, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.request import Request
+from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
+from heli_jax.flights.table import Table, column, open_table, wrong
+
+_FEWEST = 8
+_MOST_UPSAMPLING = 100
+
+
+def read_flight(
+    path: str | Path,
+    *,
+    time: str | Signal,
+    inputs: Mapping[str, Signal],
+    outputs: Mapping[str, Signal],
+    rate: float | None = None,
+    window: tuple[float, float] | None = None,
+    known: Mapping[str, float] | None = None,
+    hold_out: bool = False,
+    name: str = "",
+    moving_inputs: bool = True,
+) -> Flight:
+    """Read one run from a log in CSV or Parquet.
+
+    Args:
+        path: the log, ending in .csv, .txt, .tsv or .parquet.
+        time: the column of time stamps, in seconds where only its name is given.
+        inputs: the log's signals by the model's names; two inputs may share a column.
+        outputs: the same for what was measured.
+        rate: resample to this rate [Hz]. Without it the stamps must be a uniform grid.
+        window: first and last time to use [s], counted from the log's first sample.
+        known: parameters that differ in this run, SI.
+        hold_out: whether the run serves for validation alone.
+        name: what to call the run.
+        moving_inputs: whether an input that never moves is refused.
+
+    Raises:
+        InputError: one sentence on what is wrong with the log or with the arguments.
+    """
+    request = Request(str(path), time, inputs, outputs, rate, window, known or {})
+    table = open_table(path)
+    numbers = table.numbers(request.columns)
+    seconds, rounding = _clock(table, request.time, numbers[request.time.name])
+    rows, notes = _rows(table.path, seconds, window)
+    signals = _to_si(table, request, numbers, rows)
+    grid = uniform_grid(seconds[rows], rounding[rows])
+    if isinstance(grid, Uneven) and rate is None:
+        raise _uneven(table, request.time.name, seconds[rows], rows.start, grid)
+    dt, samples, more = _on_grid(table, request, seconds, rows, signals, grid)
+    flight = Flight(
+        dt=dt,
+        inputs={key: samples[key, "input"] for key in inputs},
+        outputs={key: samples[key, "output"] for key in outputs},
+        t0=float(seconds[rows.start]),
+        sd=request.noise(),
+        known=dict(request.known),
+        hold_out=hold_out,
+        name=name,
+        source=Source(table.path, table.sha256, notes + more),
+    )
+    if moving_inputs:
+        require_moving_inputs(flight)
+    return flight
+
+
+def require_moving_inputs(flight: Flight) -> None:
+    """Refuse a flight in which an input never moves: its effect cannot be learnt.
+
+    Raises:
+        InputError: naming the input and the value it keeps.
+    """
+    path = flight.source.path if flight.source else flight.name or "flight"
+    for name, values in flight.inputs.items():
+        if values.min() == values.max():
+            raise wrong(
+                path,
+                f"stays at {values[0]:.6g} (SI) for all of {flight.duration:.6g} s, so nothing"
+                " can be learnt from it; wanted is an input that moves",
+                f"input {name!r}",
+            )
+
+
+def _clock(table: Table, time: Signal, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (N,) in seconds and the rounding (N,) [s] that is evident in them."""
+    place = column(time.name)
+    scale = units.factor(table.time_unit(time.name) or time.unit, "s")
+    with np.errstate(over="ignore"):
+        seconds = stamps * scale
+    bad = np.flatnonzero(~np.isfinite(seconds))
+    if bad.size:
+        row = int(bad[0])
+        found = f"found {table.found(time.name, row)}, wanted is a time"
+        raise wrong(table.path, found, table.place(row), place)
+    with np.errstate(over="ignore"):
+        back = np.flatnonzero(np.diff(seconds) <= 0)
+    if back.size:
+        row = int(back[0]) + 1
+        what = "stands still" if seconds[row] == seconds[row - 1] else "runs backwards"
+        after, now = table.found(time.name, row - 1), table.found(time.name, row)
+        problem = f"the time {what}, found {now} after {after}, wanted are increasing times"
+        raise wrong(table.path, problem, table.place(row), place)
+    return seconds, rounding_of(stamps) * scale
+
+
+def _rows(
+    path: str, seconds: np.ndarray, window: tuple[float, float] | None
+) -> tuple[slice, tuple[str, ...]]:
+    """The rows inside the window, and a note where the window reaches beyond the log."""
+    first, last, notes = 0, seconds.size, ()
+    where = "the log"
+    if window is not None and seconds.size > 1:
+        elapsed = seconds - seconds[0]
+        step = float(np.median(np.diff(seconds)))
+        start, end = window
+        where = f"the window from {start:g} s to {end:g} s"
+        if end < 0 or start > elapsed[-1]:
+            raise wrong(
+                path,
+                f"{where} lies outside the log, wanted is a part of 0 s to {elapsed[-1]:.6g} s",
+            )
+        if start < 0 or end > elapsed[-1] + step:
+            notes = (f"{where} was cut to the log, which ends at {elapsed[-1]:.6g} s",)
+        # The bounds are inclusive whatever the rounding of the stamps.
+        first = int(np.searchsorted(elapsed, start - 1e-3 * step, side="left"))
+        last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
+    if last - first < _FEWEST:
+        count = max(last - first, 0)
+        raise wrong(path, f"{where} holds {count} samples, wanted are at least {_FEWEST}")
+    return slice(first, last), notes
+
+
+_Samples = dict[tuple[str, str], np.ndarray]
+
+
+def _to_si(
+    table: Table, request: Request, numbers: Mapping[str, np.ndarray], rows: slice
+) -> _Samples:
+    """The signals (N,) inside the window in SI, by name and kind."""
+    samples = {}
+    for (key, kind), signal in request.signals.items():
+        with np.errstate(over="ignore"):
+            values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            row = rows.start + int(bad[0])
+            found = f"found {table.found(signal.name, row)}, wanted is a finite number"
+            raise wrong(table.path, found, table.place(row), column(signal.name))
+        samples[key, kind] = values
+    return samples
+
+
+def _uneven(table: Table, name: str, seconds: np.ndarray, start: int, uneven: Uneven) -> ValueError:
+    """The error for stamps that are no uniform grid, with the remedy."""
+    place = table.place(start + uneven.row)
+    if uneven.drift is not None:
+        problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
+    else:
+        problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
+    remedy = f"give `rate: {1 / uneven.usual:.4g}` to resample, or a window"
+    if np.diff(seconds).max() > longest_gap(seconds):
+        remedy = "give a window"
+    wanted = f"wanted is a uniform grid; {remedy} without such steps"
+    return wrong(table.path, f"{problem}, {wanted}", place, column(name))
+
+
+def _on_grid(
+    table: Table,
+    request: Request,
+    seconds: np.ndarray,
+    rows: slice,
+    signals: _Samples,
+    grid: Grid | Uneven,
+) -> tuple[float, _Samples, tuple[str, ...]]:
+    """The time step, the signals on the uniform grid, and notes on how they came there."""
+    stamps, rate = seconds[rows], request.rate
+    notes: tuple[str, ...] = ()
+    if isinstance(grid, Grid):
+        if rate is None:
+            return grid.dt, signals, grid.notes
+        if abs(rate * grid.dt - 1.0) * stamps.size < 0.5:
+            return 1.0 / rate, signals, grid.notes
+        # The grid is better than its rounded stamps: held inputs would slip by a sample.
+        stamps, notes = stamps[0] + grid.dt * np.arange(stamps.size), grid.notes
+    assert rate is not None
+    _check_rate(table, request.time.name, stamps, rows.start, rate)
+    clock = new_clock(stamps, rate)
+    move = {"input": hold, "output": interpolate}
+    samples = {k: move[k[1]](stamps, x, clock.times) for k, x in signals.items()}
+    return clock.dt, samples, notes + clock.notes
+
+
+def _check_rate(table: Table, name: str, seconds: np.ndarray, start: int, rate: float) -> None:
+    """Refuse gaps that nothing should bridge, and rates that make no sense for the log."""
+    steps = np.diff(seconds)
+    row, most = int(np.argmax(steps)), longest_gap(seconds)
+    if steps[row] > most * (1 + 1e-9):
+        raise wrong(
+            table.path,
+            f"found a gap of {steps[row]:.6g} s after {seconds[row]:.10g} s, wanted is none longer"
+            f" than {most:.3g} s; give a window without it",
+            table.place(start + row + 1),
+            column(name),
+        )
+    usual = float(np.median(steps))
+    count = (seconds[-1] - seconds[0]) * rate
+    if not count >= _FEWEST - 1 - 1e-6:
+        problem = f"a rate of {rate:g} Hz leaves fewer than {_FEWEST} samples, wanted are more"
+        raise wrong(table.path, problem)
+    if not (rate * usual <= _MOST_UPSAMPLING and math.isfinite(count)):
+        problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
+        raise wrong(table.path, f"{problem}, wanted is at most {_MOST_UPSAMPLING} times as much")

@@ -1,0 +1,57 @@
+"""A flight's samples on another clock."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_GAP_STEPS = 5.0
+_GAP_SECONDS = 0.25
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Where to sample: `times` (M,) [s], `dt` apart, and what to tell the reader of it."""
+
+    times: np.ndarray
+    dt: float
+    notes: tuple[str, ...]
+
+
+def longest_gap(seconds: np.ndarray) -> float:
+    """The longest step [s] between stamps (N,) [s] that may be bridged."""
+    return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
+
+
+def new_clock(seconds: np.ndarray, rate: float) -> Clock:
+    """A uniform clock of `rate` [Hz] from the first of the stamps (N,) [s] to the last."""
+    usual = float(np.median(np.diff(seconds)))
+    # The last sample is not lost to the rounding of its stamp.
+    count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
+    notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
+    if rate * usual < 0.5:
+        notes.append("nothing was filtered: what the log holds above half the new rate is aliased")
+    if rate * usual > 2.0:
+        notes.append("outputs were interpolated between samples: their noise is no longer white")
+    return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
+
+
+def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The value of the sample before each time: a stick stays until the next sample.
+
+    A time that misses a stamp by rounding alone counts as at the stamp.
+
+    Args:
+        seconds: stamps (N,) [s], increasing.
+        values: samples (N,).
+        times: (M,) [s], none before the first stamp.
+
+    Returns:
+        (M,), in the samples' unit.
+    """
+    tolerance = 1e-6 * float(np.median(np.diff(seconds)))
+    return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
+
+
+def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The straight line between neighbouring samples, arguments and result as in `hold`."""
+    return np.interp(times, seconds, values)

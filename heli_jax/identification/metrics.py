@@ -1,0 +1,102 @@
+"""How well a simulated signal agrees with a measured one, and whether what is left is white."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+
+
+class Metrics(NamedTuple):
+    """Agreement of one output; NaN where a signal never moves."""
+
+    vaf: float
+    """variance accounted for, 1 - var(residual)/var(measured)"""
+    nrmse_fit_percent: float
+    """100 (1 - |residual| / |measured - mean|)"""
+    rmse: float
+    """in the output's SI unit"""
+    tic: float
+    """Theil inequality coefficient, 0 (equal) to 1"""
+
+
+def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
+    """Agreement of two signals (N,)."""
+    residual = measured - simulated
+    spread = np.linalg.norm(measured - measured.mean())
+    rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
+    rmse = float(np.sqrt(np.mean(residual**2)))
+    return Metrics(
+        vaf=float(1.0 - np.var(residual) / np.var(measured)) if spread > 0 else float("nan"),
+        nrmse_fit_percent=(
+            float(100.0 * (1.0 - np.linalg.norm(residual) / spread)) if spread > 0 else float("nan")
+        ),
+        rmse=rmse,
+        tic=float(rmse / rms) if rms > 0 else float("nan"),
+    )
+
+
+class Whiteness(NamedTuple):
+    """Whether residuals look like white noise over all their lags."""
+
+    white: bool
+    p_value: float
+    """of the Ljung-Box test over `lags` lags"""
+    lags: int
+    outside: float
+    """share of the lags outside the 99 % band"""
+    lag1: float
+    """autocorrelation at one sample"""
+
+
+def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
+    """Autocorrelation (lags + 1,) from lag 0, by the biased estimate."""
+    r = residual - residual.mean()
+    n = r.size
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft(r, size)) ** 2
+    c = np.fft.irfft(spectrum, size)[: lags + 1] / n
+    return c / c[0] if c[0] > 0 else np.concatenate([[1.0], np.zeros(lags)])
+
+
+def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
+    """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags."""
+    a, b = u - u.mean(), residual - residual.mean()
+    n = a.size
+    size = 1 << (2 * n - 1).bit_length()
+    c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
+    both = np.concatenate([c[-lags:], c[: lags + 1]])
+    scale = a.std() * b.std()
+    return both / scale if scale > 0 else np.zeros(2 * lags + 1)
+
+
+def lags_for(n: int) -> int:
+    """How many lags a record of n samples bears: a quarter of it, at most 500."""
+    return max(1, min(n // 4, 500))
+
+
+def whiteness(residual: np.ndarray) -> Whiteness:
+    """The Ljung-Box test at 1 % on residuals (N,)."""
+    n, lags = residual.size, lags_for(residual.size)
+    r = autocorrelation(residual, lags)[1:]
+    statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, lags + 1)))
+    # Few lags see a short memory that many lags would drown; both must agree with white noise.
+    short = min(lags, 20)
+    q_short = n * (n + 2) * np.sum(r[:short] ** 2 / (n - np.arange(1, short + 1)))
+    p = min(
+        1.0,
+        2.0 * min(scipy.stats.chi2.sf(statistic, lags), scipy.stats.chi2.sf(q_short, short)),
+    )
+    outside = float(np.mean(np.abs(r) > 2.5758 / np.sqrt(n)))
+    return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0]))
+
+
+def noise_guess(signal: np.ndarray) -> float:
+    """White measurement noise sd of a smooth signal, from its third differences.
+
+    Third differences of white noise have variance 20 sd^2; what is smooth all but vanishes in
+    them. Robust against the corners of a response (median of absolute values).
+    """
+    d = np.diff(signal, 3)
+    guess = float(np.median(np.abs(d)) / 0.6744897501960817 / np.sqrt(20.0))
+    floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
+    return max(guess, floor, 1e-300)

@@ -1,0 +1,118 @@
+"""Levenberg-Marquardt by optimistix on the one residual, from one start or many."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from heli_jax.identification.residual import Data, Layout, evaluate, residuals
+
+
+class Optimum(NamedTuple):
+    """Where one run of the optimiser ended."""
+
+    z: Float[Array, " q"]
+    cost: Float[Array, ""]
+    """sum of squares of all rows, priors included, over the number of measured numbers"""
+    steps: Any
+    converged: Any
+    """the optimiser's own word, and everything finite"""
+
+
+class _LevenbergMarquardt(optx.AbstractGaussNewton):
+    """optimistix's Levenberg-Marquardt with a trust region that opens faster.
+
+    The default waits for an all but perfect model (ratio 0.99) before it lowers the damping.
+    """
+
+    rtol: float
+    atol: float
+    norm: Any
+    descent: Any
+    search: Any
+    verbose: Any
+
+    def __init__(self, rtol: float, atol: float):
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
+        self.search = optx.ClassicalTrustRegion(
+            high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.1
+        )
+        self.verbose = lambda **_: None
+
+
+_COLUMN = 1000.0
+"""Column norm of the scaled Jacobian at the start: optimistix begins with damping 1, which is
+then a millionth of J'J; a step that fails raises it tenfold."""
+
+
+class Scaling(NamedTuple):
+    """Units in which the optimiser sees a start: z = z0 + unit * xi, residuals / level."""
+
+    unit: Float[Array, " q"]
+    level: Float[Array, ""]
+
+
+def scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> Scaling:
+    """Columns of equal norm and a cost of order one; an unknown without effect stays put."""
+    norms = jnp.linalg.norm(J0, axis=0)
+    norms = jnp.where(jnp.isfinite(norms), norms, 0.0)
+    usable = norms > 1e-12 * jnp.max(norms)
+    level = jnp.maximum(jnp.linalg.norm(r0), 1e-300)
+    return Scaling(jnp.where(usable, _COLUMN * level / jnp.where(usable, norms, 1.0), 0.0), level)
+
+
+@eqx.filter_jit
+def optimise(
+    layout: Layout,
+    data: Data,
+    sd: tuple[dict[str, Any], ...],
+    z0: Float[Array, " q"],
+    units: Scaling,
+    max_steps: int = 100,
+) -> Optimum:
+    """The least-squares optimum from z0; compiled once per layout and shapes."""
+
+    def fn(xi: Array, _: Any) -> Array:
+        return residuals(layout, data, sd, z0 + units.unit * xi) / units.level
+
+    solution = optx.least_squares(
+        fn,
+        _LevenbergMarquardt(rtol=1e-10, atol=1e-10),
+        jnp.zeros_like(z0),
+        max_steps=max_steps,
+        throw=False,
+        options={"jac": "fwd"},
+    )
+    z = z0 + units.unit * solution.value
+    rows = residuals_count(layout, data)
+    cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / rows
+    fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
+    converged = (solution.result == optx.RESULTS.successful) & fine
+    return Optimum(z, cost, solution.stats["num_steps"], converged)
+
+
+@eqx.filter_jit
+def optimise_many(
+    layout: Layout,
+    data: Data,
+    sd: tuple[dict[str, Any], ...],
+    starts: Float[Array, "s q"],
+    max_steps: int = 100,
+) -> Optimum:
+    """`optimise` from several starts at once, by vmap; every field gains an axis (s,)."""
+
+    def one(z0: Array) -> Optimum:
+        e = evaluate(layout, data, sd, z0)
+        return optimise(layout, data, sd, z0, scaling(e.r, e.J), max_steps)
+
+    return jax.vmap(one)(starts)
+
+
+def residuals_count(layout: Layout, data: Data) -> int:
+    """How many measured numbers there are."""
+    return sum(y.shape[0] for flight in data.flights for y in flight.outputs.values())

@@ -1,0 +1,197 @@
+"""Problem: what is fitted to what."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model, linear_misfit, zeros
+from heli_jax.errors import nearest
+from heli_jax.flights.flight import Flight
+from heli_jax.vehicle import Helicopter, impossible
+
+
+class Prior(NamedTuple):
+    """What is known of a parameter beforehand: a normal distribution, in the parameter's unit."""
+
+    mean: float
+    sd: float
+
+
+class Free(NamedTuple):
+    """A parameter to be estimated: where to start, between what bounds, with what prior."""
+
+    start: float
+    lower: float | None = None
+    upper: float | None = None
+    prior: Prior | None = None
+
+
+class Nuisance(NamedTuple):
+    """Unknowns of the experiment, estimated beside the parameters.
+
+    `initial_state` and `bias` belong to each flight; `input_gain` (one factor an input) and
+    `time_shift` [s] (the stick acted this much later, or earlier where negative, than logged)
+    are shared by all flights.
+    """
+
+    initial_state: bool = True
+    bias: bool = True
+    time_shift: bool = False
+    input_gain: bool = False
+
+
+MAX_TIME_SHIFT = 0.5
+"""Bound on an estimated time shift to either side [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A model, a vehicle, flights, and what is free.
+
+    Flights with `hold_out` are predicted, never fitted. A flight's `known` parameters replace the
+    vehicle's for that flight.
+
+    Raises:
+        ValueError: something in it does not fit together; the sentence says what and where.
+    """
+
+    model: Model
+    vehicle: Any
+    flights: tuple[Flight, ...]
+    free: Mapping[str, Free]
+    nuisance: Nuisance = field(default_factory=Nuisance)
+    solver: str | None = None
+    substeps: int = 4
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flights", tuple(self.flights))
+        object.__setattr__(self, "free", dict(self.free))
+        if not self.free:
+            raise ValueError("nothing is free: name at least one parameter to estimate")
+        for name, one in self.free.items():
+            _check_free(name, one, self.model)
+        _check_possible(self)
+        if not self.training:
+            raise ValueError("no flight to fit: every one is held out")
+        for flight in self.flights:
+            _check_flight(flight, self)
+        _check_model(self)
+
+    @property
+    def training(self) -> tuple[Flight, ...]:
+        """The flights that are fitted."""
+        return tuple(f for f in self.flights if not f.hold_out)
+
+    def start_params(self) -> Any:
+        """The vehicle with the free parameters at their starts."""
+        return naming.replace(self.vehicle, **{n: jnp.asarray(f.start, jnp.result_type(float))
+                                               for n, f in self.free.items()})
+
+
+def _check_free(name: str, one: Free, model: Model) -> None:
+    if name not in naming.names(model.Params):
+        known = naming.names(model.Params)
+        raise ValueError(f"free.{name}: model {model.name} has no such parameter"
+                         f"{nearest(name, known)}")
+    numbers = {"start": one.start, "lower": one.lower, "upper": one.upper}
+    if one.prior is not None:
+        numbers |= {"prior.mean": one.prior.mean, "prior.sd": one.prior.sd}
+    for key, value in numbers.items():
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"free.{name}.{key}: found {value}, wanted is a finite number")
+    if one.prior is not None and one.prior.sd <= 0:
+        raise ValueError(f"free.{name}.prior.sd: found {one.prior.sd:g}, wanted is above zero")
+    low, high = one.lower, one.upper
+    if low is not None and high is not None and low >= high:
+        raise ValueError(f"free.{name}: lower {low:g} is not below upper {high:g}")
+    if (low is not None and one.start <= low) or (high is not None and one.start >= high):
+        shown = f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
+        raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
+    if one.start == 0 and (low is None or high is None):
+        raise ValueError(
+            f"free.{name}.start: found 0 without two bounds, wanted is a start of the right sign "
+            "and size, or lower and upper"
+        )
+
+
+def _check_possible(problem: Problem) -> None:
+    if problem.model.Params is not Helicopter:
+        return
+    for key in ("start", "lower", "upper"):
+        values = {n: getattr(f, key) for n, f in problem.free.items()}
+        given = {n: v for n, v in values.items() if v is not None and not (key != "start" and v == 0)}
+        wrong = impossible(given)
+        if wrong:
+            raise ValueError(f"free: the {key} of {wrong}")
+    concrete = {n: float(np.asarray(v)) for n, v in naming.asdict(problem.start_params()).items()}
+    wrong = impossible({n: v for n, v in concrete.items() if not math.isnan(v)})
+    if wrong:
+        raise ValueError(f"vehicle with the free parameters at their starts: {wrong}")
+
+
+def _check_flight(flight: Flight, problem: Problem) -> None:
+    where = f"flight {flight.name!r}" if flight.name else "a flight"
+    model = problem.model
+    missing = [n for n in naming.names(model.Inputs) if n not in flight.inputs]
+    if missing:
+        raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
+    unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
+    if unknown:
+        raise ValueError(f"{where}: model {model.name} has no output {unknown[0]!r}"
+                         f"{nearest(unknown[0], naming.names(model.Outputs))}")
+    if not flight.outputs:
+        raise ValueError(f"{where} has no output: nothing can be compared with the model")
+    for name, value in flight.known.items():
+        if name not in naming.names(model.Params):
+            raise ValueError(f"{where}, known.{name}: model {model.name} has no such parameter"
+                             f"{nearest(name, naming.names(model.Params))}")
+        if name in problem.free:
+            raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
+        if not math.isfinite(value):
+            raise ValueError(f"{where}, known.{name}: found {value}, wanted is a finite number")
+        wrong = impossible({name: value}) if model.Params is Helicopter else None
+        if wrong:
+            raise ValueError(f"{where}, known: {wrong}")
+    if not flight.hold_out and flight.n_samples < 3 * len(problem.free):
+        raise ValueError(
+            f"{where} has {flight.n_samples} samples for {len(problem.free)} free parameters, "
+            f"wanted are {3 * len(problem.free)} at least"
+        )
+
+
+def _check_model(problem: Problem) -> None:
+    params = problem.start_params()
+    for flight in problem.flights:
+        known = {n: jnp.asarray(v, jnp.result_type(float)) for n, v in flight.known.items()}
+        missing = needed_but_missing(problem.model, naming.replace(params, **known))
+        if missing:
+            raise ValueError(
+                f"vehicle: {', '.join(missing)} missing, model {problem.model.name} needs it"
+            )
+    if problem.model.linear and linear_misfit(problem.model, params) > 1e-6:
+        raise ValueError(
+            f"model {problem.model.name} says linear=True, but its vector field or output is not "
+            "linear in state and inputs at the start values"
+        )
+
+
+def needed_but_missing(model: Model, params: Any) -> list[str]:
+    """The parameters that are NaN (not given) and that the model reads, in field order."""
+    values = naming.asdict(params)
+    open_ = [n for n, v in values.items() if bool(np.isnan(np.asarray(v)))]
+
+    def reads(name: str) -> bool:
+        one = jnp.ones((), jnp.result_type(float))
+        filled = naming.replace(params, **{n: one for n in open_ if n != name})
+        x = jax.tree.map(jnp.ones_like, zeros(model.State))
+        u = jax.tree.map(jnp.ones_like, zeros(model.Inputs))
+        parts = model.vector_field(filled, x, u), model.output(filled, x, u)
+        return any(bool(np.isnan(np.asarray(v)).any()) for v in jax.tree.leaves(parts))
+
+    return [n for n in open_ if reads(n)]

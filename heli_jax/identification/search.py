@@ -1,0 +1,215 @@
+"""Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.identification import coordinates
+from heli_jax.identification.optimise import Optimum, optimise, optimise_many, scaling
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
+from heli_jax.identification.residual import Data, Layout, evaluate, layout_of, predict, unpack
+
+if TYPE_CHECKING:
+    from heli_jax.identification.fit import Progress, StartRow
+
+_CHUNK = 4
+_SHIFTS = 41
+
+
+def first_guess(
+    layout: Layout, data: Data, sd: Any, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with the time shift from a coarse search and a single gain by linear least squares.
+
+    Without either among the unknowns z0 comes back as it is.
+    """
+    if not (layout.shift or len(layout.gains) == 1):
+        return z0
+    grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
+    coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
+    costs, gains = _scan(layout, data, sd, z0, jnp.asarray(coordinate, z0.dtype))
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        return z0
+    q = len(layout.free)
+    if len(layout.gains) == 1:
+        z0 = z0.at[q].set(gains[best])
+    if layout.shift:
+        z0 = z0.at[q + len(layout.gains)].set(coordinate[best])
+    return z0
+
+
+@eqx.filter_jit
+def _scan(
+    layout: Layout, data: Data, sd: Any, z0: Array, shifts: Array
+) -> tuple[Array, Array]:
+    """Cost and best single gain for each time shift, with means taken off both signals."""
+    q = len(layout.free)
+
+    def at(shift: Array) -> tuple[Array, Array]:
+        z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
+        runs = predict(layout, data, unpack(layout, data, z))
+        ys, ms = [], []
+        for flight, run, s in zip(data.flights, runs, sd, strict=True):
+            for n, y in flight.outputs.items():
+                m = getattr(run.outputs, n)
+                ys.append((y - jnp.mean(y)) / s[n])
+                ms.append((m - jnp.mean(m)) / s[n])
+        y, m = jnp.concatenate(ys), jnp.concatenate(ms)
+        gain = jnp.ones_like(y[0])
+        if len(layout.gains) == 1:
+            power = jnp.sum(m * m)
+            gain = jnp.where(power > 0, jnp.sum(y * m) / jnp.where(power > 0, power, 1.0), gain)
+        return jnp.mean(jnp.square(y - gain * m)), gain
+
+    return jax.lax.map(at, shifts)
+
+
+def draw(
+    layout: Layout, problem: Problem, z0: Float[Array, " q"], starts: int, seed: int
+) -> Float[Array, "s q"]:
+    """Starts (s, q): the first is z0, the others differ in the free parameters.
+
+    Between two bounds of one sign the draw is uniform in log, between two of different sign
+    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior.
+    """
+    rng = np.random.default_rng(seed)
+    rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
+    dtype = z0.dtype
+    for i, (free, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
+        values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
+        sign = jnp.asarray(np.sign(free.start) or 1.0, dtype)
+        low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
+        rows[1:, i] = np.asarray(coordinates.to_coordinate(how, values, sign, low, high))
+    return jnp.asarray(rows, dtype)
+
+
+def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
+    share = rng.uniform(0.02, 0.98, size)
+    low, high = free.lower, free.upper
+    if low is not None and high is not None:
+        if low * high > 0:
+            return low * (high / low) ** share
+        return low + (high - low) * share
+    width = 1.1
+    if free.prior is not None and free.prior.mean:
+        width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
+    values = free.start * np.exp(width * rng.standard_normal(size))
+    return np.where([coordinates.inside(free, v) for v in values], values, free.start)
+
+
+class Search:
+    """The optimiser over a problem: log coordinates first, bounded ones where that leaves them.
+
+    An optimum inside the bounds is the same in any coordinates; the bounded ones are needed, and
+    compiled, only where the free optimum lies outside.
+    """
+
+    def __init__(
+        self, problem: Problem, layout: Layout, data: Data, max_steps: int, *, many: bool
+    ) -> None:
+        self.problem, self.layout, self.data = problem, layout, data
+        self.max_steps, self.many = max_steps, many
+        self.bounded = layout_of(problem, problem.training, bounded=True)
+
+    def run(
+        self, sd: Any, points: Float[Array, "s q"], tell: "Progress | None" = None
+    ) -> list[Optimum]:
+        """An optimum for each start, all in the coordinates of `layout`."""
+        runs = self._run(self.layout, sd, points, tell)
+        if self.bounded.kinds == self.layout.kinds:
+            return runs
+        left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
+        if left:
+            starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
+            for i, run in zip(left, self._run(self.bounded, sd, starts, tell), strict=True):
+                runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
+        return runs
+
+    def _run(
+        self, layout: Layout, sd: Any, points: Array, tell: "Progress | None"
+    ) -> list[Optimum]:
+        if not self.many:
+            return [self._one(layout, sd, z) for z in points]
+        runs: list[Optimum] = []
+        n = points.shape[0]
+        for begin in range(0, n, _CHUNK):
+            chunk = points[begin : begin + _CHUNK]
+            real = chunk.shape[0]
+            if real < _CHUNK:  # one shape, one compilation
+                chunk = jnp.concatenate([chunk, jnp.repeat(chunk[-1:], _CHUNK - real, axis=0)])
+            many = optimise_many(layout, self.data, sd, chunk, self.max_steps)
+            runs += [jax.tree.map(lambda v, i=i: v[i], many) for i in range(real)]
+            if tell is not None and n > _CHUNK:
+                tell(f"{min(begin + _CHUNK, n)} of {n} starts done")
+        return runs
+
+    def _one(self, layout: Layout, sd: Any, z0: Array) -> Optimum:
+        e = evaluate(layout, self.data, sd, z0)
+        return optimise(layout, self.data, sd, z0, scaling(e.r, e.J), self.max_steps)
+
+    def _inside(self, z: Array) -> bool:
+        values = named_values(self.layout, self.data, z)
+        return all(
+            not np.isfinite(v) or coordinates.inside(f, v)
+            for f, v in zip(self.problem.free.values(), values.values(), strict=True)
+        )
+
+    def _convert(self, z: Array, old: Layout, new: Layout) -> Array:
+        """The same point in another layout's coordinates; a value at a bound is moved inside."""
+        for i, (free, value) in enumerate(
+            zip(
+                self.problem.free.values(), named_values(old, self.data, z).values(), strict=True
+            )
+        ):
+            low, high = (float(b) for b in coordinates.limits(free))
+            if np.isfinite(low) and np.isfinite(high):
+                edge = 1e-9 * (high - low)
+                value = min(max(value, low + edge), high - edge)
+            args = (self.data.sign[i], self.data.low[i], self.data.high[i])
+            x = jnp.asarray(value, z.dtype)
+            z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *args))
+        return z
+
+
+def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:
+    """The free parameters' values at z."""
+    return {
+        n: float(coordinates.to_value(how, z[i], data.sign[i], data.low[i], data.high[i]))
+        for i, (n, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
+    }
+
+
+def table(
+    layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
+) -> tuple["StartRow", ...]:
+    """Start, end and cost of every run, best first; equal optima share a number."""
+    from heli_jax.identification.fit import StartRow
+
+    order = sorted(
+        range(len(runs)), key=lambda i: (not bool(runs[i].converged), _cost(runs[i]))
+    )
+    rows, optimum, last = [], 0, None
+    for i in order:
+        cost, converged = _cost(runs[i]), bool(runs[i].converged)
+        if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
+            optimum, last = optimum + 1, cost
+        rows.append(
+            StartRow(
+                named_values(layout, data, points[i]),
+                named_values(layout, data, runs[i].z),
+                cost, int(runs[i].steps), converged,
+                optimum if converged else 0,
+            )
+        )
+    return tuple(rows)
+
+
+def _cost(run: Optimum) -> float:
+    cost = float(run.cost)
+    return cost if np.isfinite(cost) else float("inf")
