@@ -1,0 +1,65 @@
+"""heli_jax: physical parameters of small helicopters from logged runs, with honest uncertainties.
+
+Units are SI throughout. Switch to float64 first: `jax.config.update("jax_enable_x64", True)`.
+Importing the package changes no setting; names are loaded when they are first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from heli_jax import models as models
+    from heli_jax.analysis.linear import linearize as linearize
+    from heli_jax.analysis.lti import c2d as c2d
+    from heli_jax.analysis.lti import d2c as d2c
+    from heli_jax.dynamics.model import Model as Model
+    from heli_jax.flights import Flight as Flight
+    from heli_jax.flights import Signal as Signal
+    from heli_jax.flights import read_flight as read_flight
+    from heli_jax.identification.fit import check as check
+    from heli_jax.identification.fit import fit as fit
+    from heli_jax.identification.problem import Free as Free
+    from heli_jax.identification.problem import Nuisance as Nuisance
+    from heli_jax.identification.problem import Prior as Prior
+    from heli_jax.identification.problem import Problem as Problem
+    from heli_jax.identification.rls import rls as rls
+    from heli_jax.simulation.simulate import accumulate as accumulate
+    from heli_jax.simulation.simulate import simulate as simulate
+    from heli_jax.vehicle import Helicopter as Helicopter
+    from heli_jax.vehicle import load_vehicle as load_vehicle
+
+_HOMES = {
+    "Helicopter": "vehicle",
+    "load_vehicle": "vehicle",
+    "Model": "dynamics.model",
+    "models": "",
+    "Flight": "flights",
+    "Signal": "flights",
+    "read_flight": "flights",
+    "simulate": "simulation.simulate",
+    "accumulate": "simulation.simulate",
+    "Problem": "identification.problem",
+    "Free": "identification.problem",
+    "Prior": "identification.problem",
+    "Nuisance": "identification.problem",
+    "check": "identification.fit",
+    "fit": "identification.fit",
+    "rls": "identification.rls",
+    "c2d": "analysis.lti",
+    "d2c": "analysis.lti",
+    "linearize": "analysis.linear",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'heli_jax' has no attribute {name!r}")
+    if name == "models":
+        return importlib.import_module("heli_jax.models")
+    return getattr(importlib.import_module(f"heli_jax.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

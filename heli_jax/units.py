@@ -97,6 +97,24 @@ def factor(unit: str, si: str) -> float:
     raise ValueError(f"unit {unit!r} is {_kind(have)}, wanted is {_kind(want)} such as {si!r}")
 
 
+_SI = (
+    "1 rad rad/s rad/s^2 m m/s m/s^2 s kg kg*m^2 N N*m 1/s 1/s^2 W Pa 1/rad kg/m^3".split()
+)
+
+
+def si_of(unit: str) -> str:
+    """The SI unit of the same kind as `unit`.
+
+    Raises:
+        ValueError: the unit is unknown, or none of the kinds that occur here.
+    """
+    kind = _parse(unit).dimensionality
+    for si in _SI:
+        if _parse(si).dimensionality == kind:
+            return si
+    raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
+
+
 def is_plain(unit: str) -> bool:
     """Whether `unit` is a plain ratio: `1`, `%`, `stick`."""
     return not dict(_parse(unit).dimensionality)

@@ -31,6 +31,8 @@ class Model(eqx.Module):
     Outputs: type = eqx.field(static=True)
     linear: bool = eqx.field(static=True, default=False)
     start: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    """noise(params): a State of white-noise intensities, 1 over sqrt(s) times the state's rate"""
 
     def initial_state(self, params: Any) -> Any:
         """The state at the first sample: `start(params)`, or all zeros."""

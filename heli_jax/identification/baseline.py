@@ -55,17 +55,16 @@ def baseline(
 ) -> Baseline:
     """RLS of one flight: its first output (an angle before its rate) from its first input.
 
-    Means are taken off both signals and both are scaled to unit rms, so that P(0) = 1e12 I means
-    the same whatever the units; Theta is scaled back.
+    Both signals are scaled to unit rms, so that P(0) = 1e12 I means the same whatever the units;
+    Theta is scaled back. The first samples, whose past was not recorded, only serve as past.
     """
     output = _output(model, flight)
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
     u, y = flight.inputs[input_], flight.outputs[output]
-    u0, y0 = float(np.mean(u)), float(np.mean(y))
-    u_scale, y_scale = float(np.std(u)) or 1.0, float(np.std(y)) or 1.0
+    u_scale, y_scale = _rms(u), _rms(y)
     run = rls(
-        jnp.asarray((u - u0) / u_scale),
-        jnp.asarray((y - y0) / y_scale),
+        jnp.asarray(u / u_scale),
+        jnp.asarray(y / y_scale),
         order=order,
         forgetting=jnp.asarray(forgetting),
         p0=jnp.asarray(1e12),
@@ -76,7 +75,7 @@ def baseline(
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
     poles = np.roots(den)
     with np.errstate(all="ignore"):
-        simulated = scipy.signal.lfilter(num, den, u - u0) + y0
+        simulated = _simulate(num, den, u, y)
     continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     agreement = _metrics(y, simulated)
@@ -110,6 +109,18 @@ def baseline(
         trusted=not sentences,
         sentences=tuple(sentences),
     )
+
+
+def _rms(signal: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(signal**2))) or 1.0
+
+
+def _simulate(num: np.ndarray, den: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Hd driven by the whole input, started from the first measured outputs."""
+    n = den.size - 1
+    start = scipy.signal.lfiltic(num, den, y[n - 1 :: -1][:n], u[n - 1 :: -1][:n])
+    rest, _ = scipy.signal.lfilter(num, den, u[n:], zi=start)
+    return np.concatenate([y[:n], rest])
 
 
 def _output(model: Model, flight: Flight) -> str:

@@ -427,19 +427,19 @@ def _estimates(
 def _interval95(
     u: Unknown, relative: float, reference: float, quantile: float
 ) -> tuple[float, float, float]:
-    sd = relative * reference
+    sd = float(relative * reference)
     if not u.logarithmic:
         return sd, u.value - quantile * sd, u.value + quantile * sd
     reach = float(np.exp(min(quantile * relative, 700.0)))
     low, high = sorted((u.value / reach, u.value * reach))
-    return sd, low, high
+    return sd, float(low), float(high)
 
 
 def _unit(problem: Problem, name: str) -> str:
     if name == "time_shift":
         return "s"
     if name.startswith("gain "):
-        return "1"
+        return problem.gain_units.get(name.removeprefix("gain "), "1")
     return naming.unit(problem.model.Params, name) or ""
 
 

@@ -68,6 +68,8 @@ class Problem:
     nuisance: Nuisance = field(default_factory=Nuisance)
     solver: str | None = None
     substeps: int = 4
+    gain_units: Mapping[str, str] = field(default_factory=dict)
+    """the unit that an input's gain carries, where the log's unit is a plain number"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flights", tuple(self.flights))

@@ -92,7 +92,7 @@ def _bounded(
 def regressors(
     u: Float[Array, " N"], y: Float[Array, " N"], order: int
 ) -> Float[Array, "N 2*order+1"]:
-    """Phi(k) = [y(k-1) ... y(k-n), u(k) ... u(k-n)] for every k, eq. 25; zeros before the start."""
+    """Phi(k) = [y(k-1) ... y(k-n), u(k) ... u(k-n)], eq. 25, with zeros before the first sample."""
 
     def back(s: Array, j: int) -> Array:
         return jnp.concatenate([jnp.zeros(j, s.dtype), s[: s.shape[0] - j]])
@@ -113,6 +113,9 @@ def rls(
 ) -> RLSResult:
     """RLS over a record: Theta = [-a1 ... -an, b0 ... bn] of Hd(z), eqs 25-33.
 
+    The first n samples have no recorded past: they serve as past only, and the histories hold
+    zeros there.
+
     Args:
         u, y: input and output, (N,).
         order: n of Hd(z); the paper's is 4.
@@ -129,7 +132,13 @@ def rls(
         raise ValueError(f"u has shape {u.shape} and y {y.shape}, wanted is (N,) for both")
     if u.shape[0] < 2 * order + 1:
         raise ValueError(f"{u.shape[0]} samples for order {order}, wanted are {2 * order + 1}")
-    return rls_regression(regressors(u, y, order), y, forgetting, p0, bound)
+    phi = regressors(u, y, order)
+    run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
+
+    def padded(values: Array) -> Array:
+        return jnp.concatenate([jnp.zeros((order, *values.shape[1:]), values.dtype), values])
+
+    return RLSResult(run.theta, padded(run.history), padded(run.error), padded(run.largest))
 
 
 def rls_regression(

@@ -80,6 +80,26 @@ def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete
     return Discrete(*_hoisted(Ad, Bd, Bp))
 
 
+def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
+    """Covariance of the noise that the model's white-noise drive adds in one step (Van Loan)."""
+    A = jacobians(model, params).A
+    n = A.shape[0]
+    if model.noise is None:
+        return jnp.zeros((n, n), A.dtype)
+    G = jnp.stack([jnp.asarray(g, A.dtype) for g in jax.tree.leaves(model.noise(params))])
+    M = jnp.zeros((2 * n, 2 * n), A.dtype)
+    M = M.at[:n, :n].set(-A).at[:n, n:].set(jnp.diag(G**2)).at[n:, n:].set(A.T)
+    E = expm(M * jnp.asarray(dt, A.dtype))
+    Q = E[n:, n:].T @ E[:n, n:]
+    return 0.5 * (Q + Q.T)
+
+
+def square_root(Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A factor L with L L^T = Q for a covariance that may be singular."""
+    values, vectors = jnp.linalg.eigh(Q)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+
+
 def _held(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
     """e^{A dt} and its integral times B: one exponential of [[A, B], [0, 0]] dt."""
     n, m = B.shape

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.discretize import discretize
+from heli_jax.simulation.discretize import discretize, process_noise, square_root
 from heli_jax.simulation.solvers import (
     RK4,
     Accumulating,
@@ -73,6 +73,7 @@ def simulate(
     delay: Any = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = 1_000_000,
+    key: Any = None,
 ) -> Trajectory:
     """Simulate one machine; each input sample is held until the next (zero-order hold).
 
@@ -91,12 +92,15 @@ def simulate(
             `ForwardMode()` compiles faster, `RecursiveCheckpointAdjoint()` saves memory in
             reverse mode.
         max_steps: bound on adaptive steps; where it ends a run, `result` says so.
+        key: a JAX random key: the model's own noise is drawn with it, by the exact discrete
+            process noise (linear models with solver "exact"); without it there is none.
 
     Returns:
         A Trajectory; a failed integration is in its `result` and `finite`, never an exception.
 
     Raises:
-        ValueError: "exact" for a model that is not linear, an unknown solver, or wrong shapes.
+        ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, or a
+            key for a model without noise or another solver.
     """
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
@@ -108,6 +112,8 @@ def simulate(
         )
     else:
         method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
+        if key is not None:
+            held = _with_noise(model, held, method, dt, key)
         sol = dfx.diffeqsolve(
             term,
             method,
@@ -221,6 +227,21 @@ def _per_sample(
     return PerSample(method, substeps), Held(params, inputs, parts, None), term
 
 
+def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> Held:
+    """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
+    if model.noise is None:
+        raise ValueError(f"model {model.name!r} has no noise to draw: see with_disturbance")
+    if not isinstance(method, Exact) or held.delay is not None or held.discrete is None:
+        raise ValueError("noise is drawn with solver='exact' and without a delay only")
+    L = square_root(process_noise(model, held.params, dt))
+    n = jax.tree.leaves(held.inputs)[0].shape[0]
+    draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
+    rows = tuple((*b, *row) for b, row in zip(held.discrete.Bd, L, strict=True))
+    return held._replace(
+        inputs=(held.inputs, tuple(draws.T)), discrete=held.discrete._replace(Bd=rows)
+    )
+
+
 def _term(model: Model, scale: Any) -> dfx.ODETerm:
     """The vector field per `scale` seconds.
 
@@ -231,7 +252,8 @@ def _term(model: Model, scale: Any) -> dfx.ODETerm:
         if not isinstance(x, model.State):
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, Held):
-            now = Now(now.params, at(now.inputs, 0))
+            inputs = now.inputs if isinstance(now.inputs, model.Inputs) else now.inputs[0]
+            now = Now(now.params, at(inputs, 0))
         rates = model.vector_field(now.params, x, now.inputs)
         return jax.tree.map(lambda v: v * scale, rates)
 

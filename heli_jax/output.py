@@ -1,0 +1,202 @@
+"""What the commands print and write."""
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax import config as configuration
+from heli_jax import run_directory
+from heli_jax.errors import InputError
+from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.fit import Check, Estimate, Fit
+from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.problem import Problem
+from heli_jax.report import files
+
+
+def write_fit(
+    out: Path,
+    experiment: configuration.Experiment,
+    problem: Problem,
+    fit: Fit,
+    baseline: Baseline | None,
+    begin: float,
+) -> None:
+    """The run directory: config.yaml, fit.json, signals.csv, report.html, figures/."""
+    import yaml
+
+    from heli_jax.report.html import write_report
+
+    resolved = configuration.resolved(experiment)
+    with run_directory.whole(out) as directory:
+        text = yaml.safe_dump(resolved, sort_keys=False, allow_unicode=True)
+        (directory / "config.yaml").write_text(text, encoding="utf-8")
+        files.write_signals(directory / "signals.csv", fit.signals)
+        started = time.perf_counter()
+        title = experiment.path.stem
+        write_report(directory, fit, problem, baseline, title, experiment.vehicle.constants)
+        fit.timing["report"] = time.perf_counter() - started
+        fit.timing["total"] = time.perf_counter() - begin
+        files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline))
+
+
+def print_fit(fit: Fit, baseline: Baseline | None, out: Path) -> None:
+    """Verdict, estimates, agreement and baseline on standard output."""
+    print(f"{fit.status}: {fit.verdict.text}")
+    note = files.whiteness_note(fit)
+    for line in ([note] if note else []) + list(fit.notes):
+        print(f"! {line}")
+    shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
+    rows = [_row(name, e) for name, e in shown.items()]
+    head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
+    _table(head if fit.white else (*head[:3], "95 % (too narrow)", *head[4:]), rows)
+    for c in fit.verdict.combinations:
+        print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
+    for name, m in fit.metrics.items():
+        print(f"{name}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
+    for name, m in fit.validation.items():
+        print(f"{name}, held out: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %")
+    if baseline is not None:
+        _print_baseline(baseline)
+    print(f"report: {out / 'report.html'}")
+
+
+def _print_baseline(b: Baseline) -> None:
+    ratios = ", ".join(f"{n} = {v:.4g}" for n, v in b.combinations.items())
+    vaf = f"VAF {b.metrics.vaf:.5f}" if math.isfinite(b.metrics.vaf) else "its simulation diverges"
+    print(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
+    for sentence in b.sentences:
+        print(f"  ! {sentence}")
+
+
+def _row(name: str, e: Estimate) -> tuple[str, ...]:
+    if e.sd is None or e.lower95 is None or e.upper95 is None:
+        return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
+    at_bound = " (at bound)" if e.at_bound else ""
+    value, sd = rounded(e.value, e.sd)
+    low, _ = rounded(e.lower95, e.sd)
+    high, _ = rounded(e.upper95, e.sd)
+    return (name, value + at_bound, sd, f"{low} to {high}", e.unit, f"{e.prior_share:.2f}")
+
+
+def rounded(value: float, sd: float) -> tuple[str, str]:
+    """A value to the second digit of its standard deviation, and that deviation."""
+    if not (sd > 0 and math.isfinite(sd) and math.isfinite(value)):
+        return f"{value:.6g}", f"{sd:.2g}"
+    digits = 2
+    if value != 0:
+        digits += max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(sd)))
+    return f"{value:#.{min(digits, 12)}g}".rstrip("."), f"{sd:.2g}"
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for i, name in enumerate(head):
+        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(_escaped(cell) for cell in row))
+    width = None if sys.stdout.isatty() else 120
+    Console(file=sys.stdout, highlight=False, width=width).print(table)
+
+
+def _escaped(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def print_check(found: Check) -> None:
+    """The verdict at the start values, on standard output."""
+    _print_verdict(found.verdict)
+    rows = []
+    for i, name in enumerate(found.verdict.names):
+        relative = math.sqrt(found.verdict.covariance[i, i])
+        lost = name in found.verdict.undetermined or name in found.verdict.without_effect
+        expected = "not determined" if lost else f"{100 * relative:.2g} %"
+        rows.append((name, expected, f"{found.verdict.prior_share[name]:.2f}"))
+    _table(("parameter", "expected sd", "prior share"), rows)
+    for name, sd in found.noise.items():
+        print(f"noise of {name}: {sd:.3g}")
+    for note in found.notes:
+        print(f"! {note}")
+
+
+def _print_verdict(verdict: Verdict) -> None:
+    print(verdict.text)
+    values = ", ".join(f"{s:.3g}" for s in verdict.singular_values)
+    print(
+        f"rank {verdict.rank} of {len(verdict.names)} ({verdict.rank_without_priors} without "
+        f"priors), condition number {verdict.condition:.3g}, singular values {values}"
+    )
+    for direction in verdict.null_directions:
+        words = ", ".join(f"{n} {v:+.4f}" for n, v in direction.items())
+        print(f"null direction (log coordinates): {words}")
+
+
+def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
+    """A table as CSV or Parquet at `out`, which appears whole or not at all, or as CSV on stdout.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    if out is None:
+        pyarrow.csv.write_csv(table, pa.PythonFile(sys.stdout.buffer, mode="w"))
+        return
+    temporary = out.with_name(f".{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if out.suffix.lower() == ".csv":
+            pyarrow.csv.write_csv(table, temporary)
+        else:
+            pyarrow.parquet.write_table(table, temporary)
+        temporary.replace(out)
+    except OSError as e:
+        raise InputError(f"--out {out}: cannot be written ({e.strerror or e})") from e
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def print_info(info: Any) -> None:
+    """What a log holds, on standard output."""
+    print(f"{info.path}: {info.format}, {info.size} bytes, {info.n_rows} rows")
+    print(f"sha256 {info.sha256}")
+    if info.time is None:
+        print("time: no column looks like a clock")
+    else:
+        _print_clock(info.time)
+    rows = []
+    for c in info.columns:
+        numbers = ("",) * 4 if c.kind == "text" else tuple(
+            f"{v:.6g}" for v in (c.min, c.max, c.mean, c.sd)
+        )
+        rows.append((c.name, c.kind, str(c.count), *numbers, str(c.n_nan)))
+    _table(("signal", "kind", "count", "min", "max", "mean", "sd", "NaN"), rows)
+
+
+def _print_clock(clock: Any) -> None:
+    uniform = (
+        f"uniform (jitter {100 * clock.jitter:.2g} % of a step)" if clock.uniform else "not uniform"
+    )
+    print(
+        f"time: {clock.column} [{clock.unit}], {clock.duration:.6g} s at {clock.rate:.6g} Hz, "
+        f"{uniform}"
+    )
+    if clock.problem:
+        print(f"! {clock.problem}")
+    for gap in clock.gaps[:10]:
+        print(f"gap of {gap.length:.4g} s at {gap.start:.6g} s")
+    if len(clock.gaps) > 10:
+        print(f"and {len(clock.gaps) - 10} more gaps")

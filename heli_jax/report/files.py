@@ -1,0 +1,195 @@
+"""A fit as files: fit.json and the signals."""
+
+import importlib.metadata
+import json
+import math
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax.flights import Flight
+from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.fit import Estimate, Fit, Signals
+from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.problem import Problem
+
+_PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers came from."""
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version(), **found}
+
+
+def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str, Any]:
+    """A fit as plain data for fit.json; what is not a finite number is null."""
+    whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
+    return _plain(
+        {
+            "status": fit.status,
+            "model": fit.model,
+            "method": fit.method,
+            "n_samples": fit.n_samples,
+            "identifiable": fit.verdict.identifiable,
+            "null_directions": list(fit.verdict.null_directions),
+            "determined_combinations": _combinations(fit.verdict),
+            "verdict": _verdict(fit.verdict),
+            "verdict_before": _verdict(fit.verdict_before),
+            "parameters": {**_fixed(problem), **{n: _parameter(e) for n, e in fit.estimates.items()}},
+            "nuisance": {n: _parameter(e) for n, e in fit.nuisance.items()},
+            "noise_sd": fit.noise,
+            "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
+            "validation": {n: m._asdict() for n, m in fit.validation.items()},
+            "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
+            "baseline_rls": _baseline(baseline),
+            "starts": [row._asdict() for row in fit.starts],
+            "steps": fit.steps,
+            "notes": list(fit.notes),
+            "timing_s": fit.timing,
+            "versions": versions(),
+            "data": [_source(f) for f in problem.flights],
+            "seed": fit.seed,
+        }
+    )
+
+
+def whiteness_note(fit: Fit) -> str:
+    """Why the intervals cannot be taken at their word; empty where the residuals are white."""
+    coloured = [name for name, w in fit.whiteness.items() if not w.white]
+    if not coloured:
+        return ""
+    worst = max((fit.whiteness[n] for n in coloured), key=lambda w: abs(w.lag1))
+    return (
+        f"The residuals of {', '.join(coloured)} are not white (autocorrelation {worst.lag1:+.2f} "
+        f"at one sample, {worst.outside:.0%} of the lags outside the 99 % band): a disturbance or "
+        "dynamics that the model lacks is in them. The intervals count every sample as news and "
+        "are too narrow."
+    )
+
+
+def _parameter(e: Estimate) -> dict[str, Any]:
+    return {**e._asdict(), "fixed": False}
+
+
+def _fixed(problem: Problem) -> dict[str, Any]:
+    """The parameters a user might look for that were not free: those that flights replace."""
+    names = {n for f in problem.flights for n in f.known}
+    return {
+        n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True} for n in sorted(names)
+    }
+
+
+def _combinations(verdict: Verdict) -> list[dict[str, Any]]:
+    return [c._asdict() for c in verdict.combinations]
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "text": verdict.text,
+        "identifiable": verdict.identifiable,
+        "rank": verdict.rank,
+        "rank_without_priors": verdict.rank_without_priors,
+        "condition_number": verdict.condition,
+        "singular_values": verdict.singular_values,
+        "null_directions": list(verdict.null_directions),
+        "determined_combinations": _combinations(verdict),
+        "strong_pairs": [p._asdict() for p in verdict.pairs],
+        "without_effect": list(verdict.without_effect),
+        "names": list(verdict.names),
+        "correlation": verdict.correlation,
+        "covariance_log": verdict.covariance,
+    }
+
+
+def _baseline(b: Baseline | None) -> dict[str, Any] | None:
+    if b is None:
+        return None
+    return {
+        "flight": b.flight,
+        "input": b.input,
+        "output": b.output,
+        "order": b.order,
+        "forgetting": b.forgetting,
+        "theta": b.theta,
+        "poles": [[float(p.real), float(p.imag)] for p in b.poles],
+        "continuous": {
+            "num": b.continuous_num,
+            "den": b.continuous_den,
+            "exact": b.exact,
+            "note": b.note,
+        },
+        "combinations": b.combinations,
+        "metrics": {b.output: b.metrics._asdict()},
+        "trusted": b.trusted,
+        "sentences": list(b.sentences),
+    }
+
+
+def _source(flight: Flight) -> dict[str, Any]:
+    if flight.source is None:
+        return {"path": None, "sha256": None, "flight": flight.name}
+    return {
+        "path": flight.source.path,
+        "sha256": flight.source.sha256,
+        "flight": flight.name,
+        "hold_out": flight.hold_out,
+        "n_samples": flight.n_samples,
+        "dt": flight.dt,
+        "notes": list(flight.source.notes),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Only what JSON has; a number that is not finite becomes null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write plain data, readable and strict (no NaN)."""
+    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
+    """Measured, simulated and residual of all flights in one table, SI.
+
+    A flight without some signal has empty cells there.
+    """
+    import pyarrow as pa
+    import pyarrow.csv
+
+    columns: dict[str, list[Any]] = {}
+    names = ["flight", "time"]
+    for s in signals:
+        names += [n for n in s.inputs if n not in names]
+        names += [
+            f"{n}_{what}"
+            for n in s.measured
+            for what in ("measured", "simulated", "residual")
+            if f"{n}_{what}" not in names
+        ]
+    for s in signals:
+        n = s.times.size
+        here: dict[str, Any] = {"flight": [s.flight] * n, "time": s.times, **s.inputs}
+        for output, measured in s.measured.items():
+            here[f"{output}_measured"] = measured
+            here[f"{output}_simulated"] = s.simulated[output]
+            here[f"{output}_residual"] = s.residual(output)
+        for name in names:
+            columns.setdefault(name, []).append(
+                pa.array(here[name]) if name in here else pa.nulls(n, pa.float64())
+            )
+    table = pa.table({name: pa.chunked_array(parts) for name, parts in columns.items()})
+    pyarrow.csv.write_csv(table, path)

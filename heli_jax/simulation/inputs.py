@@ -1,0 +1,37 @@
+"""Stick inputs to excite a machine with; each function gives (N,) samples of unit amplitude."""
+
+import numpy as np
+
+
+def random_steps(n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]) -> np.ndarray:
+    """Pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold` [s]."""
+    u = np.empty(n)
+    k = 0
+    while k < n:
+        length = max(1, round(rng.uniform(*hold) / dt))
+        u[k : k + length] = rng.uniform(-1.0, 1.0)
+        k += length
+    return u
+
+
+def multistep_3211(
+    n: int, dt: float, rng: np.random.Generator, unit: float, pause: float
+) -> np.ndarray:
+    """3-2-1-1 steps of `unit` [s], in either direction, with `pause` [s] of neutral between."""
+    u = np.zeros(n)
+    one, rest = max(1, round(unit / dt)), max(1, round(pause / dt))
+    k = rest
+    while k < n:
+        sign = rng.choice([-1.0, 1.0])
+        for length, level in ((3, 1.0), (2, -1.0), (1, 1.0), (1, -1.0)):
+            u[k : k + length * one] = sign * level
+            k += length * one
+        k += rest
+    return u
+
+
+def sweep(n: int, dt: float, low: float, high: float) -> np.ndarray:
+    """A sine whose frequency rises exponentially from `low` to `high` [Hz] over the record."""
+    t = np.arange(n) * dt
+    growth = np.log(high / low) / max(t[-1], dt)
+    return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)

@@ -1,0 +1,267 @@
+"""Everything that can be wrong with a log or a request ends in one sentence that says where."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Flight, Signal, Source, read_flight, require_moving_inputs
+
+STICK = Signal("stick", "mm", "m")
+PHI = Signal("phi", "deg", "rad")
+
+
+def rows(n: int = 20, dt: float = 0.02) -> list[list[str]]:
+    return [[f"{i * dt:.3f}", str(i % 3), f"{0.1 * i:.1f}"] for i in range(n)]
+
+
+def csv_text(cells: list[list[str]], header: str = "t,stick,phi", before: str = "") -> str:
+    return before + "\n".join([header, *(",".join(row) for row in cells)]) + "\n"
+
+
+def refused(path: Path, *places: str, **request) -> str:
+    """Read, and check that the one sentence names the file and the places."""
+    asked = {"time": "t", "inputs": {"x_roll": STICK}, "outputs": {"roll": PHI}} | request
+    with pytest.raises(InputError) as caught:
+        read_flight(path, **asked)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    assert "Traceback" not in text
+    for place in places:
+        assert place in text
+    return text
+
+
+def with_cell(row: int, column: int, cell: str) -> str:
+    cells = rows()
+    cells[row][column] = cell
+    return csv_text(cells)
+
+
+WHOLE = csv_text(rows())
+COMMENTED = "# bench\n\n# 2 of May\n"
+
+
+def ragged(row: int, change: int) -> str:
+    cells = rows()
+    cells[row] = cells[row][:change] if change < 0 else cells[row] + ["1"] * change
+    return csv_text(cells, before=COMMENTED)
+
+
+def stamps(values: list[float]) -> str:
+    return csv_text([[repr(t), str(i % 3), "0"] for i, t in enumerate(values)])
+
+
+REGULAR = [0.02 * i for i in range(20)]
+
+BAD_TEXT = {
+    "comments alone": ("# nothing\n\n", ["no header"]),
+    "header alone": ("t,stick,phi\n", ["line 1", "header alone"]),
+    "header and blanks": ("# a\nt,stick,phi\n  \n\n", ["line 2", "header alone"]),
+    "no header": (csv_text(rows()[1:], header="0.000,0,0.0"), ["line 1", "names of the columns"]),
+    "short row": (ragged(3, -1), ["line 8", "2 cells", "wanted are 3"]),
+    "long row": (ragged(3, 2), ["line 8", "5 cells", "wanted are 3"]),
+    "text": (with_cell(4, 2, "fast"), ["line 6", "'phi'", "'fast'"]),
+    "long text": (with_cell(4, 2, "x" * 90), ["line 6", "'phi'", "'" + "x" * 40 + "'..."]),
+    "hexadecimal": (with_cell(4, 2, "0x10"), ["line 6", "'phi'", "'0x10'"]),
+    "underscore": (with_cell(4, 2, "1_0"), ["line 6", "'phi'", "'1_0'"]),
+    "empty cell": (with_cell(5, 1, ""), ["line 7", "'stick'", "found nothing"]),
+    "nan": (with_cell(5, 1, "NaN"), ["line 7", "'stick'", "'NaN'"]),
+    "infinite": (with_cell(5, 2, "-inf"), ["line 7", "'phi'", "'-inf'"]),
+    "huge": (with_cell(5, 2, "1e400"), ["line 7", "'phi'", "'1e400'"]),
+    "blank lines between": (
+        WHOLE.replace("0.060,", "\n   \n0.060,").replace("0.100,2,", "0.100,zwei,"),
+        ["line 9", "'stick'", "'zwei'"],
+    ),
+    "quoted rows": (
+        with_cell(4, 2, '"a ""b"""').replace("0.040,2,", '0.040,"2",'),
+        ["line 6", "'phi'", "'a \"b\"'"],
+    ),
+    "line break in quotes": (
+        with_cell(2, 0, '"0.04\n"').replace("0.100,2,", "0.100,zwei,"),
+        ["line 8", "'stick'", "'zwei'"],
+    ),
+    "open quote": (with_cell(4, 2, '"4'), ["line 6", "quotation mark"]),
+    "doubled column": (csv_text(rows(), header="t,stick,stick"), ["'stick'", "2 columns"]),
+    "missing column": (csv_text(rows(), header="t,stick,Phi"), ["'phi'", "did you mean 'Phi'?"]),
+    "time nan": (with_cell(5, 0, "nan"), ["line 7", "'t'", "'nan'"]),
+    "time infinite": (with_cell(5, 0, "inf"), ["line 7", "'t'", "'inf'"]),
+    "time empty": (with_cell(5, 0, ""), ["line 7", "'t'", "nothing"]),
+    "time stands": (with_cell(5, 0, "0.080"), ["line 7", "'t'", "stands still", "'0.080'"]),
+    "time back": (with_cell(5, 0, "0.05"), ["line 7", "backwards", "'0.05' after '0.080'"]),
+    "few samples": (csv_text(rows(7)), ["7 samples", "at least 8"]),
+    "still input": (csv_text([[r[0], "2", r[2]] for r in rows()]), ["'x_roll'", "0.002", "learnt"]),
+    "both decimal signs": (
+        WHOLE.replace(",", ";").replace("0.020", "0,020"),
+        ["'0,020'", "'0.000'", "one decimal sign"],
+    ),
+    "lost sample": (stamps([0.02 * i for i in (*range(9), *range(10, 20))]), ["line 11", "50"]),
+    "long gap": (stamps([*REGULAR[:9], *(t + 3 for t in REGULAR)]), ["line 11", "give a window"]),
+    "jitter": (stamps([t + 0.006 * (i == 4) for i, t in enumerate(REGULAR)]), ["`rate: 50`"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TEXT)
+def test_bad_text(tmp_path, case):
+    text, places = BAD_TEXT[case]
+    path = tmp_path / "bench.csv"
+    path.write_text(text)
+    refused(path, *places)
+
+
+def test_slow_clock_drift_is_refused(tmp_path):
+    t = np.cumsum(np.where(np.arange(400) < 200, 0.02, 0.0206))
+    path = tmp_path / "bench.csv"
+    path.write_text(stamps([float(x) for x in t]))
+    refused(path, "leave a uniform grid", "line ", "`rate: ")
+
+
+BAD_BYTES = {
+    "empty": (b"", ["is empty"]),
+    "binary": (b"t,stick\n0,1\n\x00\x01\x02\n", ["line 3", "binary"]),
+    "utf-16": ("t,stick\n0,1\n".encode("utf-16"), ["UTF-16"]),
+    "latin-1": (b"t,stick,phi\n0,1,2\n0,1,2\xb0\n", ["line 3", "0xb0", "UTF-8"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BYTES)
+def test_bad_bytes(tmp_path, case):
+    data, places = BAD_BYTES[case]
+    path = tmp_path / "bench.csv"
+    path.write_bytes(data)
+    refused(path, *places)
+
+
+def test_file_that_is_not_there(tmp_path):
+    refused(tmp_path / "none.csv", "no such file")
+
+
+def test_folder(tmp_path):
+    refused(tmp_path, "folder")
+
+
+def test_name_with_a_null_character():
+    with pytest.raises(InputError, match="name of a file"):
+        read_flight("a\x00b.csv", time="t", inputs={"x_roll": STICK}, outputs={})
+
+
+def test_file_that_may_not_be_read(tmp_path, monkeypatch):
+    path = tmp_path / "bench.csv"
+    path.write_text(WHOLE)
+
+    def deny(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    refused(path, "Permission denied")
+
+
+@pytest.mark.parametrize("ending", [".ulg", ".bin", ".xlsx", ""])
+def test_other_formats(tmp_path, ending):
+    path = tmp_path / f"flight{ending}"
+    path.write_bytes(b"ULog")
+    refused(path, repr(ending), "convert")
+
+
+BAD_REQUEST = {
+    "input and output": ({"inputs": {"x_roll": PHI}}, ["'phi'", "'x_roll'", "'roll'"]),
+    "time and signal": ({"inputs": {"x_roll": Signal("t", "s", "s")}}, ["'t'", "'x_roll'"]),
+    "one output twice": ({"outputs": {"roll": PHI, "pitch": PHI}}, ["'phi'", "'pitch'"]),
+    "nothing": ({"inputs": {}, "outputs": {}}, ["at least one"]),
+    "unknown unit": ({"outputs": {"roll": Signal("phi", "dog", "rad")}}, ["'phi'", "'dog'"]),
+    "wrong kind": ({"outputs": {"roll": Signal("phi", "mm", "rad")}}, ["'phi'", "angle"]),
+    "time in metres": ({"time": Signal("t", "m", "s")}, ["'t'", "a time"]),
+    "input with sd": ({"inputs": {"x_roll": Signal("stick", "mm", "m", 1.0)}}, ["'stick'", "sd"]),
+    "rate zero": ({"rate": 0.0}, ["rate is 0"]),
+    "rate nan": ({"rate": math.nan}, ["rate is nan"]),
+    "rate infinite": ({"rate": math.inf}, ["rate is inf"]),
+    "rate far too high": ({"rate": 1e9}, ["1e+09 Hz", "50 Hz"]),
+    "rate far too low": ({"rate": 2.0}, ["2 Hz", "fewer than 8"]),
+    "window reversed": ({"window": (0.3, 0.1)}, ["window", "reversed", "0.3"]),
+    "window empty": ({"window": (0.1, 0.1)}, ["window", "empty"]),
+    "window infinite": ({"window": (0.1, math.inf)}, ["window", "inf"]),
+    "window of three": ({"window": (0.1, 0.2, 0.3)}, ["window", "two"]),
+    "window after": ({"window": (1.0, 2.0)}, ["outside", "0.38 s"]),
+    "window before": ({"window": (-2.0, -1.0)}, ["outside"]),
+    "window short": ({"window": (0.0, 0.1)}, ["holds 6 samples"]),
+    "known nan": ({"known": {"Ixx": math.nan}}, ["'Ixx'", "nan"]),
+} | {
+    f"sd {sd}": ({"outputs": {"roll": Signal("phi", "deg", "rad", sd)}}, ["'roll'", f"is {sd:g}"])
+    for sd in (0.0, -1.0, math.nan, math.inf)
+}
+
+
+@pytest.mark.parametrize("case", BAD_REQUEST)
+def test_bad_request(tmp_path, case):
+    request, places = BAD_REQUEST[case]
+    path = tmp_path / "bench.csv"
+    path.write_text(WHOLE)
+    refused(path, *places, **request)
+
+
+def test_gap_that_resampling_may_not_bridge(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(stamps([*REGULAR[:9], *(t + 3 for t in REGULAR)]))
+    refused(path, "line 11", "gap of 2.84 s", "0.25 s", rate=50.0)
+
+
+def write_parquet(path: Path, **changed) -> Path:
+    columns = {"t": 0.02 * np.arange(20), "stick": np.arange(20) % 3, "phi": np.arange(20.0)}
+    pq.write_table(pa.table(columns | changed), path)
+    return path
+
+
+BAD_PARQUET = {
+    "text": ({"phi": ["a"] * 20}, ["'phi'", "string"]),
+    "null": ({"phi": [*range(9), None, *range(10)]}, ["row 10", "'phi'", "nothing"]),
+    "nan": ({"phi": [*range(9), math.nan, *range(10)]}, ["row 10", "'phi'", "nan"]),
+    "list": ({"phi": [[1.0]] * 20}, ["'phi'", "list"]),
+    "time stands": ({"t": [*range(9), 8, *range(10, 20)]}, ["row 10", "'t'", "stands still"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PARQUET)
+def test_bad_parquet(tmp_path, case):
+    changed, places = BAD_PARQUET[case]
+    refused(write_parquet(tmp_path / "bench.parquet", **changed), *places)
+
+
+def test_parquet_without_rows(tmp_path):
+    path = tmp_path / "bench.parquet"
+    pq.write_table(pa.table({"t": pa.array([], pa.float64())}), path)
+    refused(path, "no rows")
+
+
+def test_parquet_with_a_column_twice(tmp_path):
+    path = tmp_path / "bench.parquet"
+    x = pa.array(np.arange(20.0))
+    pq.write_table(pa.table([x, x, x], names=["t", "phi", "phi"]), path)
+    refused(path, "'phi'", "2 columns", inputs={})
+
+
+@pytest.mark.parametrize("keep", [1, 10, 200, -1, -9])
+def test_broken_parquet(tmp_path, keep):
+    path = write_parquet(tmp_path / "bench.parquet")
+    path.write_bytes(path.read_bytes()[:keep])
+    refused(path, "no whole Parquet file")
+
+
+def test_still_input_can_be_allowed(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(csv_text([[r[0], "2", r[2]] for r in rows()]))
+    asked = {"time": "t", "inputs": {"x_roll": STICK}, "outputs": {"roll": PHI}}
+    flight = read_flight(path, **asked, moving_inputs=False)
+    assert np.array_equal(flight.inputs["x_roll"], np.full(20, 0.002))
+
+
+def test_moving_inputs_of_a_flight_made_by_hand():
+    moving, still = np.arange(9.0), np.ones(9)
+    require_moving_inputs(Flight(0.1, {"x_roll": moving}, {"roll": still}))
+    flight = Flight(0.1, {"x_roll": still}, {}, source=Source("bench.csv", "0"))
+    with pytest.raises(InputError, match=r"^bench\.csv, input 'x_roll': .*nothing"):
+        require_moving_inputs(flight)

@@ -1,0 +1,228 @@
+"""What is written to a log comes back: values, units, window, dialects of CSV, Parquet."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Signal, describe_log, read_flight
+
+ASKED = {
+    "time": "t",
+    "inputs": {"x_roll": Signal("stick", "mm", "m")},
+    "outputs": {"roll": Signal("phi", "rad", "rad")},
+}
+T = np.round(5.0 + 0.02 * np.arange(12), 2)
+STICK = np.array([0, 1, 1, -2, 3.5, 0, 0, 1e-3, -7, 8, 9, 10.25])
+PHI = np.sin(T)
+
+
+def lines(delimiter: str = ",", header: str = "t,stick,phi", decimal: str = ".") -> list[str]:
+    cells = [[repr(float(x)).replace(".", decimal) for x in row] for row in zip(T, STICK, PHI)]
+    return [header.replace(",", delimiter), *(delimiter.join(row) for row in cells)]
+
+
+def check(path: Path) -> None:
+    flight = read_flight(path, **ASKED)
+    assert flight.dt == pytest.approx(0.02, rel=1e-12)
+    assert flight.t0 == 5.0
+    assert np.array_equal(flight.outputs["roll"], PHI)
+    assert np.array_equal(flight.inputs["x_roll"], STICK * 1e-3)
+    assert flight.source is not None
+    assert flight.source.notes == ()
+
+
+DIALECTS = {
+    "plain": "\n".join(lines()),
+    "end of line": "\n".join(lines()) + "\n\n  \n",
+    "windows": "\r\n".join(lines()) + "\r\n",
+    "old mac": "\r".join(lines()),
+    "mark at the start": "\ufeff" + "\n".join(lines()),
+    "semicolon": "\n".join(lines(";")),
+    "semicolon, decimal comma": "\n".join(lines(";", decimal=",")),
+    "tab": "\n".join(lines("\t")),
+    "tab, decimal comma": "\n".join(lines("\t", decimal=",")),
+    "commas in the names": "\n".join(lines(";"))
+    .replace("phi\n", "phi;a, b, c\n")
+    .replace("\n5", ";0\n5")
+    + ";0",
+    "comments": "# a, b\n\n#c\n" + "\n".join(lines()),
+    "blanks": "\n".join(lines(" , ")),
+    "blank lines": "\n\n \n".join(lines()),
+    "quotes": "\n".join(f'"{line.replace(",", '","')}"' for line in lines()),
+    "quoted header": "\n".join(lines(header='"t","stick","phi"')),
+    "plus signs": "\n".join(lines()).replace(",1.0,", ",+1.0,"),
+    "long line": "\n".join(
+        [
+            *lines(header="t,stick,phi,note")[:1],
+            *(f"{line},{'x' * 2_000_000 * (i == 3)}" for i, line in enumerate(lines()[1:])),
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_dialects(tmp_path, dialect):
+    path = tmp_path / "bench.csv"
+    path.write_bytes(DIALECTS[dialect].encode())
+    check(path)
+
+
+@pytest.mark.parametrize("ending", [".txt", ".tsv", ".CSV"])
+def test_endings(tmp_path, ending):
+    path = tmp_path / f"bench{ending}"
+    path.write_text(DIALECTS["tab"])
+    check(path)
+
+
+def test_fingerprint_of_the_file(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(DIALECTS["comments"])
+    source = read_flight(path, **ASKED).source
+    assert source is not None
+    assert source.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert source.path == str(path)
+
+
+@pytest.mark.parametrize("kind", [pa.float64(), pa.timestamp("us"), pa.duration("ms")])
+def test_parquet(tmp_path, kind):
+    path = tmp_path / "bench.parquet"
+    ticks = {"us": 1e6, "ms": 1e3}.get(getattr(kind, "unit", ""), 1)
+    stamps = pa.array(T if ticks == 1 else np.rint(T * ticks).astype(np.int64)).cast(kind)
+    pq.write_table(pa.table({"t": stamps, "stick": STICK, "phi": PHI, "x": ["a"] * 12}), path)
+    check(path)
+
+
+def test_parquet_in_single_precision(tmp_path):
+    path = tmp_path / "bench.parquet"
+    stamps = (1000 + np.arange(500) / 400).astype(np.float32)
+    x = np.arange(500, dtype=np.float32)
+    pq.write_table(pa.table({"t": stamps, "stick": x, "phi": x}), path)
+    assert read_flight(path, **ASKED).dt == pytest.approx(1 / 400, rel=1e-6)
+
+
+def test_units_sd_and_known(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(DIALECTS["plain"])
+    flight = read_flight(
+        path,
+        time=Signal("t", "ms", "s"),
+        inputs={"x_roll": Signal("stick", "%", "1"), "x_pitch": Signal("stick", "1", "1")},
+        outputs={"roll": Signal("phi", "deg", "rad", 0.5)},
+        known={"Ixx_added": 0.012},
+        hold_out=True,
+        name="second",
+    )
+    assert flight.dt == pytest.approx(2e-5)
+    assert flight.inputs["x_roll"] == pytest.approx(STICK / 100)
+    assert np.array_equal(flight.inputs["x_pitch"], STICK)
+    assert flight.outputs["roll"] == pytest.approx(np.deg2rad(PHI))
+    assert flight.sd == {"roll": pytest.approx(np.deg2rad(0.5))}
+    assert (flight.known, flight.hold_out, flight.name) == ({"Ixx_added": 0.012}, True, "second")
+
+
+def test_window_is_inclusive(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(DIALECTS["plain"])
+    flight = read_flight(path, **ASKED, window=(0.04, 0.2))
+    assert flight.t0 == 5.04
+    assert np.array_equal(flight.outputs["roll"], PHI[2:11])
+
+
+def test_window_beyond_the_log_is_noted(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(DIALECTS["plain"])
+    flight = read_flight(path, **ASKED, window=(0.04, 60.0))
+    assert flight.n_samples == 10
+    assert flight.source is not None
+    assert "cut to the log" in flight.source.notes[0]
+
+
+def test_what_is_wrong_outside_the_window_is_no_matter(tmp_path):
+    path = tmp_path / "bench.csv"
+    path.write_text(DIALECTS["plain"].replace("\n5.0,0.0,", "\n5.0,nan,"))
+    with pytest.raises(InputError, match="line 2"):
+        read_flight(path, **ASKED)
+    assert read_flight(path, **ASKED, window=(0.02, 1.0)).n_samples == 11
+
+
+NUMBERS = st.floats(-1e12, 1e12, allow_subnormal=False)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    data=hnp.arrays(np.float64, st.tuples(st.integers(8, 40), st.just(2)), elements=NUMBERS),
+    rate=st.sampled_from([1.0, 3.0, 50.0, 60.0, 400.0, 1000.0]),
+    start=st.sampled_from([0.0, 12.5, 86400.0]),
+    ending=st.sampled_from(["csv", "parquet"]),
+)
+def test_any_uniform_log_comes_back(tmp_path_factory, data, rate, start, ending):
+    t = start + np.arange(len(data)) / rate
+    path = tmp_path_factory.mktemp("logs") / f"log.{ending}"
+    if ending == "csv":
+        rows = [",".join(map(repr, map(float, row))) for row in np.column_stack([t, data])]
+        path.write_text("\n".join(["t,stick,phi", *rows]))
+    else:
+        pq.write_table(pa.table({"t": t, "stick": data[:, 0], "phi": data[:, 1]}), path)
+    flight = read_flight(
+        path,
+        time="t",
+        inputs={"x_roll": Signal("stick", "1", "1")},
+        outputs={"roll": Signal("phi", "1", "1")},
+        moving_inputs=False,
+    )
+    assert np.array_equal(flight.inputs["x_roll"], data[:, 0])
+    assert np.array_equal(flight.outputs["roll"], data[:, 1])
+    assert flight.dt == pytest.approx(1 / rate, rel=1e-9)
+    assert flight.t0 == t[0]
+
+
+CELLS = st.sampled_from(
+    ["0", "1", ".5", "nan", "inf", "1e400", "-1e308", "", " ", '"', "x", ",", ";", "\t", "\n"]
+    + ["\r", "#", "\ufeff", "\x1c", "\u2028", "1,5", '"2"', "t,stick,phi\n", "\n0,1,2", "\n1,2,3"]
+)
+TEXT = st.lists(CELLS, max_size=60).map("".join) | st.text(max_size=80)
+WITH_HEADER = TEXT.map(lambda body: "t,stick,phi\n" + body)
+
+
+def only_input_errors(path: Path) -> None:
+    for read in (lambda: read_flight(path, **ASKED, rate=3.0), lambda: describe_log(path)):
+        try:
+            read()
+        except InputError as e:
+            assert len(str(e).splitlines()) == 1  # noqa: PT017
+            assert path.name in str(e)  # noqa: PT017
+
+
+@settings(max_examples=200, deadline=None)
+@given(text=TEXT | WITH_HEADER)
+def test_no_text_breaks_the_reader(tmp_path_factory, text):
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    path.write_bytes(text.encode())
+    only_input_errors(path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.binary(max_size=200), ending=st.sampled_from(["csv", "parquet"]))
+def test_no_bytes_break_the_reader(tmp_path_factory, data, ending):
+    path = tmp_path_factory.getbasetemp() / f"any.{ending}"
+    path.write_bytes(data)
+    only_input_errors(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255))
+def test_no_damaged_parquet_breaks_the_reader(tmp_path_factory, place, byte):
+    path = tmp_path_factory.getbasetemp() / "damaged.parquet"
+    pq.write_table(pa.table({"t": T, "stick": STICK, "phi": PHI}), path)
+    data = bytearray(path.read_bytes())
+    data[int(place * len(data))] = byte
+    path.write_bytes(data)
+    only_input_errors(path)

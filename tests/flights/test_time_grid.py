@@ -1,0 +1,121 @@
+"""Which stamps pass for a uniform grid, and what resampling does with the others."""
+
+from bisect import bisect_right
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Flight, Signal, read_flight
+from heli_jax.flights.resample import hold, interpolate
+
+
+def read(path, stamps: list[str], x: np.ndarray | None = None, **request) -> Flight:
+    x = np.arange(len(stamps)) ** 1.5 if x is None else x
+    rows = (f"{t},{float(v)!r},{float(v)!r}" for t, v in zip(stamps, x, strict=True))
+    path.write_text("\n".join(["t,u,y", *rows]))
+    asked = {"inputs": {"u": Signal("u", "1", "1")}, "outputs": {"y": Signal("y", "1", "1")}}
+    return read_flight(path, time=request.pop("time", "t"), **asked, **request)
+
+
+def notes(flight: Flight) -> str:
+    assert flight.source is not None
+    return " ".join(flight.source.notes)
+
+
+ROUNDED = {
+    "100 Hz, two decimals": (100, "{:.2f}", 0.0),
+    "30 Hz, milliseconds": (30, "{:.3f}", 0.0),
+    "60 Hz, hundredths": (60, "{:.2f}", 0.0),
+    "400 Hz, milliseconds": (400, "{:.3f}", 0.0),
+    "800 Hz, milliseconds": (800, "{:.3f}", 0.0),
+    "300 Hz, seven digits": (300, "{:.7g}", 9.0),
+    "30 Hz, seven digits": (30, "{:.7g}", 99990.0),
+}
+
+
+@pytest.mark.parametrize("case", ROUNDED)
+def test_rounded_stamps_pass(tmp_path, case):
+    rate, form, start = ROUNDED[case]
+    stamps = [form.format(start + i / rate) for i in range(600)]
+    flight = read(tmp_path / "log.csv", stamps)
+    assert flight.dt == pytest.approx(1 / rate, rel=1e-2 if "seven" in case else 2e-3)
+    assert ("jitter" in notes(flight)) == (case != "100 Hz, two decimals")
+
+
+def test_stamps_in_other_units(tmp_path):
+    stamps = [str(1_700_000_000_000_000 + 20_000 * i) for i in range(30)]
+    flight = read(tmp_path / "log.csv", stamps, time=Signal("t", "us", "s"))
+    assert flight.dt == pytest.approx(0.02, rel=1e-6)
+
+
+@pytest.mark.parametrize(("size", "noted"), [(0.003, False), (0.07, True)])
+def test_jitter_is_noted(tmp_path, size, noted):
+    t = np.arange(100) + size / 2 * np.random.default_rng(0).uniform(-1, 1, 100)
+    flight = read(tmp_path / "log.csv", [repr(float(x)) for x in t])
+    assert flight.dt == pytest.approx((t[-1] - t[0]) / 99)
+    assert ("jitter" in notes(flight)) == noted
+
+
+@pytest.mark.parametrize("at", [1, 50, 100, 198])
+def test_lost_sample_is_no_rounding(tmp_path, at):
+    stamps = [f"{0.01 * i:.2f}" for i in range(200) if i != at]
+    with pytest.raises(InputError, match=rf"line {at + 2}, .*0\.02 s where 0\.01 s.*rate: 100"):
+        read(tmp_path / "log.csv", stamps)
+
+
+def test_resampling_bridges_a_lost_sample(tmp_path):
+    keep = np.delete(np.arange(100), 40)
+    flight = read(tmp_path / "log.csv", [f"{0.01 * i:.2f}" for i in keep], keep, rate=100.0)
+    want = np.arange(100.0)
+    assert np.allclose(flight.outputs["y"], want, atol=1e-9)
+    want[40] = 39.0
+    assert np.array_equal(flight.inputs["u"], want)
+
+
+def test_rate_of_a_rounded_log_keeps_its_samples(tmp_path):
+    x = np.random.default_rng(1).normal(size=300)
+    flight = read(tmp_path / "log.csv", [f"{i / 30:.3f}" for i in range(300)], x, rate=30.0)
+    assert flight.dt == 1 / 30
+    assert np.array_equal(flight.inputs["u"], x)
+
+
+def test_held_inputs_do_not_slip_on_rounded_stamps(tmp_path):
+    x = np.random.default_rng(1).normal(size=300)
+    flight = read(tmp_path / "log.csv", [f"{i / 30:.3f}" for i in range(300)], x, rate=60.0)
+    assert np.array_equal(flight.inputs["u"][::2], x[: flight.inputs["u"][::2].size])
+
+
+@pytest.mark.parametrize(
+    ("rate", "word"), [(20.0, "filtered"), (250.0, "no longer white"), (60.0, "resampled")]
+)
+def test_notes_of_resampling(tmp_path, rate, word):
+    flight = read(tmp_path / "log.csv", [f"{0.01 * i:.2f}" for i in range(100)], rate=rate)
+    assert word in notes(flight)
+    assert ("filtered" in notes(flight)) == (rate == 20.0)
+    assert ("white" in notes(flight)) == (rate == 250.0)
+    assert flight.dt == 1 / rate
+    assert flight.duration == pytest.approx(0.99, abs=flight.dt)
+
+
+STEPS = st.lists(st.integers(1, 50), min_size=2, max_size=40)
+
+
+@settings(deadline=None)
+@given(steps=STEPS, every=st.integers(1, 30))
+def test_hold_and_interpolation_against_a_plain_loop(steps, every):
+    ticks = [0, *np.cumsum(steps).tolist()]
+    values = np.random.default_rng(len(ticks)).normal(size=len(ticks))
+    new = list(range(0, ticks[-1] + 1, every))
+    seconds, times = np.array(ticks) * 1e-3, np.array(new) * 1e-3
+    held, line = [], []
+    for tick in new:
+        k = bisect_right(ticks, tick) - 1
+        after = min(k + 1, len(ticks) - 1)
+        part = (tick - ticks[k]) / max(ticks[after] - ticks[k], 1)
+        held.append(values[k])
+        line.append(values[k] + part * (values[after] - values[k]))
+    assert np.array_equal(hold(seconds, values, times), held)
+    assert np.allclose(interpolate(seconds, values, times), line, rtol=0, atol=1e-9)
