@@ -136,9 +136,7 @@ def _fit(options: argparse.Namespace) -> int:
     _say("writing the report")
     output.write_fit(out, experiment, problem, found, rls, begin)
     output.print_fit(found, rls, out)
-    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(
-        found.status, NOT_CONVERGED
-    )
+    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
 
 
 def _warn_reading(problem: Any) -> None:

@@ -171,7 +171,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
     for text in overrides:
         _override(content, text)
     config = _validated(content, str(path))
-    model = models.by_name(config.model, f"{path}: model")
+    model = models.by_name(config.model, f"{path}: model", path.absolute().parent)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle)
 
@@ -298,7 +298,9 @@ def problem(experiment: Experiment) -> Problem:
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
         )
     except ValueError as e:
-        raise InputError(f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}") from e
+        raise InputError(
+            f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}"
+        ) from e
 
 
 def read_flights(

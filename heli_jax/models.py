@@ -3,6 +3,7 @@
 import importlib
 import re
 import sys
+from pathlib import Path
 
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import on_stand, pitch, roll
@@ -13,13 +14,13 @@ pitch_on_stand = on_stand(pitch)
 
 __all__ = ["by_name", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
 
-_SHIPPED = {
-    model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)
-}
+_SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
 
 
-def by_name(name: str, where: str = "model") -> Model:
+def by_name(name: str, where: str = "model", folder: str | Path | None = None) -> Model:
     """The shipped model of that name, or anyone's own at 'package.module:name'.
+
+    A module of one's own may lie in `folder`, as beside the configuration that names it.
 
     Raises:
         InputError: neither exists; `where` begins the sentence.
@@ -30,8 +31,8 @@ def by_name(name: str, where: str = "model") -> Model:
         known = [*_SHIPPED, "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     module_name, attribute = name.split(":")
-    if "" not in sys.path:
-        sys.path.insert(0, "")  # a user's module lies beside the configuration, not in site-packages
+    if folder is not None and str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))
     try:
         module = importlib.import_module(module_name)
     except ImportError as e:

@@ -179,8 +179,10 @@ def print_info(info: Any) -> None:
         _print_clock(info.time)
     rows = []
     for c in info.columns:
-        numbers = ("",) * 4 if c.kind == "text" else tuple(
-            f"{v:.6g}" for v in (c.min, c.max, c.mean, c.sd)
+        numbers = (
+            ("",) * 4
+            if c.kind == "text"
+            else tuple(f"{v:.6g}" for v in (c.min, c.max, c.mean, c.sd))
         )
         rows.append((c.name, c.kind, str(c.count), *numbers, str(c.n_nan)))
     _table(("signal", "kind", "count", "min", "max", "mean", "sd", "NaN"), rows)

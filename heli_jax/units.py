@@ -56,7 +56,31 @@ def _registry() -> Any:
 # A unit is names with small whole exponents, multiplied or divided: nothing that computes.
 _FACTOR = r"(?:1|[A-Za-zµ°%_]+)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/·]\s*{_FACTOR}|\s+{_FACTOR})*")
-_EXAMPLES = "m mm cm km s ms us min rad mrad deg rev rpm Hz kg g N W Pa lb ft in stick".split()
+_EXAMPLES = [
+    "m",
+    "mm",
+    "cm",
+    "km",
+    "s",
+    "ms",
+    "us",
+    "min",
+    "rad",
+    "mrad",
+    "deg",
+    "rev",
+    "rpm",
+    "Hz",
+    "kg",
+    "g",
+    "N",
+    "W",
+    "Pa",
+    "lb",
+    "ft",
+    "in",
+    "stick",
+]
 
 
 @functools.cache
@@ -97,9 +121,26 @@ def factor(unit: str, si: str) -> float:
     raise ValueError(f"unit {unit!r} is {_kind(have)}, wanted is {_kind(want)} such as {si!r}")
 
 
-_SI = (
-    "1 rad rad/s rad/s^2 m m/s m/s^2 s kg kg*m^2 N N*m 1/s 1/s^2 W Pa 1/rad kg/m^3".split()
-)
+_SI = [
+    "1",
+    "rad",
+    "rad/s",
+    "rad/s^2",
+    "m",
+    "m/s",
+    "m/s^2",
+    "s",
+    "kg",
+    "kg*m^2",
+    "N",
+    "N*m",
+    "1/s",
+    "1/s^2",
+    "W",
+    "Pa",
+    "1/rad",
+    "kg/m^3",
+]
 
 
 def si_of(unit: str) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -69,14 +68,10 @@ class Helicopter(eqx.Module):
     K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
     K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
     K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
-    Ixx_added: Annotated[Scalar, "kg m^2", "known inertia fixed to the fuselage, roll"] = _field(0.0)
-    Iyy_added: Annotated[Scalar, "kg m^2", "known inertia fixed to the fuselage, pitch"] = _field(
-        0.0
-    )
-    kappa: Annotated[Scalar, "1/s^2", "stand stiffness over the fuselage's own inertia"] = _field(
-        0.0
-    )
-    zeta: Annotated[Scalar, "1/s", "stand damping over the fuselage's own inertia"] = _field(0.0)
+    Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)
+    Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
+    kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
+    zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
     cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
 
 
@@ -190,10 +185,3 @@ def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
     if not math.isfinite(value):
         raise InputError(f"{place}: found {entry!r:.40}, wanted is a finite number")
     return Constant(value, si or unit, source)
-
-
-def missing_for(params: Any, needed: set[str]) -> list[str]:
-    """The names among `needed` that the vehicle leaves open (NaN), in field order."""
-    have = naming.asdict(params)
-    concrete = {n: v for n, v in have.items() if not isinstance(v, jax.core.Tracer)}
-    return [n for n, v in concrete.items() if n in needed and np.isnan(np.asarray(v)).any()]

@@ -13,7 +13,10 @@ _LIMIT_NODES = 100_000
 _LIMIT_DEPTH = 40
 
 
-class _Loader(yaml.CSafeLoader if hasattr(yaml, "CSafeLoader") else yaml.SafeLoader):
+_Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Base):
     """SafeLoader without YAML 1.1's traps: `1e-4` is a number; `on`, `yes` and dates are text."""
 
 

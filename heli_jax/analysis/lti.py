@@ -1,6 +1,6 @@
 """Between discrete and continuous transfer functions: c2d, d2c, and what can go wrong."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
@@ -45,7 +45,7 @@ def d2c(
         raise ValueError(f"unknown method {method!r}: use 'zoh' or 'real-log'")
     A, B, C, D = _state_space(num, den, dt)
     n = A.shape[0]
-    poles = np.linalg.eigvals(A)
+    poles: Any = np.linalg.eigvals(A)
     size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
     if np.any(np.abs(poles) < 1e-12 * size):
         raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")
@@ -83,4 +83,4 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
 
 def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
     num, den = scipy.signal.ss2tf(A, B, C, D)
-    return num[0], den
+    return np.asarray(num)[0], np.asarray(den)

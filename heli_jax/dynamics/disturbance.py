@@ -39,7 +39,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     State = naming.extended(
         model.State,
         f"{model.State.__name__}Disturbed",
-        {n: (Annotated[Scalar, "rad/s^2", "disturbance acceleration"], None) for n in chain},
+        dict.fromkeys(chain, (Annotated[Scalar, "rad/s^2", "disturbance acceleration"], None)),
     )
     # Two equal lags halve the variance of the first; the gain brings it back.
     gain = 2.0**0.5 if poles == 2 else 1.0
@@ -59,13 +59,13 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
 
     def noise(p: Any) -> Any:
         zero = 0.0 * p.sigma_w
-        intensity = {n: zero for n in naming.names(State)}
+        intensity = dict.fromkeys(naming.names(State), zero)
         intensity[chain[0]] = p.sigma_w * (2.0 / p.tau_w) ** 0.5
         return State(**intensity)
 
     def start(p: Any) -> Any:
         zero = 0.0 * p.sigma_w
-        return State(**{**naming.asdict(model.initial_state(p)), **{n: zero for n in chain}})
+        return State(**{**naming.asdict(model.initial_state(p)), **dict.fromkeys(chain, zero)})
 
     return Model(
         f"{model.name}-disturbed",

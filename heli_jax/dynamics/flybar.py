@@ -30,6 +30,4 @@ def flapping_acceleration(
     `omega` is the body's rate about the same axis [rad/s]. The paper's text prints
     $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the denominator of eq. 23.
     """
-    return (
-        flapping_rate_gain(p) * (x_cyc / p.L5 - (dbeta + omega) / p.Omega) - p.Omega**2 * beta
-    )
+    return flapping_rate_gain(p) * (x_cyc / p.L5 - (dbeta + omega) / p.Omega) - p.Omega**2 * beta

@@ -159,16 +159,22 @@ def _combinations(
     model: Model, params: Any, flight: Flight, output: str, den: np.ndarray | None, order: int
 ) -> tuple[dict[str, float], list[str]]:
     """a/Ixx and a/If where the structure of eq. 23 allows to read them off."""
-    if model.Params is not Helicopter or output not in ("roll", "pitch") or len(
-        naming.names(model.State)
-    ) != 4:
-        return {}, ["No way leads from its coefficients to physical parameters of this model and "
-                    f"output ({output})."]
+    if (
+        model.Params is not Helicopter
+        or output not in ("roll", "pitch")
+        or len(naming.names(model.State)) != 4
+    ):
+        return {}, [
+            "No way leads from its coefficients to physical parameters of this model and "
+            f"output ({output})."
+        ]
     if den is None:
         return {}, []
     if order != 4:
-        return {}, [f"Order {order} is not the fourth order of eq. 23: no physical parameters "
-                    "can be read from it."]
+        return {}, [
+            f"Order {order} is not the fourth order of eq. 23: no physical parameters "
+            "can be read from it."
+        ]
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     p = naming.replace(params, **known)
     p = p if "stand" in model.name else naming.replace(p, zeta=0.0 * p.zeta)
@@ -191,15 +197,16 @@ def _combinations(
 def _stability(poles: np.ndarray) -> list[str]:
     size = float(np.max(np.abs(poles)))
     if size >= 1.0:
-        return [f"It has a pole of size {size:.4f}, outside the unit circle: its simulation "
-                "diverges."]
+        return [
+            f"It has a pole of size {size:.4f}, outside the unit circle: its simulation diverges."
+        ]
     return []
 
 
 def _bias(
     errors: np.ndarray, simulated: np.ndarray, y: np.ndarray, agreement: Metrics
 ) -> list[str]:
-    """Equation error is biased by measurement noise: told by coloured errors or a poor simulation."""
+    """Noise biases equation error: told by coloured errors or a poor simulation."""
     said = []
     one_step = float(np.sqrt(np.mean(errors**2)))
     if math.isnan(agreement.rmse):

@@ -16,6 +16,7 @@ FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
 ILL_CONDITIONED = 1e4
 STRONG = 0.99
+_TAKES_PART = 0.1  # of a unit direction: less is not worth naming
 _Z95 = 1.959963984540054
 
 
@@ -96,7 +97,9 @@ def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
 
 
 def judge(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...], remedy: str = "") -> Verdict:
-    """The verdict from a whitened sensitivity (any rows, q) in relative coordinates, without priors.
+    """The verdict from a whitened sensitivity (any rows, q) in relative coordinates.
+
+    Priors are no rows of it; they come with the unknowns.
 
     `remedy` is a further way out that the model offers, such as a run with a known inertia.
     """
@@ -115,9 +118,7 @@ def judge(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...], remedy: str = 
     dead = tuple(
         n for n, s in zip(names, sizes, strict=True) if not s > 1e-12 * max(sizes.max(), 1e-300)
     )
-    undetermined = tuple(
-        n for i, n in enumerate(names) if any(abs(v[i]) > 1e-3 for v in null)
-    )
+    undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > 1e-3 for v in null))
     correlation = _correlation(covariance)
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
@@ -215,7 +216,7 @@ def _combinations(
     W, pivots = _reduced(np.array(null), unknowns)
     found = []
     for i in range(len(unknowns)):
-        if i in pivots or np.all(np.abs(W[:, i]) < 1e-3):
+        if i in pivots or np.all(np.abs(W[:, i]) < _TAKES_PART):
             continue
         exponents = np.zeros(len(unknowns))
         exponents[i] = 1.0
@@ -296,14 +297,14 @@ def _sentences(
     remedy: str,
     covariance: np.ndarray,
 ) -> tuple[str, ...]:
-    said = []
-    for name in dead:
-        said.append(f"{name} has no effect on the measured outputs: fix it.")
+    said = [f"{name} has no effect on the measured outputs: fix it." for name in dead]
     lost = _mixed(null, names, dead)
     if lost:
         what = _listed([c.name for c in combinations]) if combinations else "no part"
-        said.append(f"The data determine only {what} of {_listed(list(lost))}: "
-                    f"fix one of {', '.join(lost)}, give it a prior{remedy}.")
+        said.append(
+            f"The data determine only {what} of {_listed(list(lost))}: "
+            f"fix one of {', '.join(lost)}, give it a prior{remedy}."
+        )
     elif null and not dead:
         said.append("The data do not determine what was asked.")
     if not null:
@@ -312,16 +313,24 @@ def _sentences(
             combos = _combinations(data_null, covariance, unknowns)
             with_prior = [u.name for u in unknowns if u.prior > 0 and u.name in resting]
             what = _listed([c.name for c in combos]) if combos else "less than was asked"
-            said.append(f"The data alone determine only {what}; "
-                        f"{_listed(list(resting))} rest on the prior of {_listed(with_prior)}.")
+            owners = f"the prior of {_listed(with_prior)}" if with_prior else "the priors"
+            said.append(
+                f"The data alone determine only {what}; {_listed(list(resting))} rest on {owners}."
+            )
         else:
             said.append(f"The data determine {_listed(list(names))}.")
+    told = set(lost) | (set(_mixed(data_null, names, ())) if not null else set())
     if not null and condition > ILL_CONDITIONED and not data_null:
-        worst = _weak_words(covariance, unknowns)
-        said.append(f"They are hardly separated (condition number {condition:.1e}): {worst}")
+        words, weak = _weakest(covariance, unknowns)
+        told |= weak
+        said.append(f"They are hardly separated (condition number {condition:.1e}): {words}")
     for pair in pairs:
-        said.append(f"{pair.first} and {pair.second} can hardly be told apart (correlation "
-                    f"{pair.correlation:+.5f}): fix one of them or give it a prior.")
+        if {pair.first, pair.second} <= told:
+            continue
+        said.append(
+            f"{pair.first} and {pair.second} can hardly be told apart (correlation "
+            f"{pair.correlation:+.5f}): fix one of them or give it a prior."
+        )
     return tuple(said)
 
 
@@ -332,17 +341,21 @@ def _mixed(
     return tuple(
         n
         for i, n in enumerate(names)
-        if n not in dead and any(abs(v[i]) > 1e-2 for v in null)
+        if n not in dead and any(abs(v[i]) > _TAKES_PART for v in null)
     )
 
 
-def _weak_words(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> str:
-    """The least determined direction in words."""
+def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, set[str]]:
+    """The least determined direction in words, and who takes part in it."""
     _, vectors = np.linalg.eigh(covariance)
     direction = _unit(vectors[:, -1])
-    parts = [
-        f"{u.name} {v:+.2f}"
-        for u, v in zip(unknowns, direction, strict=True)
-        if abs(v) > 0.1
-    ]
-    return f"the weakest direction is ({', '.join(parts)}) in log coordinates."
+    parts = {u.name: v for u, v in zip(unknowns, direction, strict=True) if abs(v) > _TAKES_PART}
+    words = ", ".join(f"{n} {v:+.2f}" for n, v in parts.items())
+    combos = _combinations([direction], covariance, unknowns)
+    better = _listed([c.name for c in combos]) if combos else "their combinations"
+    return (
+        f"the weakest direction is ({words}) in log coordinates, and {better} "
+        f"{'is' if len(combos) == 1 else 'are'} determined far better than "
+        f"{_listed(list(parts))}; fix one of them or give it a prior.",
+        set(parts),
+    )

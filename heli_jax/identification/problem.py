@@ -92,15 +92,18 @@ class Problem:
 
     def start_params(self) -> Any:
         """The vehicle with the free parameters at their starts."""
-        return naming.replace(self.vehicle, **{n: jnp.asarray(f.start, jnp.result_type(float))
-                                               for n, f in self.free.items()})
+        return naming.replace(
+            self.vehicle,
+            **{n: jnp.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
+        )
 
 
 def _check_free(name: str, one: Free, model: Model) -> None:
     if name not in naming.names(model.Params):
         known = naming.names(model.Params)
-        raise ValueError(f"free.{name}: model {model.name} has no such parameter"
-                         f"{nearest(name, known)}")
+        raise ValueError(
+            f"free.{name}: model {model.name} has no such parameter{nearest(name, known)}"
+        )
     numbers = {"start": one.start, "lower": one.lower, "upper": one.upper}
     if one.prior is not None:
         numbers |= {"prior.mean": one.prior.mean, "prior.sd": one.prior.sd}
@@ -113,7 +116,9 @@ def _check_free(name: str, one: Free, model: Model) -> None:
     if low is not None and high is not None and low >= high:
         raise ValueError(f"free.{name}: lower {low:g} is not below upper {high:g}")
     if (low is not None and one.start <= low) or (high is not None and one.start >= high):
-        shown = f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
+        shown = (
+            f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
+        )
         raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
     if one.start == 0 and (low is None or high is None):
         raise ValueError(
@@ -127,7 +132,9 @@ def _check_possible(problem: Problem) -> None:
         return
     for key in ("start", "lower", "upper"):
         values = {n: getattr(f, key) for n, f in problem.free.items()}
-        given = {n: v for n, v in values.items() if v is not None and not (key != "start" and v == 0)}
+        given = {
+            n: v for n, v in values.items() if v is not None and not (key != "start" and v == 0)
+        }
         wrong = impossible(given)
         if wrong:
             raise ValueError(f"free: the {key} of {wrong}")
@@ -145,14 +152,18 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
     unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
     if unknown:
-        raise ValueError(f"{where}: model {model.name} has no output {unknown[0]!r}"
-                         f"{nearest(unknown[0], naming.names(model.Outputs))}")
+        raise ValueError(
+            f"{where}: model {model.name} has no output {unknown[0]!r}"
+            f"{nearest(unknown[0], naming.names(model.Outputs))}"
+        )
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
-            raise ValueError(f"{where}, known.{name}: model {model.name} has no such parameter"
-                             f"{nearest(name, naming.names(model.Params))}")
+            raise ValueError(
+                f"{where}, known.{name}: model {model.name} has no such parameter"
+                f"{nearest(name, naming.names(model.Params))}"
+            )
         if name in problem.free:
             raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
         if not math.isfinite(value):

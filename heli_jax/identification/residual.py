@@ -5,6 +5,7 @@ For flight f and output j the residual is (measured - bias - simulated) / sd; pr
 input gains, the time shift, then for each flight the initial state and the biases.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -90,9 +91,7 @@ class Unknowns(NamedTuple):
     biases: tuple[dict[str, Any], ...]
 
 
-def layout_of(
-    problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False
-) -> Layout:
+def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
     """The static side of a problem over the given flights.
 
     `bounded` keeps the free parameters within their bounds by logit coordinates.
@@ -156,12 +155,16 @@ def _size(values: Any) -> Array:
 
 
 def _state_scales(problem: Problem, data: FlightData) -> dict[str, Array]:
-    """Ten times what each state does in a run from the start values: a weak prior's sd."""
+    """Ten times what each state does in a run from the start values: a weak prior's sd.
+
+    The run is brought to the size of the measured outputs first, since a gain may be unknown.
+    """
     run = _simulate_start(
         problem.model, problem.start_params(), data, problem.solver, problem.substeps
     )
-    sizes = {n: _size(v) for n, v in naming.asdict(run.states).items()}
-    return {n: 10.0 * v for n, v in sizes.items()}
+    ratios = [_size(y) / _size(getattr(run.outputs, n)) for n, y in data.outputs.items()]
+    ratio = 10.0 * jnp.mean(jnp.stack(ratios))
+    return {n: ratio * _size(v) for n, v in naming.asdict(run.states).items()}
 
 
 @eqx.filter_jit
@@ -209,7 +212,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     return Unknowns(params, gains, shift, tuple(states), tuple(biases))
 
 
-def start_vector(layout: Layout, data: Data, free: dict[str, Free]) -> Float[Array, " q"]:
+def start_vector(layout: Layout, data: Data, free: Mapping[str, Free]) -> Float[Array, " q"]:
     """z at the start values: gains 1, no shift, the model's own initial state, no bias."""
     z = [
         coordinates.to_coordinate(
@@ -225,7 +228,7 @@ def start_vector(layout: Layout, data: Data, free: dict[str, Free]) -> Float[Arr
     return z
 
 
-def _initial_states(layout: Layout, data: Data, free: dict[str, Free], z: Array) -> Array:
+def _initial_states(layout: Layout, data: Data, free: Mapping[str, Free], z: Array) -> Array:
     at = len(layout.named)
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in free.items()}
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):

@@ -151,7 +151,10 @@ def rls_regression(
     """RLS on given regressors (N, q): y(k) = phi(k)^T theta."""
     dtype = phi.dtype
     p0 = jnp.asarray(p0, dtype)
-    lam, limit = jnp.asarray(forgetting, dtype), jnp.asarray(100.0 * p0 if bound is None else bound, dtype)
+    lam, limit = (
+        jnp.asarray(forgetting, dtype),
+        jnp.asarray(100.0 * p0 if bound is None else bound, dtype),
+    )
 
     def step(state: RLSState, sample: tuple[Array, Array]) -> tuple[RLSState, RLSInfo]:
         return rls_step(state, *sample, lam, limit)

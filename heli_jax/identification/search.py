@@ -1,6 +1,7 @@
 """Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,20 +10,25 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification import coordinates
-from heli_jax.identification.optimise import Optimum, optimise, optimise_many, scaling
+from heli_jax.identification.optimise import (
+    Optimum,
+    optimise,
+    optimise_many,
+    residuals_count,
+    scaling,
+)
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.residual import Data, Layout, evaluate, layout_of, predict, unpack
+from heli_jax.identification.result import StartRow
 
-if TYPE_CHECKING:
-    from heli_jax.identification.fit import Progress, StartRow
+Progress = Callable[[str], None]
+
 
 _CHUNK = 4
 _SHIFTS = 41
 
 
-def first_guess(
-    layout: Layout, data: Data, sd: Any, z0: Float[Array, " q"]
-) -> Float[Array, " q"]:
+def first_guess(layout: Layout, data: Data, sd: Any, z0: Float[Array, " q"]) -> Float[Array, " q"]:
     """z0 with the time shift from a coarse search and a single gain by linear least squares.
 
     Without either among the unknowns z0 comes back as it is.
@@ -45,9 +51,7 @@ def first_guess(
 
 
 @eqx.filter_jit
-def _scan(
-    layout: Layout, data: Data, sd: Any, z0: Array, shifts: Array
-) -> tuple[Array, Array]:
+def _scan(layout: Layout, data: Data, sd: Any, z0: Array, shifts: Array) -> tuple[Array, Array]:
     """Cost and best single gain for each time shift, with means taken off both signals."""
     q = len(layout.free)
 
@@ -118,10 +122,10 @@ class Search:
         self.bounded = layout_of(problem, problem.training, bounded=True)
 
     def run(
-        self, sd: Any, points: Float[Array, "s q"], tell: "Progress | None" = None
+        self, sd: Any, points: Float[Array, "s q"], tell: Progress | None = None
     ) -> list[Optimum]:
         """An optimum for each start, all in the coordinates of `layout`."""
-        runs = self._run(self.layout, sd, points, tell)
+        runs = [self._worth(run, sd) for run in self._run(self.layout, sd, points, tell)]
         if self.bounded.kinds == self.layout.kinds:
             return runs
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
@@ -131,9 +135,7 @@ class Search:
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
         return runs
 
-    def _run(
-        self, layout: Layout, sd: Any, points: Array, tell: "Progress | None"
-    ) -> list[Optimum]:
+    def _run(self, layout: Layout, sd: Any, points: Array, tell: Progress | None) -> list[Optimum]:
         if not self.many:
             return [self._one(layout, sd, z) for z in points]
         runs: list[Optimum] = []
@@ -153,6 +155,16 @@ class Search:
         e = evaluate(layout, self.data, sd, z0)
         return optimise(layout, self.data, sd, z0, scaling(e.r, e.J), self.max_steps)
 
+    def _worth(self, run: Optimum, sd: Any) -> Optimum:
+        """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        power = [
+            float(jnp.sum(jnp.square(y / s[n])))
+            for flight, s in zip(self.data.flights, sd, strict=True)
+            for n, y in flight.outputs.items()
+        ]
+        nothing = sum(power) / residuals_count(self.layout, self.data)
+        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+
     def _inside(self, z: Array) -> bool:
         values = named_values(self.layout, self.data, z)
         return all(
@@ -163,9 +175,7 @@ class Search:
     def _convert(self, z: Array, old: Layout, new: Layout) -> Array:
         """The same point in another layout's coordinates; a value at a bound is moved inside."""
         for i, (free, value) in enumerate(
-            zip(
-                self.problem.free.values(), named_values(old, self.data, z).values(), strict=True
-            )
+            zip(self.problem.free.values(), named_values(old, self.data, z).values(), strict=True)
         ):
             low, high = (float(b) for b in coordinates.limits(free))
             if np.isfinite(low) and np.isfinite(high):
@@ -187,13 +197,9 @@ def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:
 
 def table(
     layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
-) -> tuple["StartRow", ...]:
+) -> tuple[StartRow, ...]:
     """Start, end and cost of every run, best first; equal optima share a number."""
-    from heli_jax.identification.fit import StartRow
-
-    order = sorted(
-        range(len(runs)), key=lambda i: (not bool(runs[i].converged), _cost(runs[i]))
-    )
+    order = sorted(range(len(runs)), key=lambda i: (not bool(runs[i].converged), _cost(runs[i])))
     rows, optimum, last = [], 0, None
     for i in order:
         cost, converged = _cost(runs[i]), bool(runs[i].converged)
@@ -203,7 +209,9 @@ def table(
             StartRow(
                 named_values(layout, data, points[i]),
                 named_values(layout, data, runs[i].z),
-                cost, int(runs[i].steps), converged,
+                cost,
+                int(runs[i].steps),
+                converged,
                 optimum if converged else 0,
             )
         )

@@ -38,7 +38,10 @@ def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str,
             "determined_combinations": _combinations(fit.verdict),
             "verdict": _verdict(fit.verdict),
             "verdict_before": _verdict(fit.verdict_before),
-            "parameters": {**_fixed(problem), **{n: _parameter(e) for n, e in fit.estimates.items()}},
+            "parameters": {
+                **_fixed(problem),
+                **{n: _parameter(e) for n, e in fit.estimates.items()},
+            },
             "nuisance": {n: _parameter(e) for n, e in fit.nuisance.items()},
             "noise_sd": fit.noise,
             "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
@@ -78,7 +81,8 @@ def _fixed(problem: Problem) -> dict[str, Any]:
     """The parameters a user might look for that were not free: those that flights replace."""
     names = {n for f in problem.flights for n in f.known}
     return {
-        n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True} for n in sorted(names)
+        n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True}
+        for n in sorted(names)
     }
 
 

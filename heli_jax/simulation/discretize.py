@@ -72,12 +72,13 @@ def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
     if late is None:
-        Ad, Bd = _held(A, B, dt)
-        return Discrete(*_hoisted(Ad, Bd), None)
+        Ad, Bd = _hoisted(*_held(A, B, dt))
+        return Discrete(Ad, Bd, None)
     late = jnp.asarray(late, A.dtype)
     first, second = _held(A, B, late), _held(A, B, dt - late)
     Ad, Bd, Bp = second[0] @ first[0], second[1], second[0] @ first[1]
-    return Discrete(*_hoisted(Ad, Bd, Bp))
+    Ad, Bd, Bp = _hoisted(Ad, Bd, Bp)
+    return Discrete(Ad, Bd, Bp)
 
 
 def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:

@@ -3,7 +3,9 @@
 import numpy as np
 
 
-def random_steps(n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]) -> np.ndarray:
+def random_steps(
+    n: int, dt: float, rng: np.random.Generator, hold: tuple[float, float]
+) -> np.ndarray:
     """Pilot-like steps: levels uniform in [-1, 1], each held for a uniform time in `hold` [s]."""
     u = np.empty(n)
     k = 0

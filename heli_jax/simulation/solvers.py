@@ -75,7 +75,7 @@ class Exact(dfx.AbstractSolver):
             before = jax.tree.leaves(at(args.inputs, k - 1))
             new = [x + _dot(b, before) for x, b in zip(new, Bp, strict=True)]
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
-        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
 def _dot(coefficients: Any, values: Any) -> Any:
@@ -120,7 +120,7 @@ class RK4(dfx.AbstractSolver):
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + (h / 6.0) * (a + 2.0 * (b + c) + d), y0, k1, k2, k3, k4
         )
-        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
 class PerSample(dfx.AbstractSolver):
@@ -161,7 +161,7 @@ class PerSample(dfx.AbstractSolver):
             now = Now(args.params, at(args.inputs, sample))
             y, one = self._steps(terms, begin, end, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)
-        return y, None, dict(y0=y0, y1=y), None, result
+        return y, None, {"y0": y0, "y1": y}, None, result
 
     def _steps(self, terms: Any, begin: Any, end: Any, y0: Any, now: Now) -> Any:
         h = (end - begin) / self.substeps
@@ -212,4 +212,4 @@ class Accumulating(dfx.AbstractSolver):
         value = self.update(value, state, at(held.inputs, k), at(data, k))
         state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
         y1 = (state, value)
-        return y1, None, dict(y0=y0, y1=y1), None, result
+        return y1, None, {"y0": y0, "y1": y1}, None, result

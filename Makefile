@@ -1,0 +1,37 @@
+# make demo   the main job on a bench log that the project makes itself; CONFIG=FILE fits yours
+# make test   all checks
+# make bench  the benchmarks, side by side in one run
+.PHONY: demo test bench clean
+SHELL := /bin/bash
+CONFIG ?= configs/bench-roll.yaml
+OUT ?= runs/demo/fit
+BIN := .venv/bin
+
+.venv/.installed: pyproject.toml constraints.txt
+	@found=; for p in python3.13 python3.12 python3 "$$(uv python find '>=3.12' 2>/dev/null)"; do \
+	  if [ -n "$$p" ] && "$$p" -c 'import sys, venv; sys.exit(sys.version_info < (3, 12))' >/dev/null 2>&1; \
+	  then found="$$p"; break; fi; done; \
+	if [ -z "$$found" ]; then \
+	  echo "heli_jax needs Python 3.12 or newer: install python3.13 (with its venv module) or uv." >&2; exit 1; fi; \
+	if [ ! -x $(BIN)/python ]; then "$$found" -m venv .venv || exit 1; fi; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -c constraints.txt
+	@touch $@
+
+demo: .venv/.installed
+ifeq ($(CONFIG),configs/bench-roll.yaml)
+	@$(BIN)/heli-jax simulate $(CONFIG) --out runs/demo/bench.csv
+endif
+	@rm -rf '$(OUT)'
+	@$(BIN)/heli-jax fit '$(CONFIG)' --out '$(OUT)'
+
+test: .venv/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -n 2
+
+bench: .venv/.installed
+	$(BIN)/python experiments/benchmarks/identification.py
+
+clean:
+	rm -rf .venv runs .pytest_cache .ruff_cache

@@ -1,0 +1,142 @@
+"""Estimates with standard deviations and intervals, from an optimum and its verdict."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.identifiability import Unknown, Verdict
+from heli_jax.identification.judgement import references_of, unknowns_of
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.residual import Data, Evaluation, Layout
+from heli_jax.identification.result import Estimate
+
+
+def estimates_of(
+    problem: Problem, layout: Layout, e: Evaluation, verdict: Verdict, quantile: float
+) -> dict[str, Estimate]:
+    unknowns = unknowns_of(problem, layout, e)
+    references = references_of(problem, layout, unknowns)
+    out = {}
+    for i, u in enumerate(unknowns):
+        free = problem.free.get(u.name)
+        relative = float(np.sqrt(verdict.covariance[i, i]))
+        sd, low, high = _interval95(u, relative, references[i], quantile)
+        lost = u.name in verdict.undetermined or u.name in verdict.without_effect
+        start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
+        out[u.name] = Estimate(
+            value=u.value,
+            sd=None if lost else sd,
+            lower95=None if lost else low,
+            upper95=None if lost else high,
+            unit=_unit(problem, u.name),
+            start=start,
+            prior_share=verdict.prior_share[u.name],
+            at_bound=_at_bound(problem, u.name, u.value),
+        )
+    return out
+
+
+def _interval95(
+    u: Unknown, relative: float, reference: float, quantile: float
+) -> tuple[float, float, float]:
+    sd = float(relative * reference)
+    if not u.logarithmic:
+        return sd, u.value - quantile * sd, u.value + quantile * sd
+    reach = float(np.exp(min(quantile * relative, 700.0)))
+    low, high = sorted((u.value / reach, u.value * reach))
+    return sd, float(low), float(high)
+
+
+def _unit(problem: Problem, name: str) -> str:
+    if name == "time_shift":
+        return "s"
+    if name.startswith("gain "):
+        return problem.gain_units.get(name.removeprefix("gain "), "1")
+    return naming.unit(problem.model.Params, name) or ""
+
+
+def _at_bound(problem: Problem, name: str, value: float) -> bool:
+    free = problem.free.get(name)
+    if free is None:
+        return name == "time_shift" and abs(value) > 0.999 * MAX_TIME_SHIFT
+    low, high = free.lower, free.upper
+    width = high - low if low is not None and high is not None else abs(value)
+    near = 1e-3 * width
+    by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
+    by_high = high is not None and high - value < near
+    return bool(by_low or by_high)
+
+
+def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
+    return [
+        f"{name} ended at its bound: the data want it beyond {one.value:g}; its interval does not "
+        "hold there."
+        for name, one in estimates.items()
+        if one.at_bound
+    ]
+
+
+def stated_noise_notes(problem: Problem, sd: Any) -> list[str]:
+    notes = []
+    for flight, label, by_name in zip(problem.training, labels(problem.training), sd, strict=True):
+        for name, stated in flight.sd.items():
+            ratio = float(by_name[name]) / stated
+            if not 0.5 < ratio < 2.0:
+                notes.append(
+                    f"{label}: the residual of {name} has {ratio:.2g} times the stated noise; the "
+                    "intervals go by the residual."
+                )
+    return notes
+
+
+def flight_nuisances(
+    problem: Problem, layout: Layout, data: Data, z: Array, e: Evaluation, quantile: float
+) -> dict[str, Estimate]:
+    """Initial states and biases, with the weak priors they carry."""
+    q = len(layout.named)
+    if layout.size == q:
+        return {}
+    J = np.asarray(e.J, dtype=np.float64)
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    inverse = np.linalg.pinv(J / norms, rcond=1e-10)
+    sds = np.sqrt(np.sum(inverse**2, axis=1)) / norms
+    out, at = {}, q
+    state_names = naming.names(layout.model.State)
+    for label, flight, outputs in zip(
+        labels(problem.training), data.flights, layout.outputs, strict=True
+    ):
+        parts = []
+        if layout.initial_state:
+            parts += [
+                (f"initial {n}", flight.state_scale[n], naming.unit(layout.model.State, n))
+                for n in state_names
+            ]
+        if layout.bias:
+            parts += [
+                (f"bias {n}", flight.bias_scale[n], naming.unit(layout.model.Outputs, n))
+                for n in outputs
+            ]
+        for name, scale, unit in parts:
+            value, sd = float(z[at] * scale), float(sds[at] * scale)
+            share = min(1.0, float(sds[at]) ** 2)
+            out[f"{label}/{name}"] = Estimate(
+                value,
+                sd,
+                value - quantile * sd,
+                value + quantile * sd,
+                unit or "",
+                0.0,
+                share,
+                False,
+            )
+            at += 1
+    return out
+
+
+def labels(flights: tuple[Flight, ...]) -> list[str]:
+    """What to call each flight."""
+    return [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]

@@ -1,0 +1,56 @@
+"""Doubts about a record that no residual shows: sampling too slow, inputs too small or too few."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.linear import modes
+from heli_jax.identification.problem import Problem
+
+_AT_NYQUIST = 0.9
+_FEEBLE = 3.0
+
+
+def notes(problem: Problem, simulated: tuple[dict[str, np.ndarray], ...], sd: Any) -> list[str]:
+    """Sentences on sampling and excitation for runs simulated at the start values."""
+    found = sampling(problem, {n: f.start for n, f in problem.free.items()})
+    for flight, outputs, noise in zip(problem.training, simulated, sd, strict=True):
+        where = flight.name or "the flight"
+        for name, y in outputs.items():
+            moved = float(np.std(y))
+            if moved < _FEEBLE * float(noise[name]):
+                found.append(
+                    f"{where}: the input hardly excites the model: it moves {name} by "
+                    f"{moved:.2g} (rms, at the start values) where the noise is "
+                    f"{float(noise[name]):.2g}; use larger or more inputs."
+                )
+        for name, u in flight.inputs.items():
+            changes = int(np.count_nonzero(np.diff(u)))
+            if changes < len(problem.free):
+                found.append(
+                    f"{where}: {name} changes {changes} times in the record, fewer than there "
+                    f"are free parameters ({len(problem.free)}): it excites too little."
+                )
+    return found
+
+
+def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
+    """A sentence for each flight whose sampling a mode of the linearised model reaches."""
+    free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
+    params = naming.replace(problem.vehicle, **free)
+    found = []
+    for flight in problem.training:
+        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+        eigenvalues = modes(problem.model, naming.replace(params, **known))
+        nyquist = np.pi / flight.dt
+        fast = eigenvalues[np.abs(eigenvalues.imag) >= _AT_NYQUIST * nyquist]
+        if fast.size:
+            omega = float(np.max(np.abs(fast.imag)))
+            found.append(
+                f"{flight.name or 'the flight'}: a mode at {omega:.4g} rad/s lies at or past the "
+                f"Nyquist frequency of the sampling ({nyquist:.4g} rad/s): the samples cannot show "
+                "it, and its aliases may be taken for slower dynamics."
+            )
+    return found

@@ -1,0 +1,98 @@
+"""What a fit gives: plain data."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.metrics import Metrics, Whiteness
+
+Status = Literal["converged", "not-converged", "not-identifiable"]
+
+
+class Estimate(NamedTuple):
+    """One estimated number; sd and interval are None where the data do not determine it."""
+
+    value: float
+    sd: float | None
+    lower95: float | None
+    upper95: float | None
+    unit: str
+    start: float
+    prior_share: float
+    at_bound: bool
+
+
+class Signals(NamedTuple):
+    """One flight as measured and as simulated; arrays (N,), SI."""
+
+    flight: str
+    hold_out: bool
+    times: np.ndarray
+    inputs: dict[str, np.ndarray]
+    measured: dict[str, np.ndarray]
+    simulated: dict[str, np.ndarray]
+    """with the estimated bias"""
+
+    def residual(self, output: str) -> np.ndarray:
+        """measured - simulated"""
+        return self.measured[output] - self.simulated[output]
+
+
+class StartRow(NamedTuple):
+    """Where one start led."""
+
+    start: dict[str, float]
+    end: dict[str, float]
+    cost: float
+    steps: int
+    converged: bool
+    optimum: int
+    """1 for the best optimum, 2 for the next, ...; 0 where it did not converge"""
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What is known before any fit."""
+
+    verdict: Verdict
+    noise: dict[str, float]
+    """sd assumed for each flight and output"""
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of a fit: plain data."""
+
+    model: str
+    method: str
+    status: Status
+    n_samples: int
+    estimates: dict[str, Estimate]
+    nuisance: dict[str, Estimate]
+    params: Any
+    """the vehicle with the estimates in place"""
+    verdict_before: Verdict
+    verdict: Verdict
+    noise: dict[str, float]
+    """residual sd for each flight and output: 'flight/output'"""
+    signals: tuple[Signals, ...]
+    metrics: dict[str, Metrics]
+    """over the fitted flights, by output"""
+    validation: dict[str, Metrics]
+    """over the flights held out, by output"""
+    whiteness: dict[str, Whiteness]
+    starts: tuple[StartRow, ...]
+    steps: int
+    trace: tuple[tuple[int, float], ...]
+    """(steps, cost) of every round of the optimiser"""
+    notes: tuple[str, ...]
+    seed: int = 0
+    timing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def white(self) -> bool:
+        """Whether all residuals look white, so that the intervals may be taken at their word."""
+        return all(w.white for w in self.whiteness.values())
