@@ -1,6 +1,6 @@
 """Between discrete and continuous transfer functions: c2d, d2c, and what can go wrong."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import scipy.linalg
@@ -45,7 +45,7 @@ def d2c(
         raise ValueError(f"unknown method {method!r}: use 'zoh' or 'real-log'")
     A, B, C, D = _state_space(num, den, dt)
     n = A.shape[0]
-    poles: Any = np.linalg.eigvals(A)
+    poles = np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
     size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
     if np.any(np.abs(poles) < 1e-12 * size):
         raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")

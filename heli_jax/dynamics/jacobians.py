@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -19,6 +20,7 @@ class StateSpace(NamedTuple):
     D: Float[Array, "p m"]
 
 
+@eqx.filter_jit
 def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) -> StateSpace:
     """The model's A, B, C, D at a state and inputs (all zeros unless given), by forward mode."""
     dtype = jnp.result_type(*(jnp.asarray(v).dtype for v in jax.tree.leaves(params)))

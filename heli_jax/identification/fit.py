@@ -3,7 +3,6 @@
 import time
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
@@ -23,7 +22,7 @@ from heli_jax.identification.estimates import (
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.metrics import Metrics, metrics, noise_guess, whiteness
-from heli_jax.identification.optimise import Optimum
+from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import (
     Data,
@@ -31,24 +30,11 @@ from heli_jax.identification.residual import (
     data_of,
     evaluate,
     layout_of,
-    predict,
-    raw_residuals,
     start_vector,
-    unpack,
 )
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, StartRow, Status
 
 __all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
-
-
-@eqx.filter_jit
-def _simulated(layout: Layout, data: Data, z: Array) -> Any:
-    """Simulated outputs with bias, by flight."""
-    u = unpack(layout, data, z)
-    return tuple(
-        {n: getattr(run.outputs, n) + bias[n] for n in flight.outputs}
-        for flight, run, bias in zip(data.flights, predict(layout, data, u), u.biases, strict=True)
-    )
 
 
 def check(problem: Problem) -> Check:
@@ -59,19 +45,11 @@ def check(problem: Problem) -> Check:
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     sd, notes = _first_noise(problem)
     z = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
-    verdict = verdict_of(problem, layout, evaluate(layout, data, sd, z))
-    notes += excitation.notes(problem, _start_run(layout, data, z), sd)
+    e = evaluate(layout, data, sd, z)
+    verdict = verdict_of(problem, layout, e)
+    runs = tuple(s.simulated for s in _signals(e.raw, problem.training))
+    notes += excitation.notes(problem, runs, sd)
     return Check(verdict, _noise_by_name(problem, sd), tuple(notes))
-
-
-def _start_run(layout: Layout, data: Data, z: Array) -> tuple[dict[str, np.ndarray], ...]:
-    """Simulated outputs without bias at z, by flight."""
-    u = unpack(layout, data, z)
-    simulated = _simulated(layout, data, z)
-    return tuple(
-        {n: np.asarray(y - bias[n]) for n, y in by_name.items()}
-        for by_name, bias in zip(simulated, u.biases, strict=True)
-    )
 
 
 def fit(
@@ -153,7 +131,8 @@ def _settle_noise(
     """Alternate between the optimum and the residual sd until both stay (relaxation of R)."""
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(8):
-        new = _residual_sd(search.layout, search.data, best.z)
+        raw = evaluate(search.layout, search.data, sd, best.z).raw
+        new = _residual_sd(search.layout, search.data, raw)
         change = max(
             abs(float(jnp.log(n[k] / s[k]))) for n, s in zip(new, sd, strict=True) for k in s
         )
@@ -167,11 +146,9 @@ def _settle_noise(
     return best, sd, tuple(trace)
 
 
-@eqx.filter_jit
-def _residual_sd(layout: Layout, data: Data, z: Array) -> Any:
+def _residual_sd(layout: Layout, data: Data, raw: Any) -> Any:
     """Residual sd by flight and output, with the degrees of freedom taken off in proportion."""
-    raw = raw_residuals(layout, data, z)
-    n = sum(r.shape[0] for by_name in raw for r in by_name.values())
+    n = residuals_count(layout, data)
     freedom = n / max(n - layout.size, 1)
 
     def sd(r: Array, y: Array) -> Array:
@@ -215,7 +192,7 @@ def _assemble(
     n = sum(y.size for f in problem.training for y in f.outputs.values())
     quantile = float(scipy.stats.t.ppf(0.975, max(n - layout.size, 1)))
     named = estimates_of(problem, layout, e, verdict, quantile)
-    signals = _signals(layout, data, best.z, problem.training)
+    signals = _signals(e.raw, problem.training)
     held = tuple(f for f in problem.flights if f.hold_out)
     validation = _validation(problem, sd, best.z, layout, held) if held else ()
     estimates = {k: named[k] for k in layout.free}
@@ -249,10 +226,8 @@ def _assemble(
     )
 
 
-def _signals(
-    layout: Layout, data: Data, z: Array, flights: tuple[Flight, ...]
-) -> tuple[Signals, ...]:
-    simulated = _simulated(layout, data, z)
+def _signals(raw: Any, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
+    """Measured and simulated signals; what is simulated carries the bias."""
     return tuple(
         Signals(
             label,
@@ -260,9 +235,9 @@ def _signals(
             f.times,
             dict(f.inputs),
             dict(f.outputs),
-            {n: np.asarray(y) for n, y in by_name.items()},
+            {n: f.outputs[n] - np.asarray(r) for n, r in by_name.items()},
         )
-        for label, f, by_name in zip(labels(flights), flights, simulated, strict=True)
+        for label, f, by_name in zip(labels(flights), flights, raw, strict=True)
     )
 
 
@@ -282,7 +257,7 @@ def _validation(
         e = evaluate(other, data, noise, full)
         step, *_ = np.linalg.lstsq(np.asarray(e.J)[:, q:], -np.asarray(e.r), rcond=1e-10)
         full = full.at[q:].add(jnp.asarray(step, z.dtype))
-    return _signals(other, data, full, held)
+    return _signals(evaluate(other, data, noise, full).raw, held)
 
 
 def _pooled(signals: tuple[Signals, ...]) -> dict[str, Metrics]:

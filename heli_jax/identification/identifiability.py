@@ -96,19 +96,25 @@ def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
     return R[k : k + q, k:]
 
 
-def judge(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...], remedy: str = "") -> Verdict:
+def judge(
+    sensitivity: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    remedy: str = "",
+    null_below: float = NULL,
+) -> Verdict:
     """The verdict from a whitened sensitivity (any rows, q) in relative coordinates.
 
     Priors are no rows of it; they come with the unknowns.
 
-    `remedy` is a further way out that the model offers, such as a run with a known inertia.
+    `null_below` is the part of the largest singular value that counts as zero. `remedy` is a
+    further way out that the model offers, such as a run with a known inertia.
     """
     names = tuple(u.name for u in unknowns)
     scale = np.array([u.scale for u in unknowns])
     prior = np.diag([u.prior for u in unknowns])
     data = _directions(sensitivity, scale)
     total = _directions(np.vstack([sensitivity, prior]), scale)
-    kept = total.singular > NULL * max(total.singular[0], 1e-300)
+    kept = total.singular > null_below * max(total.singular[0], 1e-300)
     covariance = _covariance(total, kept, scale)
     null = [_unit(scale * v) for v in total.right[~kept]]
     if not null:
@@ -123,7 +129,7 @@ def judge(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...], remedy: str = 
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
     condition = float(total.singular[0] / smallest) if smallest > 0 else math.inf
-    data_rank = int(np.sum(data.singular > NULL * max(data.singular[0], 1e-300)))
+    data_rank = int(np.sum(data.singular > null_below * max(data.singular[0], 1e-300)))
     share = {
         u.name: float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
         for i, u in enumerate(unknowns)

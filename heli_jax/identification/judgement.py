@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.identification.identifiability import Unknown, Verdict, judge, projected
+from heli_jax.identification.identifiability import NULL, Unknown, Verdict, judge, projected
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import Evaluation, Layout
 
@@ -91,4 +91,6 @@ def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
         )
     unknowns = unknowns_of(problem, layout, e)
     sensitivity, nuisances = _split(problem, layout, e, unknowns)
-    return judge(projected(sensitivity, nuisances), unknowns, _remedy(problem))
+    # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
+    null_below = max(NULL, 100.0 * float(jnp.finfo(e.J.dtype).eps))
+    return judge(projected(sensitivity, nuisances), unknowns, _remedy(problem), null_below)

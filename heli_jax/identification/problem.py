@@ -1,7 +1,7 @@
 """Problem: what is fitted to what."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -63,7 +63,7 @@ class Problem:
 
     model: Model
     vehicle: Any
-    flights: tuple[Flight, ...]
+    flights: Sequence[Flight]
     free: Mapping[str, Free]
     nuisance: Nuisance = field(default_factory=Nuisance)
     solver: str | None = None

@@ -1,0 +1,38 @@
+"""float64, strict dtypes and ranks, checked shapes, and examples that are the same every time."""
+
+from pathlib import Path
+
+import hypothesis
+import jax
+import jaxtyping
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Before the package's first import: the hook checks the shapes that its annotations state.
+# Left out are flights (beartype cannot check its Table, a Protocol that is not runtime_checkable)
+# and identification.problem (it takes a list of flights where its annotation says tuple).
+_CHECKED = (
+    "vehicle naming dynamics simulation analysis identification.rls identification.coordinates "
+    "identification.baseline identification.metrics identification.residual"
+)
+jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")
+
+hypothesis.settings.register_profile(
+    "same", derandomize=True, deadline=None, max_examples=30, database=None
+)
+hypothesis.settings.load_profile("same")
+
+
+@pytest.fixture(scope="session")
+def vehicles_folder():
+    return Path(__file__).parents[1] / "configs" / "vehicles"
+
+
+@pytest.fixture(scope="session")
+def bench30(vehicles_folder):
+    from heli_jax import load_vehicle
+
+    return load_vehicle(vehicles_folder / "bench-30.yaml")
