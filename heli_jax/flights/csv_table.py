@@ -133,6 +133,13 @@ class CsvTable:
                 " them",
                 f"line {self._first_line - 1}",
             )
+        if missing and len(self.names) == 1:
+            raise wrong(
+                self.path,
+                f"found no comma, semicolon or tab between names, wanted are columns,"
+                f" {shown(missing[0])} among them",
+                f"line {self._first_line - 1}",
+            )
         require_columns(self.path, self.names, names)
 
     def _record(self, row: int) -> tuple[int, list[str]]:
@@ -149,7 +156,7 @@ class CsvTable:
                     yield number, line.split(self.delimiter)
             return
         lines = (f"{line}\n" for line in self._body.split("\n"))
-        reader = csv.reader(lines, delimiter=self.delimiter, strict=True)
+        reader = csv.reader(lines, delimiter=self.delimiter, skipinitialspace=True, strict=True)
         start = self._first_line
         try:
             for cells in reader:

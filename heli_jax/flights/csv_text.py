@@ -44,6 +44,9 @@ def find_delimiter(header: str, first: str) -> str:
 
 def header_names(path: str, header: str, delimiter: str, line: int) -> tuple[str, ...]:
     try:
-        return tuple(cell.strip() for cell in next(csv.reader([header], delimiter=delimiter)))
+        return tuple(
+            cell.strip()
+            for cell in next(csv.reader([header], delimiter=delimiter, skipinitialspace=True))
+        )
     except csv.Error as e:
         raise wrong(path, "is no header, wanted are names of columns", f"line {line}") from e

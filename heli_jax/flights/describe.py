@@ -9,7 +9,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
+from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.table import Survey, Table, column, open_table, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
@@ -167,7 +167,7 @@ def _describe_time(table: Table, survey: list[Survey], signal: Signal) -> TimeIn
     if problem:
         return TimeInfo(signal.name, unit, nan, nan, False, nan, (), problem)
     usual = float(np.median(steps))
-    grid = uniform_grid(seconds, rounding_of(stamps) * units.factor(unit, "s"))
+    grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * units.factor(unit, "s"))
     uneven = isinstance(grid, Uneven)
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
     return TimeInfo(
@@ -187,10 +187,12 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
     bad = int(np.count_nonzero(~np.isfinite(seconds)))
     if bad:
         return f"{bad} stamps are empty or no finite numbers"
-    if not np.all(np.isfinite(steps)):
-        return "the stamps are too far apart"
+    if not np.all(np.abs(seconds) <= LATEST):
+        return "the stamps are too large for times"
     if not np.all(steps > 0):
         row = int(np.flatnonzero(steps <= 0)[0])
         what = "stands still" if steps[row] == 0 else "runs backwards"
         return f"the time {what} after {seconds[row] - seconds[0]:.6g} s"
+    if np.median(steps) < SHORTEST_STEP:
+        return "the steps are shorter than 1 ns"
     return ""

@@ -1,12 +1,18 @@
 """Whether a log's time stamps are a uniform grid, and which one."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 JITTER_ALLOWED = 0.1  # of a step, where rounding does not explain more
+LATEST = 1e12  # s, beyond any calendar; keeps sums and differences of stamps finite
+SHORTEST_STEP = 1e-9  # s
 _JITTER_NOTED = 0.01
-_FEW = 5  # so few steps of double length are lost samples, not rounding
+_DRIFT_ALLOWED = 0.5  # of a step
+_FEWEST_DIGITS = 5  # nobody logs fewer significant digits
+_FEWEST_STAMPS = 8  # fewer may be round numbers by accident
+_COARSEST = 0.9  # of a step; stamps rounded to a whole step cannot show a lost sample otherwise
 
 
 @dataclass(frozen=True)
@@ -40,74 +46,91 @@ class Uneven:
     drift: float | None = None
 
 
-def uniform_grid(seconds: np.ndarray, rounding: np.ndarray) -> Grid | Uneven:
+def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
     """The uniform grid that stamps (N,) [s] stand for, N >= 2 and strictly increasing.
 
-    Every step may err by a tenth of the mean step, or by the rounding (N,) [s] of its stamps,
-    and no stamp may leave a straight line by half a step.
+    Either no step errs by more than a tenth and no stamp leaves a straight line by half a step;
+    or all stamps lie as near to a line as the `rounding` [s] of stamps on it would leave them.
     """
-    with np.errstate(all="ignore"):
-        steps = np.diff(seconds)
-        usual = float(np.median(steps))
-        dt = float((seconds[-1] - seconds[0]) / steps.size)
-        error = np.abs(steps - dt)
-        allowed = np.maximum(JITTER_ALLOWED * dt, np.maximum(rounding[1:], rounding[:-1]))
-        far = np.count_nonzero(error > 0.5 * dt)
-        if not np.all(error <= allowed * (1 + 1e-6)) or 0 < far < _FEW:
-            row = int(np.argmax(np.abs(steps - usual)))
-            return Uneven(row + 1, float(steps[row]), usual)
-        drift = np.abs(_leave_line(seconds)) / dt
-        row = int(np.argmax(drift))
-        if not drift[row] < 0.5:
-            return Uneven(row, float(steps[max(row - 1, 0)]), usual, float(drift[row]))
-        return Grid(_plain(dt, seconds), float(error.max() / dt))
+    steps = np.diff(elapsed)
+    slope = _least_squares_step(elapsed)
+    dt = _plain(slope, 2 * rounding / float(elapsed[-1] - elapsed[0]))
+    jitter = float(np.abs(steps - dt).max() / dt)
+    drift = _spread(elapsed, dt) / dt / 2
+    if jitter <= JITTER_ALLOWED and drift < _DRIFT_ALLOWED:
+        return Grid(dt, jitter)
+    if rounding <= _COARSEST * dt:
+        nearest = _step_of_least_spread(elapsed, slope)
+        if _spread(elapsed, nearest) <= rounding * (1 + 1e-6):
+            return Grid(dt, jitter)
+    usual = float(np.median(steps))
+    error = np.abs(steps - usual)
+    row = int(np.argmax(error >= error.max() * (1 - 1e-6)))  # the first of equals
+    only_drift = jitter <= JITTER_ALLOWED
+    return Uneven(row + 1, float(steps[row]), usual, drift if only_drift else None)
 
 
-def _leave_line(seconds: np.ndarray) -> np.ndarray:
-    """Distance [s] of each stamp (N,) from the straight line of least squares."""
-    i = np.arange(seconds.size) - 0.5 * (seconds.size - 1)
-    t = seconds - seconds[0]
-    t = t - t.mean()
-    return t - i * (i @ t) / (i @ i)
+def _spread(elapsed: np.ndarray, dt: float) -> float:
+    """Width [s] of the band of slope `dt` that holds all stamps (N,)."""
+    return float(np.ptp(elapsed - dt * np.arange(elapsed.size)))
 
 
-def _plain(dt: float, seconds: np.ndarray) -> float:
-    """`dt` without the digits that are errors of floating point: 0.01, not 0.0100000000000003."""
-    plain = float(f"{dt:.10g}")
-    error = 4 * float(np.spacing(np.abs(seconds).max()))
-    return plain if plain > 0 and abs(plain - dt) * seconds.size <= error else dt
+def _least_squares_step(elapsed: np.ndarray) -> float:
+    """Slope of the line of least squares; the median step of 300 Hz in milliseconds is 3 ms."""
+    i = np.arange(elapsed.size) - 0.5 * (elapsed.size - 1)
+    return float(i @ (elapsed - elapsed.mean()) / (i @ i))
 
 
-def rounding_of(stamps: np.ndarray) -> np.ndarray:
-    """How coarsely each stamp (N,) is rounded, in the stamps' unit.
+def _step_of_least_spread(elapsed: np.ndarray, dt: float) -> float:
+    """The slope for which the band is narrowest, by ternary search: the width is convex in it."""
+    reach = 2 * _spread(elapsed, dt) / elapsed.size
+    low, high = dt - reach, dt + reach
+    for _ in range(60):
+        third = (high - low) / 3
+        if _spread(elapsed, low + third) < _spread(elapsed, high - third):
+            high -= third
+        else:
+            low += third
+    return 0.5 * (low + high)
 
-    Read from the stamps themselves: their decimals, or their significant digits (then the later
-    stamps are the coarser), or a float32 column. Where nothing is evident it is what float64
-    resolves.
+
+def _plain(dt: float, tolerance: float) -> float:
+    """A whole rate, or few digits, where the stamps cannot tell it from `dt`: 0.01, not 0.0099999.
+
+    `tolerance` is relative.
+    """
+    tolerance = min(max(tolerance, 1e-10), 1e-3)
+    candidates = [float(f"{dt:.9g}")]
+    if dt < 1:
+        candidates.insert(0, 1 / round(1 / dt))
+    return next((c for c in candidates if abs(c / dt - 1) <= tolerance), dt)
+
+
+def rounding_of(stamps: np.ndarray) -> float:
+    """How coarsely stamps (N,), N >= 2 and strictly increasing, are rounded, in their unit.
+
+    Read from the stamps themselves: the largest power of ten, up to a step, that all are multiples
+    of; or what float32 resolves; where nothing is evident, what float64 does. Significant digits
+    round later stamps more coarsely, so those with the most digits before the point decide.
     """
     size = np.abs(stamps)
-    with np.errstate(all="ignore"):
+    largest = float(size.max())
+    top = math.floor(math.log10(largest))
+    late = size[size >= 10.0**top]
+    resolved = float(np.spacing(largest))
+    coarse = math.floor(math.log10(float(np.median(np.diff(stamps)))) + 1e-9)
+    for exponent in range(coarse, coarse - 6, -1):
+        unit = 10.0**exponent
+        by_digits = top - exponent + 1 >= _FEWEST_DIGITS and late.size >= _FEWEST_STAMPS
+        multiples = (late if by_digits else size) / unit
+        error = np.abs(multiples - np.rint(multiples)).max()
+        if unit > 100 * resolved and error <= max(1e-9, 4 * resolved / unit):
+            return unit
+    return max(resolved, _single_precision(size))
+
+
+def _single_precision(size: np.ndarray) -> float:
+    """What float32 resolves where the stamps are all float32, otherwise 0."""
+    with np.errstate(over="ignore", under="ignore"):
         single = size.astype(np.float32)
-        binary = np.spacing(single if np.all(single == size) else size).astype(np.float64)
-    return np.maximum(_decimal_rounding(size), binary)
-
-
-def _decimal_rounding(size: np.ndarray) -> np.ndarray:
-    unit = np.zeros(size.size)
-    left = np.arange(size.size)
-    for decimals in range(-3, 10):
-        scaled = size[left] * 10.0**decimals
-        tolerance = 4 * np.finfo(float).eps * np.maximum(scaled, 1.0)
-        whole = np.abs(scaled - np.rint(scaled)) <= tolerance
-        unit[left[whole]] = 10.0**-decimals
-        left = left[~whole]
-    with np.errstate(divide="ignore"):
-        decade = np.where(size > 0, np.floor(np.log10(size)), -400)
-    # A stamp such as 0.5 among thousandths only looks coarse: the finest of its decade counts,
-    # and no decade is finer than one above it.
-    finest = np.inf
-    for d in np.unique(decade)[::-1]:
-        members = decade == d
-        finest = min(finest, unit[members].min())
-        unit[members] = finest
-    return unit
+    return float(np.spacing(single.max())) if np.all(single == size) else 0.0

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.grid import Grid, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
 from heli_jax.flights.table import Table, column, open_table, wrong
@@ -50,10 +51,12 @@ def read_flight(
     request = Request(str(path), time, inputs, outputs, rate, window, known or {})
     table = open_table(path)
     numbers = table.numbers(request.columns)
-    seconds, rounding = _clock(table, request.time, numbers[request.time.name])
+    clock = _clock(table, request.time, numbers[request.time.name])
+    seconds = clock.elapsed
     rows, notes = _rows(table.path, seconds, window)
     signals = _to_si(table, request, numbers, rows)
-    grid = uniform_grid(seconds[rows], rounding[rows])
+    _check_step(table, request.time.name, seconds[rows], rows.start)
+    grid = uniform_grid(seconds[rows], rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and rate is None:
         raise _uneven(table, request.time.name, seconds[rows], rows.start, grid)
     dt, samples, more = _on_grid(table, request, seconds, rows, signals, grid)
@@ -61,7 +64,7 @@ def read_flight(
         dt=dt,
         inputs={key: samples[key, "input"] for key in inputs},
         outputs={key: samples[key, "output"] for key in outputs},
-        t0=float(seconds[rows.start]),
+        t0=float(clock.stamps[rows.start] * clock.scale),
         sd=request.noise(),
         known=dict(request.known),
         hold_out=hold_out,
@@ -90,37 +93,47 @@ def require_moving_inputs(flight: Flight) -> None:
             )
 
 
-def _clock(table: Table, time: Signal, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (N,) in seconds and the rounding (N,) [s] that is evident in them."""
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """Stamps (N,) in the log's unit, which is `scale` seconds, and the time since the first."""
+
+    stamps: np.ndarray
+    scale: float
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """(N,) [s], from 0; subtracted first, so that a calendar's digits do not cost any."""
+        return (self.stamps - self.stamps[0]) * self.scale
+
+
+def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
+    """The stamps, finite and increasing."""
     place = column(time.name)
     scale = units.factor(table.time_unit(time.name) or time.unit, "s")
     with np.errstate(over="ignore"):
-        seconds = stamps * scale
-    bad = np.flatnonzero(~np.isfinite(seconds))
+        bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
         row = int(bad[0])
         found = f"found {table.found(time.name, row)}, wanted is a time"
         raise wrong(table.path, found, table.place(row), place)
-    with np.errstate(over="ignore"):
-        back = np.flatnonzero(np.diff(seconds) <= 0)
+    back = np.flatnonzero(np.diff(stamps) <= 0)
     if back.size:
         row = int(back[0]) + 1
-        what = "stands still" if seconds[row] == seconds[row - 1] else "runs backwards"
+        what = "stands still" if stamps[row] == stamps[row - 1] else "runs backwards"
         after, now = table.found(time.name, row - 1), table.found(time.name, row)
         problem = f"the time {what}, found {now} after {after}, wanted are increasing times"
         raise wrong(table.path, problem, table.place(row), place)
-    return seconds, rounding_of(stamps) * scale
+    return _Clock(stamps, scale)
 
 
 def _rows(
-    path: str, seconds: np.ndarray, window: tuple[float, float] | None
+    path: str, elapsed: np.ndarray, window: tuple[float, float] | None
 ) -> tuple[slice, tuple[str, ...]]:
     """The rows inside the window, and a note where the window reaches beyond the log."""
-    first, last, notes = 0, seconds.size, ()
+    first, last, notes = 0, elapsed.size, ()
     where = "the log"
-    if window is not None and seconds.size > 1:
-        elapsed = seconds - seconds[0]
-        step = float(np.median(np.diff(seconds)))
+    if window is not None and elapsed.size > 1:
+        step = float(np.median(np.diff(elapsed)))
         start, end = window
         where = f"the window from {start:g} s to {end:g} s"
         if end < 0 or start > elapsed[-1]:
@@ -157,6 +170,16 @@ def _to_si(
             raise wrong(table.path, found, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples
+
+
+def _check_step(table: Table, name: str, seconds: np.ndarray, start: int) -> None:
+    """Refuse steps that no clock resolves: the time's unit is wrong."""
+    usual = float(np.median(np.diff(seconds)))
+    if usual < SHORTEST_STEP:
+        problem = (
+            f"the usual step is {usual:.3g} s, wanted is at least 1 ns; look at the time's unit"
+        )
+        raise wrong(table.path, problem, table.place(start), column(name))
 
 
 def _uneven(table: Table, name: str, seconds: np.ndarray, start: int, uneven: Uneven) -> ValueError:
@@ -206,8 +229,8 @@ def _check_rate(table: Table, name: str, seconds: np.ndarray, start: int, rate: 
     if steps[row] > most * (1 + 1e-9):
         raise wrong(
             table.path,
-            f"found a gap of {steps[row]:.6g} s after {seconds[row]:.10g} s, wanted is none longer"
-            f" than {most:.3g} s; give a window without it",
+            f"found a gap of {steps[row]:.6g} s, {seconds[row]:.6g} s after the first sample,"
+            f" wanted is none longer than {most:.3g} s; give a window without it",
             table.place(start + row + 1),
             column(name),
         )

@@ -61,6 +61,7 @@ REGULAR = [0.02 * i for i in range(20)]
 
 BAD_TEXT = {
     "comments alone": ("# nothing\n\n", ["no header"]),
+    "blanks for delimiters": ("t stick phi\n0 1 2\n", ["line 1", "no comma"]),
     "header alone": ("t,stick,phi\n", ["line 1", "header alone"]),
     "header and blanks": ("# a\nt,stick,phi\n  \n\n", ["line 2", "header alone"]),
     "no header": (csv_text(rows()[1:], header="0.000,0,0.0"), ["line 1", "names of the columns"]),

@@ -25,7 +25,8 @@ PHI = np.sin(T)
 
 
 def lines(delimiter: str = ",", header: str = "t,stick,phi", decimal: str = ".") -> list[str]:
-    cells = [[repr(float(x)).replace(".", decimal) for x in row] for row in zip(T, STICK, PHI)]
+    rows = zip(T, STICK, PHI, strict=True)
+    cells = [[repr(float(x)).replace(".", decimal) for x in row] for row in rows]
     return [header.replace(",", delimiter), *(delimiter.join(row) for row in cells)]
 
 
@@ -50,12 +51,13 @@ DIALECTS = {
     "tab": "\n".join(lines("\t")),
     "tab, decimal comma": "\n".join(lines("\t", decimal=",")),
     "commas in the names": "\n".join(lines(";"))
-    .replace("phi\n", "phi;a, b, c\n")
-    .replace("\n5", ";0\n5")
+    .replace("\n", ";0\n")
+    .replace("phi;0\n", "phi;a, b, c\n")
     + ";0",
     "comments": "# a, b\n\n#c\n" + "\n".join(lines()),
     "blanks": "\n".join(lines(" , ")),
     "blank lines": "\n\n \n".join(lines()),
+    "blanks before quotes": "\n".join(lines(header='t, "stick", "phi"')).replace(",", ", "),
     "quotes": "\n".join(f'"{line.replace(",", '","')}"' for line in lines()),
     "quoted header": "\n".join(lines(header='"t","stick","phi"')),
     "plus signs": "\n".join(lines()).replace(",1.0,", ",+1.0,"),
@@ -185,8 +187,10 @@ def test_any_uniform_log_comes_back(tmp_path_factory, data, rate, start, ending)
 
 
 CELLS = st.sampled_from(
-    ["0", "1", ".5", "nan", "inf", "1e400", "-1e308", "", " ", '"', "x", ",", ";", "\t", "\n"]
-    + ["\r", "#", "\ufeff", "\x1c", "\u2028", "1,5", '"2"', "t,stick,phi\n", "\n0,1,2", "\n1,2,3"]
+    [
+        *("0", "1", ".5", "nan", "inf", "1e400", "-1e308", "", " ", '"', "x", ",", ";", "\t", "\n"),
+        *("\r", "#", "\ufeff", "\x1c", "\u2028", "1,5", '"2"', "t,stick,phi\n", "\n0,1,2"),
+    ]
 )
 TEXT = st.lists(CELLS, max_size=60).map("".join) | st.text(max_size=80)
 WITH_HEADER = TEXT.map(lambda body: "t,stick,phi\n" + body)
