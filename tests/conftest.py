@@ -12,11 +12,14 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Before the package's first import: the hook checks the shapes that its annotations state.
-# Left out are flights (beartype cannot check its Table, a Protocol that is not runtime_checkable)
-# and identification.problem (it takes a list of flights where its annotation says tuple).
+# Left out are modules that are called with other types than their annotations say, on purpose:
+# flights (beartype cannot check its Table, a Protocol that is not runtime_checkable), the equations
+# (any record with the names of a Helicopter passes for one, such as with_disturbance's) and
+# identification.problem (takes a list of flights for a tuple).
 _CHECKED = (
-    "vehicle naming dynamics simulation analysis identification.rls identification.coordinates "
-    "identification.baseline identification.metrics identification.residual"
+    "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation analysis "
+    "identification.rls identification.coordinates identification.baseline identification.metrics "
+    "identification.residual"
 )
 jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")
 

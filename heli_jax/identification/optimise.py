@@ -9,7 +9,13 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from heli_jax.identification.residual import Data, Layout, evaluate, residuals
+from heli_jax.identification.residual import (
+    Data,
+    Layout,
+    evaluate,
+    residuals,
+    residuals_and_jacobian,
+)
 
 
 class Optimum(NamedTuple):
@@ -21,6 +27,27 @@ class Optimum(NamedTuple):
     steps: Any
     converged: Any
     """the optimiser's own word, and everything finite"""
+
+
+_ROUNDING = 1e-12
+"""Part of the sum of squares below which a change is rounding."""
+
+
+class _Search(optx.ClassicalTrustRegion):
+    """optimistix's trust region, but a step whose gain would drown in rounding is accepted.
+
+    Otherwise such a step, which is the last, is rejected at random and the search lingers.
+    """
+
+    def step(
+        self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: Any
+    ) -> Any:
+        size, accept, result, new = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        cost = f_info.as_min()
+        gain = self.predict_reduction(y_eval - y, f_info)
+        change = f_eval_info.as_min() - cost
+        nothing = (gain > -_ROUNDING * cost) & (change < _ROUNDING * cost)
+        return size, accept | nothing, result, new
 
 
 class _LevenbergMarquardt(optx.AbstractGaussNewton):
@@ -39,8 +66,8 @@ class _LevenbergMarquardt(optx.AbstractGaussNewton):
     def __init__(self, rtol: Any, atol: Any):
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
-        self.search = optx.ClassicalTrustRegion(
-            high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.1
+        self.search = _Search(
+            high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
         )
         self.verbose = lambda **_: None
 
@@ -77,8 +104,19 @@ def optimise(
 ) -> Optimum:
     """The least-squares optimum from z0; compiled once per layout and shapes."""
 
-    def fn(xi: Array, _: Any) -> Array:
+    # The optimiser multiplies by J several times a step; by this rule it is made once, in the
+    # pass that gives the residuals, and multiplied as a matrix.
+    @jax.custom_jvp
+    def scaled(xi: Array) -> Array:
         return residuals(layout, data, sd, z0 + units.unit * xi) / units.level
+
+    @scaled.defjvp
+    def scaled_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        r, J = residuals_and_jacobian(layout, data, sd, z0 + units.unit * primals[0])
+        return r / units.level, (J * (units.unit / units.level)) @ tangents[0]
+
+    def fn(xi: Array, _: Any) -> Array:
+        return scaled(xi)
 
     solution = optx.least_squares(
         fn,

@@ -23,6 +23,9 @@ from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 
+_BLOCK = 32
+
+
 class FlightData(NamedTuple):
     """One flight as arrays: what a trace may see of it."""
 
@@ -71,6 +74,11 @@ class Layout(eqx.Module):
         """The unknowns that the verdict speaks of: parameters, gains, the shift."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
+
+    @property
+    def exact(self) -> bool:
+        """Whether runs are integrated by the exact recurrence."""
+        return self.solver == "exact" or (self.solver is None and self.model.linear)
 
     @property
     def size(self) -> int:
@@ -257,6 +265,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
                 solver=layout.solver,
                 substeps=layout.substeps,
                 delay=u.shift,
+                block=_BLOCK if layout.exact else 1,
                 adjoint=dfx.ForwardMode(),
             )
         )
@@ -295,6 +304,19 @@ def residuals(
 def _whitened(layout: Layout, data: Data, sd: Any, z: Array, raw: Any) -> Array:
     rows = [r / s[n] for by_name, s in zip(raw, sd, strict=True) for n, r in by_name.items()]
     return jnp.concatenate([*rows, prior_rows(layout, data, z), weak_rows(layout, z)])
+
+
+def residuals_and_jacobian(
+    layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
+) -> tuple[Float[Array, " n"], Float[Array, "n q"]]:
+    """Residuals and their derivative by z, in forward mode, in one pass."""
+
+    def both(z: Array) -> tuple[Array, Array]:
+        r = residuals(layout, data, sd, z)
+        return r, r
+
+    J, r = jax.jacfwd(both, has_aux=True)(z)
+    return r, J
 
 
 class Evaluation(NamedTuple):

@@ -4,12 +4,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
+from heli_jax.simulation.blocks import blocked, expanded
 from heli_jax.simulation.discretize import discretize, process_noise, square_root
 from heli_jax.simulation.solvers import (
     RK4,
@@ -74,6 +76,7 @@ def simulate(
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = 1_000_000,
     key: Any = None,
+    block: int = 1,
 ) -> Trajectory:
     """Simulate one machine; each input sample is held until the next (zero-order hold).
 
@@ -94,6 +97,8 @@ def simulate(
         max_steps: bound on adaptive steps; where it ends a run, `result` says so.
         key: a JAX random key: the model's own noise is drawn with it, by the exact discrete
             process noise (linear models with solver "exact"); without it there is none.
+        block: samples per step of solver "exact", a power of two; 32 is three times as fast as 1
+            for a single record, 1 is best for large batches.
 
     Returns:
         A Trajectory; a failed integration is in its `result` and `finite`, never an exception.
@@ -114,19 +119,28 @@ def simulate(
         method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
         if key is not None:
             held = _with_noise(model, held, method, dt, key)
+        cut = None
+        if block > 1:
+            _require_blocks(method, block)
+            cut = blocked(held, block)
+            held = cut.held
+        steps = n - 1 if cut is None else max(cut.count - 1, 1)
         sol = dfx.diffeqsolve(
             term,
             method,
             t0=0.0,
-            t1=float(n - 1),
+            t1=float(steps),
             dt0=1.0,
             y0=x0,
             args=held,
             saveat=dfx.SaveAt(t0=True, steps=True),
-            max_steps=n - 1,
+            max_steps=steps,
             adjoint=adjoint,
             throw=False,
         )
+        if cut is not None:
+            starts = jax.tree.map(lambda v: v[: cut.count], sol.ys)
+            sol = eqx.tree_at(lambda s: s.ys, sol, expanded(cut, starts, n))
     states: Any = sol.ys
     outputs = _outputs(model, params, states, inputs, dt, delay)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
@@ -227,6 +241,13 @@ def _per_sample(
     return PerSample(method, substeps), Held(params, inputs, parts, None), term
 
 
+def _require_blocks(method: Any, block: int) -> None:
+    if not isinstance(method, Exact):
+        raise ValueError("block is for solver='exact' only")
+    if block & (block - 1):
+        raise ValueError(f"block is {block}, wanted is a power of two")
+
+
 def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> Held:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
     if model.noise is None:
@@ -252,8 +273,7 @@ def _term(model: Model, scale: Any) -> dfx.ODETerm:
         if not isinstance(x, model.State):
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, Held):
-            inputs = now.inputs if isinstance(now.inputs, model.Inputs) else now.inputs[0]
-            now = Now(now.params, at(inputs, 0))
+            return x  # only the shapes are asked for; the inputs may not be the model's
         rates = model.vector_field(now.params, x, now.inputs)
         return jax.tree.map(lambda v: v * scale, rates)
 

@@ -1,0 +1,219 @@
+"""Speed against hand-written programs, side by side in one run: `make bench`.
+
+Everything runs on one core (the process is pinned where the system allows), each pair in turn;
+the figure is the median of the ratios. Ours counts whole calls: `fit` with its verdicts and
+metrics, simulations with the discretisation of every vehicle, where the C kernel is handed its
+coefficients.
+"""
+
+import ctypes
+import os
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+import scipy.signal
+
+from heli_jax import (
+    Flight,
+    Free,
+    Nuisance,
+    Prior,
+    Problem,
+    accumulate,
+    fit,
+    load_vehicle,
+    models,
+    rls,
+)
+from heli_jax.dynamics.roll import roll_transfer_function
+from heli_jax.naming import replace
+
+jax.config.update("jax_enable_x64", True)
+HERE = Path(__file__).parent
+VEHICLE = load_vehicle(HERE.parents[1] / "configs" / "vehicles" / "bench-30.yaml")
+N, DT, BATCH, BLOCK, SUBSTEPS = 6000, 0.02, 1024, 128, 4
+
+
+def closed_form(v: dict[str, float]) -> tuple[list[float], np.ndarray]:
+    """H(s) of eq. 23 on the stand in plain Python."""
+    q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
+    k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
+    k2 = q * v["R"] ** 4 / (2 * v["Ixx"] * v["L1"] * (v["L2"] + v["L3"]))
+    c1, c2, c3 = k1 / v["Omega"], v["Omega"] ** 2, k1 * k2 * v["L2"] * v["L4"] / v["Omega"]
+    num = [k2 * v["L3"], k1 * k2 * v["L3"] / v["Omega"]]
+    num.append(k2 * (v["L3"] * c2 + v["L2"] * v["L4"] * k1 / v["L5"]))
+    den = np.polymul([1.0, v["zeta"], v["kappa"]], [1.0, c1, c2])
+    den[3] += c3
+    return num, den
+
+
+def bench_record() -> Flight:
+    """6000 samples at 50 Hz with 2 mrad of white noise."""
+    rng = np.random.default_rng(0)
+    u = 3e-6 * np.repeat(rng.uniform(-1, 1, N // 25), 25)
+    num, den = roll_transfer_function(VEHICLE, stand=True)
+    b, a, _ = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+    y = scipy.signal.lfilter(np.ravel(b), a, u) + 2e-3 * rng.standard_normal(N)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
+
+
+def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], runs: int = 9) -> tuple[float, ...]:
+    """Median times of both [s] and the median ratio ours/theirs, taken in turn."""
+    ours(), theirs()
+    times = []
+    for _ in range(runs):
+        pair = []
+        for f in (ours, theirs):
+            begin = time.perf_counter()
+            jax.block_until_ready(f())
+            pair.append(time.perf_counter() - begin)
+        times.append(pair)
+    a = np.array(times)
+    return float(np.median(a[:, 0])), float(np.median(a[:, 1])), float(np.median(a[:, 0] / a[:, 1]))
+
+
+def fit_against_scipy(flight: Flight) -> tuple[float, ...]:
+    free = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
+    problem = Problem(models.roll_on_stand, VEHICLE, [flight], free, Nuisance(False, False))
+    base = {n: float(getattr(VEHICLE, n)) for n in VEHICLE.__dataclass_fields__}
+    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        v = base | dict(zip(("Ixx", "If", "a"), np.exp(z), strict=True))
+        b, a, _ = scipy.signal.cont2discrete(closed_form(v), DT)
+        r = (y - scipy.signal.lfilter(np.ravel(b), a, u)) / 2e-3
+        return np.append(r, (v["a"] - 5.5) / 0.5)
+
+    start = np.log([0.05, 5e-4, 5.0])
+    found = fit(problem)
+    theirs = scipy.optimize.least_squares(residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10)
+    ours = np.array([e.value for e in found.estimates.values()])
+    assert np.allclose(ours, np.exp(theirs.x), rtol=1e-3), (ours, np.exp(theirs.x))
+    return ratios(
+        lambda: fit(problem),
+        lambda: scipy.optimize.least_squares(residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10),
+    )
+
+
+def rls_against_numpy(flight: Flight) -> tuple[float, ...]:
+    u, y = flight.inputs["x_roll"] * 1e6, flight.outputs["roll"]
+    uj, yj = jnp.asarray(u), jnp.asarray(y)
+
+    def loop() -> np.ndarray:
+        theta, P = np.zeros(9), 1e6 * np.eye(9)
+        for k in range(4, N):
+            phi = np.concatenate([y[k - 4 : k][::-1], u[k - 4 : k + 1][::-1]])
+            g = P @ phi
+            alpha = 1.0 + phi @ g
+            theta = theta + g / alpha * (y[k] - phi @ theta)
+            P = P - np.outer(g, g) / alpha
+        return theta
+
+    assert np.allclose(rls(uj, yj).theta, loop(), rtol=1e-4)
+    return ratios(lambda: rls(uj, yj).theta, loop)
+
+
+def compiled_kernel() -> Any:
+    folder = tempfile.mkdtemp()
+    out = Path(folder) / "kernel.so"
+    flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, str(HERE / "kernel.c"), "-o", str(out), "-lm"], check=True)
+    return ctypes.CDLL(str(out))
+
+
+def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Array]:
+    """Mean-square misfit of each vehicle, in blocks, nothing else kept."""
+    u = models.roll_on_stand.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"]))
+    y = jnp.asarray(flight.outputs["roll"])
+
+    def one(i: jax.Array) -> jax.Array:
+        total, _ = accumulate(
+            models.roll_on_stand,
+            replace(VEHICLE, Ixx=i),
+            u,
+            lambda total, out, measured: total + (measured - out.roll) ** 2,
+            jnp.zeros(()),
+            data=y,
+            dt=jnp.asarray(DT),
+            solver=solver,
+            substeps=SUBSTEPS,
+            adjoint=diffrax.ForwardMode(),
+        )
+        return total / N
+
+    run = jax.jit(lambda Ixx: jax.lax.map(one, Ixx, batch_size=BLOCK))
+    return lambda: run(Ixx)
+
+
+def simulation_against_c(flight: Flight, solver: str) -> tuple[float, ...]:
+    kernel = compiled_kernel()
+    Ixx = np.linspace(0.5, 2.0, BATCH) * float(VEHICLE.Ixx)
+    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+    cost = np.zeros(BATCH)
+
+    def pointer(a: np.ndarray) -> Any:
+        return a.ctypes.data_as(ctypes.c_void_p)
+
+    size = ctypes.c_size_t
+    if solver == "exact":
+        from heli_jax.simulation.discretize import discretize
+
+        def scalars(i: jax.Array) -> jax.Array:
+            d = discretize(models.roll_on_stand, replace(VEHICLE, Ixx=i), jnp.asarray(DT))
+            return jnp.stack(jax.tree.leaves((d.Ad, d.Bd)))
+
+        coef = np.ascontiguousarray(np.asarray(jax.vmap(scalars)(jnp.asarray(Ixx))).T)
+
+        def theirs() -> np.ndarray:
+            kernel.exact(pointer(coef), pointer(u), pointer(y), pointer(cost), size(BATCH), size(N))
+            return cost
+    else:
+        v = {n: float(getattr(VEHICLE, n)) for n in VEHICLE.__dataclass_fields__}
+        q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
+        k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
+        k2 = q * v["R"] ** 4 / (2 * Ixx * v["L1"] * (v["L2"] + v["L3"]))
+        one = np.ones(BATCH)
+        rows = [k1 * one, one / v["L5"], one / v["Omega"], v["Omega"] ** 2 * one, k2 * v["L3"]]
+        rows += [k2 * v["L2"] * v["L4"], v["kappa"] * one, v["zeta"] * one]
+        par = np.ascontiguousarray(np.array(rows))
+
+        def theirs() -> np.ndarray:
+            kernel.rk4(
+                pointer(par), pointer(u), pointer(y), pointer(cost), size(BATCH), size(N),
+                ctypes.c_double(DT), ctypes.c_int(SUBSTEPS),
+            )  # fmt: skip
+            return cost
+
+    ours = batched(flight, jnp.asarray(Ixx), solver)
+    assert np.allclose(ours(), theirs(), rtol=1e-6)
+    return ratios(ours, theirs, runs=5)
+
+
+def main() -> None:
+    flight = bench_record()
+    rows = [
+        ("three-parameter fit / scipy least_squares", fit_against_scipy(flight), "<= 0.20"),
+        ("RLS / numpy loop", rls_against_numpy(flight), "<= 0.02"),
+        (f"exact, {BATCH} vehicles / C", simulation_against_c(flight, "exact"), "<= 2.5"),
+        (f"RK4 x{SUBSTEPS}, {BATCH} vehicles / C", simulation_against_c(flight, "rk4"), "<= 2.0"),
+    ]
+    print(f"{N} samples, one core, jax {jax.__version__}")
+    print(f"{'':45s} {'ours [ms]':>10s} {'other [ms]':>10s} {'ratio':>8s}  wanted")
+    for name, (a, b, ratio), wanted in rows:
+        print(f"{name:45s} {1e3 * a:10.2f} {1e3 * b:10.2f} {ratio:8.4f}  {wanted}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""Frequency responses of a fit, of its baseline and of the record itself, on one phase branch."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+from heli_jax import naming
+from heli_jax.analysis.linear import linearize, modes
+from heli_jax.dynamics.model import Model
+from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.fit import Fit
+
+type Response = Callable[[np.ndarray], np.ndarray]
+
+SEGMENTS = 8
+"""fewer half-overlapping segments than this make no average"""
+SHORTEST = 64
+"""samples of a segment at least: fewer resolve nothing"""
+_LONGEST = 4096
+
+
+class Empirical(NamedTuple):
+    """Output over input as the record shows it; arrays (k,)."""
+
+    omega: np.ndarray
+    """rad/s"""
+    H: np.ndarray
+    coherence: np.ndarray
+    segments: int
+
+
+def log_grid(low: float, high: float, n: int = 900) -> np.ndarray:
+    """Frequencies (n,) [rad/s], equally spaced in the logarithm."""
+    return np.geomspace(low, high, n)
+
+
+def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
+    """The estimated gain and delay of an input as a factor (k,); 1 where neither was estimated."""
+    gain, shift = fit.nuisance.get(f"gain {input}"), fit.nuisance.get("time_shift")
+    factor = np.full(omega.shape, 1.0 if gain is None else gain.value, complex)
+    return factor if shift is None else factor * np.exp(-1j * omega * shift.value)
+
+
+def responses(
+    model: Model, params: Any, output: str, input: str, dt: float
+) -> tuple[Response, Response]:
+    """H(i omega) and Hd(e^{i omega dt}) of the model linearised about zero, as functions.
+
+    The second holds the input over each sample: this, and not the first, is what a sampled record
+    can show. One linearisation serves both, and NumPy evaluates them: a figure is no reason to
+    compile.
+    """
+    A, B, C, D = (np.asarray(M) for M in linearize(model, params).matrices)
+    i = naming.names(model.Outputs).index(output)
+    j = naming.names(model.Inputs).index(input)
+    n = A.shape[0]
+    both = np.zeros((n + 1, n + 1))
+    both[:n, :n], both[:n, n] = A, B[:, j]
+    held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
+
+    def at(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        if not np.isfinite(A).all():
+            return np.full(points.shape, np.nan, complex)
+        x = np.linalg.solve(points[:, None, None] * np.eye(n) - A, b[None, :, None])
+        return (C[i] @ x)[:, 0] + D[i, j]
+
+    return (
+        lambda omega: at(1j * omega, A, B[:, j]),
+        lambda omega: at(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
+    )
+
+
+def memory(model: Model, params: Any) -> float:
+    """Four times the slowest time constant of the linearised model [s], integrators left out."""
+    size = np.abs(modes(model, params))
+    size = size[np.isfinite(size) & (size > 1e-6 * np.max(size, initial=0.0))]
+    return 4.0 / float(size.min()) if size.size else 0.0
+
+
+def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
+    """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
+    z = np.exp(1j * omega * baseline.dt)
+    with np.errstate(all="ignore"):
+        return np.polyval(baseline.num, z) / np.polyval(baseline.den, z)
+
+
+def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
+    """Welch's cross-spectrum over the input's spectrum, or why the record does not allow it.
+
+    `memory` [s] is how long the machine remembers its input: a segment must not be shorter.
+    """
+    if not np.std(u) > 0:
+        return "the input does not move"
+    needed = max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
+    length = max(needed, min(2 ** int(np.log2(max(u.size / SEGMENTS, 1.0))), _LONGEST))
+    segments = 1 + (u.size - length) // (length // 2)
+    if segments < SEGMENTS:
+        wanted = needed * dt * (SEGMENTS + 1) / 2
+        return f"wanted are {SEGMENTS} segments of {needed * dt:.3g} s, a record of {wanted:.3g} s"
+    how: dict[str, Any] = {"fs": 1.0 / dt, "nperseg": length, "detrend": "linear"}
+    f, Suu = scipy.signal.welch(u, **how)
+    _, Syy = scipy.signal.welch(y, **how)
+    _, Suy = scipy.signal.csd(u, y, **how)
+    useful = (f > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
+    f, Suu, Syy, Suy = f[useful], Suu[useful], Syy[useful], Suy[useful]
+    return Empirical(2 * np.pi * f, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), segments)
+
+
+def phase(H: np.ndarray) -> np.ndarray:
+    """Unwrapped phase (k,) [deg], begun between -270 and 90."""
+    unwrapped = np.degrees(np.unwrap(np.angle(H)))
+    first = unwrapped[0] if unwrapped.size else 0.0
+    return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)

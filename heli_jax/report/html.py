@@ -1,0 +1,154 @@
+"""The report of a fit: one HTML file that holds everything, and its figures as files."""
+
+import base64
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jinja2
+from matplotlib.figure import Figure
+
+from heli_jax import naming
+from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.fit import Fit
+from heli_jax.identification.problem import Problem
+from heli_jax.report import figures, style, tables
+from heli_jax.report.files import versions
+from heli_jax.vehicle import Constant
+
+MOST_FLIGHTS = 6
+"""flights that get figures of their own; signals.csv has them all"""
+
+_HERE = Path(__file__).parent
+
+
+class Picture(NamedTuple):
+    """A figure as the page holds it."""
+
+    name: str
+    title: str
+    data: str
+    """SVG in base64"""
+
+
+def write_report(
+    directory: Path,
+    fit: Fit,
+    problem: Problem,
+    baseline: Baseline | None,
+    title: str,
+    vehicle_constants: Mapping[str, Constant],
+) -> list[str]:
+    """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
+
+    The page refers to nothing outside itself. Whatever comes from logs and configurations is
+    escaped.
+    """
+    folder = directory / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = {}
+    for name, draw in _drawings(fit, problem, baseline).items():
+        drawn = style.save(draw, folder / name)
+        if drawn is not None:
+            data = base64.b64encode(drawn[1]).decode("ascii")
+            pictures[name] = Picture(name, drawn[0], data)
+    page = render(fit, problem, baseline, title, vehicle_constants, list(pictures.values()))
+    (directory / "report.html").write_text(page, encoding="utf-8")
+    return list(pictures)
+
+
+type Draw = Callable[[], Figure | None]
+
+
+def _drawings(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str, Draw]:
+    """Every figure of the report by its file name, not yet drawn."""
+    model, drawings = problem.model, {}
+    shown = fit.signals[:MOST_FLIGHTS]
+    for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
+        for output in s.measured:
+            drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
+            if not s.hold_out:
+                drawings[f"residual{part}_{output}"] = _drawing(
+                    figures.residual_correlation, s, output
+                )
+    drawings["bode"] = _bode(fit, problem, baseline)
+    if len(fit.verdict.names) > 1:
+        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
+    drawings["starts"] = _drawing(figures.waterfall, fit.starts)
+    if baseline is not None:
+        drawings["rls"] = _drawing(figures.rls_history, baseline)
+    return drawings
+
+
+def _parts(flights: list[str]) -> list[str]:
+    """What tells the flights' file names apart; nothing where there is one flight."""
+    if len(flights) == 1:
+        return [""]
+    return [
+        f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
+        for i, f in enumerate(flights)
+    ]
+
+
+def _drawing(function: Callable[..., figures.Panels], *args: Any) -> Draw:
+    def draw() -> Figure | None:
+        axes = function(*args)
+        return axes[0].figure if axes else None  # type: ignore[return-value]
+
+    return draw
+
+
+def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
+    """The frequency response of the flight that the baseline saw, with what is known of it."""
+    i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
+    known = problem.training[i].known if i < len(problem.training) else {}
+    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
+    return _drawing(figures.bode, problem.model, params, fit, baseline, fit.signals[i])
+
+
+def render(
+    fit: Fit,
+    problem: Problem,
+    baseline: Baseline | None,
+    title: str,
+    vehicle_constants: Mapping[str, Constant],
+    pictures: list[Picture],
+) -> str:
+    """The page as text."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.j2").render(
+        title=title,
+        fit=fit,
+        problem=problem,
+        baseline=baseline,
+        headline=tables.headline(fit),
+        warnings=tables.warnings(fit),
+        remark=tables.model_remark(problem),
+        parameters=tables.parameters(fit),
+        nuisances=tables.nuisances(fit),
+        combinations=tables.combinations(fit),
+        agreement=tables.agreement(fit, baseline),
+        residuals=tables.residuals(fit, problem),
+        verdict=tables.verdict(fit),
+        starts=tables.starts(fit),
+        ratios=tables.baseline_ratios(fit, baseline) if baseline else None,
+        facts=tables.baseline_facts(baseline) if baseline else None,
+        origins=tables.origins(fit, problem),
+        constants=tables.constants(problem, vehicle_constants),
+        versions=tables.pairs(versions()),
+        timing=tables.pairs(fit.timing, " s"),
+        unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
+        pictures={
+            group: [p for p in pictures if p.name.startswith(group)]
+            for group in ("response", "residual", "bode", "correlation", "starts", "rls")
+        },
+        NOT_DETERMINED=tables.NOT_DETERMINED,
+    )

@@ -1,0 +1,354 @@
+"""What the report's page says, as words and as rows of text; the page itself is the template."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.fit import Estimate, Fit
+from heli_jax.identification.identifiability import ILL_CONDITIONED, Verdict
+from heli_jax.identification.metrics import Metrics
+from heli_jax.identification.problem import Problem
+from heli_jax.report.files import whiteness_note
+from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
+from heli_jax.report.style import pretty
+from heli_jax.vehicle import Constant, Helicopter
+
+NOT_DETERMINED = "not determined"
+
+
+class Table(NamedTuple):
+    """Heads and rows of text; the first column names the row."""
+
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+class Headline(NamedTuple):
+    """The verdict in one line."""
+
+    level: str
+    """good, warning or bad"""
+    word: str
+    text: str
+
+
+def _listed(names: list[str] | tuple[str, ...]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def headline(fit: Fit) -> Headline:
+    """The status in words: what the data determine, and whether that may be believed."""
+    v, names = fit.verdict, tuple(fit.estimates)
+    if fit.status == "not-converged":
+        text = "the optimiser stopped before an optimum; the numbers below are where it stopped"
+        return Headline("bad", "not converged", text)
+    if fit.status == "not-identifiable":
+        lost = [n for n in v.names if n in v.undetermined or n in v.without_effect]
+        return Headline(
+            "bad", "not identifiable", f"the data do not determine {_listed(lost or list(v.names))}"
+        )
+    resting = v.rank_without_priors < v.rank
+    who = "the data and the priors together" if resting else "the data"
+    text = f"{who} determine {_listed(names)}"
+    doubts = [
+        ("the intervals are too narrow", not fit.white),
+        ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
+        ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
+    ]
+    said = [words for words, is_so in doubts if is_so]
+    if said:
+        text += f", but {_listed(said)}"
+    return Headline("warning" if said or resting else "good", "converged", text)
+
+
+def warnings(fit: Fit) -> list[str]:
+    """What a reader has to know before the numbers."""
+    note = whiteness_note(fit)
+    return ([note] if note else []) + list(fit.notes)
+
+
+def model_remark(problem: Problem) -> str:
+    """Why an inertia found here is a number of the paper's model; empty for other models."""
+    if problem.model.Params is not Helicopter:
+        return ""
+    factor = float(np.asarray(problem.vehicle.cyclic_moment))
+    return (
+        "Ixx and If are numbers of the paper's model, not of the machine: eqs 14-15 have the "
+        f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
+        "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
+        "Compare an estimate with a weighed or swung inertia only with that in mind."
+    )
+
+
+def parameters(fit: Fit) -> Table:
+    """The free parameters; where the data do not determine one, that is said in place of it."""
+    interval = "95 % interval" if fit.white else "95 % interval (too narrow)"
+    head = ("parameter", "estimate", "sd", "sd / value", interval, "unit", "start", "prior share")
+    return Table((*head, "at bound"), [_estimate(n, e) for n, e in fit.estimates.items()])
+
+
+def _estimate(name: str, e: Estimate) -> tuple[str, ...]:
+    start, share = number(e.start, 5), percent(e.prior_share, 0)
+    bound = "yes" if e.at_bound else "no"
+    if e.sd is None or e.lower95 is None or e.upper95 is None:
+        return (name, NOT_DETERMINED, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    interval = f"{low} to {high}"
+    share_sd = relative(e.sd, e.value)
+    return (name, value, sd, share_sd, interval, pretty(e.unit), start, share, bound)
+
+
+class Nuisances(NamedTuple):
+    """Gains, time shifts and biases; initial states apart, for there may be many."""
+
+    shown: Table
+    folded: Table
+
+
+def nuisances(fit: Fit) -> Nuisances:
+    """What was estimated beside the parameters."""
+    head = ("unknown", "estimate", "sd", "95 % interval", "unit")
+    rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
+    folded = [row for n, row in rows.items() if "/initial " in n]
+    return Nuisances(
+        Table(head, [row for n, row in rows.items() if "/initial " not in n]), Table(head, folded)
+    )
+
+
+def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
+    if e.sd is None or e.lower95 is None or e.upper95 is None:
+        return (name, NOT_DETERMINED, NOTHING, NOTHING, pretty(e.unit))
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    return (name, value, sd, f"{low} to {high}", pretty(e.unit))
+
+
+def combinations(fit: Fit) -> Table:
+    """What the data do determine where they do not determine every parameter."""
+    rows = []
+    for c in fit.verdict.combinations:
+        value, low, high, sd = measured(c.sd, c.value, c.lower95, c.upper95)
+        rows.append((c.name, value, sd, relative(c.sd, c.value), f"{low} to {high}"))
+    return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
+
+
+def agreement(fit: Fit, baseline: Baseline | None) -> Table:
+    """The same metrics for fit, held-out flights and RLS, output by output."""
+    head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
+    rows = []
+    for output in dict.fromkeys([*fit.metrics, *fit.validation]):
+        if output in fit.metrics:
+            rows.append(_agreement(output, "fit", fit.metrics[output]))
+        if output in fit.validation:
+            rows.append(_agreement(output, "held out, predicted", fit.validation[output]))
+        if baseline is not None and baseline.output == output:
+            rows.append(_agreement(output, f"RLS ({baseline.flight})", baseline.metrics))
+    return Table(head, rows)
+
+
+def _agreement(output: str, of: str, m: Metrics) -> tuple[str, ...]:
+    fit_percent = percent(m.nrmse_fit_percent / 100)
+    return (output, of, percent(m.vaf, 3), fit_percent, number(m.rmse), number(m.tic, 3))
+
+
+def residuals(fit: Fit, problem: Problem) -> Table:
+    """Noise and whiteness of every flight and output."""
+    stated = {
+        f"{s.flight}/{name}": sd
+        for s, f in zip(fit.signals, problem.training, strict=False)
+        for name, sd in f.sd.items()
+    }
+    rows = []
+    for name, w in fit.whiteness.items():
+        output = name.rsplit("/", 1)[-1]
+        unit = pretty(naming.unit(problem.model.Outputs, output))
+        rows.append(
+            (
+                name,
+                number(fit.noise.get(name), 3),
+                number(stated.get(name), 3),
+                unit,
+                "yes" if w.white else "no",
+                number(w.p_value, 2),
+                percent(w.outside, 1),
+                f"{w.lag1:+.3f}".replace("-", "−"),
+            )
+        )
+    head = ("flight/output", "residual sd", "stated sd", "unit", "white", "p", "lags outside")
+    return Table((*head, "at one sample"), rows)
+
+
+def verdict(fit: Fit) -> Table:
+    """The verdict's numbers at the start values and at the estimates."""
+    before, after = fit.verdict_before, fit.verdict
+    n = len(after.names)
+
+    def singular(v: Verdict) -> str:
+        return ", ".join(number(float(s), 3) for s in v.singular_values)
+
+    def pairs(v: Verdict) -> str:
+        said = [f"{p.first}, {p.second}: {p.correlation:+.5f}" for p in v.pairs]
+        return "; ".join(said).replace("-", "−") or "none"
+
+    def null(v: Verdict) -> str:
+        said = [
+            ", ".join(f"{n} {x:+.2f}" for n, x in d.items() if abs(x) > 0.005)
+            for d in v.null_directions
+        ]
+        return "; ".join(said).replace("-", "−") or "none"
+
+    rows = [
+        ("rank", f"{before.rank} of {n}", f"{after.rank} of {n}"),
+        (
+            "rank without priors",
+            f"{before.rank_without_priors} of {n}",
+            f"{after.rank_without_priors} of {n}",
+        ),
+        ("condition number", number(before.condition, 3), number(after.condition, 3)),
+        ("singular values", singular(before), singular(after)),
+        ("strong pairs (correlation beyond 0.99)", pairs(before), pairs(after)),
+        ("undetermined directions (log coordinates)", null(before), null(after)),
+    ]
+    return Table(("", "at the start values", "at the estimates"), rows)
+
+
+def starts(fit: Fit) -> Table:
+    """Where every start led."""
+    names = list(fit.starts[0].start) if fit.starts else []
+    rows = [
+        (
+            str(i + 1),
+            *(number(s.start[n], 4) for n in names),
+            *(number(s.end[n], 6) for n in names),
+            number(s.cost, 7),
+            str(s.steps),
+            f"optimum {s.optimum}" if s.converged else "failed",
+        )
+        for i, s in enumerate(fit.starts)
+    ]
+    moved = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
+    return Table(("", *moved, "cost", "steps", "led to"), rows)
+
+
+def baseline_ratios(fit: Fit, baseline: Baseline) -> Table:
+    """a/Ixx and the like: as the RLS has them and as the fit has them."""
+    rows = []
+    for name, value in baseline.combinations.items():
+        ours = _ratio(fit, name)
+        if ours is None:
+            rows.append((name, number(value), NOT_DETERMINED, NOTHING))
+            continue
+        mean, sd = ours
+        off = percent(value / mean - 1.0, 1) if mean else NOTHING
+        rows.append((name, number(value), with_sd(mean, sd) if sd > 0 else number(mean, 6), off))
+    return Table(("ratio", "RLS", "fit", "RLS against fit"), rows)
+
+
+def _ratio(fit: Fit, name: str) -> tuple[float, float] | None:
+    """Value and sd of `x/y` by the fit; None where it is not determined or not of the model."""
+    for c in fit.verdict.combinations:
+        if c.name == name:
+            return c.value, c.sd
+    over, _, under = name.partition("/")
+    known = naming.names(type(fit.params))
+    if over not in known or under not in known:
+        return None
+    value = float(getattr(fit.params, over)) / float(getattr(fit.params, under))
+    v = fit.verdict
+    weights = np.array([(n == over) - float(n == under) for n in v.names])
+    lost = {*v.undetermined, *v.without_effect}
+    if any(w and n in lost for w, n in zip(weights, v.names, strict=True)):
+        return None
+    sds = np.array([_relative_sd(fit, n) for n in v.names]) * weights
+    return value, abs(value) * math.sqrt(max(0.0, float(sds @ v.correlation @ sds)))
+
+
+def _relative_sd(fit: Fit, name: str) -> float:
+    e = fit.estimates.get(name)
+    return e.sd / abs(e.value) if e is not None and e.sd is not None and e.value else 0.0
+
+
+def baseline_facts(b: Baseline) -> Table:
+    """What the recursive least squares found, in full."""
+    poles = [_complex(p) for p in sorted(b.poles, key=lambda p: (-abs(p), p.imag))]
+    rows = [
+        ("from, to", f"{b.input} to {b.output}, {b.flight}"),
+        ("order, forgetting", f"{b.order}, {b.forgetting:g}"),
+        ("coefficients −a", _polynomial(b.theta[: b.order])),
+        ("coefficients b", _polynomial(b.theta[b.order :])),
+        ("poles of Hd(z)", ";  ".join(poles)),
+    ]
+    if b.continuous_num is not None and b.continuous_den is not None:
+        kind = "exact inverse of the hold" if b.exact else "not exact"
+        rows += [
+            (f"H(s), numerator ({kind})", _polynomial(b.continuous_num)),
+            (f"H(s), denominator ({kind})", _polynomial(b.continuous_den)),
+        ]
+    else:
+        rows.append(("H(s)", "none"))
+    return Table(("", "highest power first"), rows)
+
+
+def _polynomial(c: np.ndarray) -> str:
+    return ",  ".join(number(float(x), 6) for x in c)
+
+
+def _complex(p: complex) -> str:
+    size = f"size {abs(p):.4f}"
+    if abs(p.imag) < 1e-12:
+        return f"{number(p.real, 5)} ({size})"
+    sign = "+" if p.imag > 0 else "−"
+    return f"{number(p.real, 5)} {sign} {number(abs(p.imag), 5)}i ({size})"
+
+
+class Origin(NamedTuple):
+    """Where one flight came from."""
+
+    flight: str
+    facts: Table
+    notes: tuple[str, ...]
+
+
+def origins(fit: Fit, problem: Problem) -> list[Origin]:
+    """The flights, in order: the fitted ones first."""
+    flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
+    found = []
+    for signals, flight in zip(fit.signals, flights, strict=True):
+        rows = [
+            ("used for", "validation alone" if flight.hold_out else "the fit"),
+            (
+                "samples",
+                f"{flight.n_samples} at {1 / flight.dt:g} Hz, {flight.duration:.6g} s",
+            ),
+        ]
+        if flight.known:
+            known = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
+            rows.append(("differs in", known))
+        source = flight.source
+        rows.append(("file", source.path if source else "given in memory, no file"))
+        if source:
+            rows.append(("sha256", source.sha256))
+        found.append(Origin(signals.flight, Table(("", ""), rows), source.notes if source else ()))
+    return found
+
+
+def constants(problem: Problem, given: Mapping[str, Constant]) -> Table:
+    """The vehicle as it was given: value in SI, unit, meaning, source."""
+    rows = []
+    for name, c in given.items():
+        unit = naming.unit(problem.model.Params, name) or c.unit
+        role = "estimated, this is the file's value" if name in problem.free else "fixed"
+        meaning = naming.meaning(problem.model.Params, name)
+        rows.append((name, number(c.value, 8), pretty(unit), role, meaning, c.source))
+    return Table(("constant", "value", "unit", "in this fit", "meaning", "source"), rows)
+
+
+def pairs(content: Mapping[str, Any], unit: str = "") -> Table:
+    """Names and values."""
+    return Table(
+        ("", ""),
+        [(n, f"{v:.2f}{unit}" if isinstance(v, float) else str(v)) for n, v in content.items()],
+    )

@@ -1,0 +1,113 @@
+"""The disturbance against the theory of first- and second-order noise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from heli_jax import models, naming, simulate
+from heli_jax.dynamics.disturbance import with_disturbance
+from tests.dynamics.paper import BENCH, matrices
+
+DT, N, SIGMA, TAU = 0.02, 100_000, 1.04, 0.1
+
+
+def disturbed(bench30, poles, **changes):
+    model = with_disturbance(models.roll_on_stand, "roll", poles)
+    known = {**naming.asdict(bench30), "sigma_w": jnp.asarray(SIGMA), "tau_w": jnp.asarray(TAU)}
+    return model, model.Params(**{**known, **changes})
+
+
+@pytest.fixture(scope="module", params=[1, 2], ids=["one pole", "two poles"])
+def run(request, bench30):
+    model, p = disturbed(bench30, request.param)
+    still = model.Inputs(np.zeros(N))
+    return request.param, model, simulate(model, p, still, dt=DT, key=jax.random.key(4))
+
+
+def stationary(poles):
+    """Covariance of (phi, dphi, beta, dbeta, w1 ...) from the Lyapunov equation."""
+    n = 4 + poles
+    A, G = np.zeros((n, n)), np.zeros((n, n))
+    A[:4, :4] = matrices(BENCH, True)[0]
+    A[1, n - 1] = 1.0
+    for k in range(poles):
+        A[4 + k, 4 + k] = -1.0 / TAU
+        if k:
+            A[4 + k, 3 + k] = np.sqrt(2.0) / TAU
+    G[4, 4] = 2.0 * SIGMA**2 / TAU
+    return scipy.linalg.solve_continuous_lyapunov(A, -G)
+
+
+def test_standard_deviation_is_sigma(run):
+    poles, _, found = run
+    w = np.asarray(getattr(found.states, f"w{poles}_roll"))[500:]
+    # sd of a variance estimate from N dt / (2 tau) independent samples: about 1 %
+    assert np.var(w) == pytest.approx(SIGMA**2, rel=0.05)
+    assert abs(np.mean(w)) < 5.0 * SIGMA * np.sqrt(2.0 * poles * TAU / (N * DT))
+    assert stationary(poles)[-1, -1] == pytest.approx(SIGMA**2)
+
+
+def test_autocorrelation_is_that_of_its_lags(run):
+    poles, _, found = run
+    w = np.asarray(getattr(found.states, f"w{poles}_roll"))[500:]
+    for lag in (1, 3, 5, 10, 20):
+        t = lag * DT / TAU
+        theory = np.exp(-t) * (1.0 if poles == 1 else 1.0 + t)
+        assert np.mean(w[:-lag] * w[lag:]) / np.mean(w**2) == pytest.approx(theory, abs=0.04)
+
+
+def test_response_has_the_variance_that_lyapunov_gives(run):
+    poles, _, found = run
+    covariance = stationary(poles)
+    # Roll is slow (0.2 s) and lightly sampled: wider.
+    assert np.var(found.states.phi[500:]) == pytest.approx(covariance[0, 0], rel=0.15)
+    assert np.var(found.states.dphi[500:]) == pytest.approx(covariance[1, 1], rel=0.1)
+
+
+def test_same_key_same_noise_other_key_other_noise(bench30):
+    model, p = disturbed(bench30, 1)
+    still = model.Inputs(np.zeros(20))
+    go = jax.jit(lambda key: simulate(model, p, still, dt=DT, key=key).outputs.roll)
+    one, two, other = (go(jax.random.key(k)) for k in (0, 0, 1))
+    np.testing.assert_array_equal(one, two)
+    assert not np.allclose(one, other)
+    quiet = simulate(model, p, still, dt=DT)
+    np.testing.assert_array_equal(quiet.outputs.roll, 0.0)
+
+
+def test_names_and_defaults(bench30):
+    model = with_disturbance(models.roll_on_stand, "roll", 2)
+    assert naming.names(model.State) == (*naming.names(models.roll.State), "w1_roll", "w2_roll")
+    p = model.Params(**naming.asdict(bench30))
+    assert (p.sigma_w, p.tau_w) == (0.0, 1.0)
+    assert naming.unit(model.Params, "sigma_w") == "rad/s^2"
+    assert naming.unit(model.Params, "Ixx") == "kg m^2"
+    assert model.linear
+    assert model is with_disturbance(models.roll_on_stand, "roll", 2)
+
+
+def test_pitch_has_its_own_axis(bench30):
+    model = with_disturbance(models.pitch, "pitch")
+    assert naming.names(model.State)[-1] == "w1_pitch"
+    p = model.Params(**{**naming.asdict(bench30), "Iyy": jnp.asarray(0.03)})
+    x = model.State(*map(jnp.asarray, (0.0, 0.0, 0.0, 0.0, 2.0)))
+    found = model.vector_field(p, x, model.Inputs(jnp.asarray(0.0)))
+    assert float(found.dtheta) == 2.0
+    assert float(found.w1_pitch) == -2.0
+
+
+@pytest.mark.parametrize(
+    ("axis", "poles", "said"),
+    [
+        ("yaw", 1, r"no axis 'yaw' to disturb; it has \['roll'\]"),
+        ("heave", 1, "no axis 'heave'"),
+        ("pitch", 1, "no axis 'pitch'"),
+        ("roll", 0, "poles is 0, wanted is 1 or 2"),
+        ("roll", 3, "poles is 3, wanted is 1 or 2"),
+    ],
+)
+def test_what_cannot_be_disturbed(axis, poles, said):
+    with pytest.raises(ValueError, match=said):
+        with_disturbance(models.roll, axis, poles)

@@ -1,0 +1,161 @@
+"""Anyone's own model, its linearisation, and how models are named."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+from heli_jax import Model, linearize, models, simulate
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import linear_misfit
+from heli_jax.errors import InputError
+
+
+class Params(NamedTuple):
+    Lp: float
+    Lda: float
+    drag: float = 0.0
+    start: float = 0.0
+
+
+class State(NamedTuple):
+    phi: float
+    p: float
+
+
+class Inputs(NamedTuple):
+    aileron: float
+
+
+class Outputs(NamedTuple):
+    roll_rate: float
+
+
+def field(params, s, u):
+    drag = params.drag * jnp.abs(s.p) * s.p
+    return State(phi=s.p, p=params.Lp * s.p - drag + params.Lda * u.aileron)
+
+
+def output(params, s, u):
+    return Outputs(roll_rate=s.p + 0.5 * u.aileron)
+
+
+own = Model(
+    "own", field, output, Params, State, Inputs, Outputs,
+    start=lambda p: State(phi=0.0 * p.start, p=p.start),
+)  # fmt: skip
+own_linear = Model("own", field, output, Params, State, Inputs, Outputs, linear=True)
+
+U, DT = np.random.default_rng(0).uniform(-1.0, 1.0, 40), 0.05
+
+
+def by_scipy(params, start):
+    states = [np.array([0.0, start])]
+    for u in U[:-1]:
+
+        def rates(t, x, u=u):
+            return [x[1], params.Lp * x[1] - params.drag * abs(x[1]) * x[1] + params.Lda * u]
+
+        one = scipy.integrate.solve_ivp(rates, (0, DT), states[-1], rtol=1e-11, atol=1e-13)
+        states.append(one.y[:, -1])
+    return np.array(states)
+
+
+def test_own_nonlinear_model_against_scipy():
+    params = Params(Lp=-3.0, Lda=20.0, drag=0.4, start=1.0)
+    found = simulate(own, params, Inputs(U), dt=DT, substeps=16)
+    wanted = by_scipy(params, 1.0)
+    np.testing.assert_allclose(found.states.phi, wanted[:, 0], atol=1e-6)
+    np.testing.assert_allclose(found.states.p, wanted[:, 1], atol=1e-6)
+    np.testing.assert_allclose(found.outputs.roll_rate, wanted[:, 1] + 0.5 * U, atol=1e-6)
+    assert bool(found.finite)
+
+
+def test_own_linear_model_is_exact():
+    params = Params(Lp=-3.0, Lda=20.0)
+    found = simulate(own_linear, params, Inputs(U), dt=DT)
+    decay, p = np.exp(-3.0 * DT), [0.0]
+    for u in U[:-1]:
+        p.append(decay * p[-1] + 20.0 * u * (1.0 - decay) / 3.0)
+    np.testing.assert_allclose(found.states.p, p, rtol=1e-12, atol=1e-13)
+
+
+def test_jacobians_at_a_point_against_finite_differences():
+    params, x, u, h = Params(Lp=-3.0, Lda=20.0, drag=0.4), np.array([0.2, 1.5]), 0.3, 1e-6
+
+    def f(x, u):
+        return np.array(
+            [x[1], params.Lp * x[1] - params.drag * abs(x[1]) * x[1] + params.Lda * u]
+        )
+
+    A, B, C, D = jacobians(own, params, State(*x), Inputs(u))
+    for k, e in enumerate(np.eye(2) * h):
+        np.testing.assert_allclose(A[:, k], (f(x + e, u) - f(x - e, u)) / (2 * h), atol=1e-7)
+    np.testing.assert_allclose(B[:, 0], (f(x, u + h) - f(x, u - h)) / (2 * h), atol=1e-7)
+    np.testing.assert_array_equal(C, [[0.0, 1.0]])
+    np.testing.assert_array_equal(D, [[0.5]])
+
+
+def test_linearize_names_rows_and_columns(bench30):
+    found = linearize(models.roll, bench30)
+    assert found.states == ("phi", "dphi", "beta_roll", "dbeta_roll")
+    assert found.inputs == ("x_roll",)
+    assert found.outputs == ("roll", "roll_rate")
+
+
+def test_linear_misfit(bench30):
+    assert linear_misfit(models.roll_on_stand, bench30) < 1e-12
+    assert linear_misfit(own, Params(Lp=-3.0, Lda=20.0)) < 1e-12
+    assert linear_misfit(own, Params(Lp=-3.0, Lda=20.0, drag=1.0)) > 1e-3
+    shifted = Model(
+        "shifted", lambda p, s, u: State(s.p, 1.0 + s.p), output, Params, State, Inputs, Outputs
+    )
+    assert linear_misfit(shifted, Params(Lp=-3.0, Lda=20.0)) > 1e-3
+
+
+def test_shipped_models_by_name():
+    for name, model in {
+        "roll": models.roll,
+        "pitch": models.pitch,
+        "roll-on-stand": models.roll_on_stand,
+        "pitch-on-stand": models.pitch_on_stand,
+    }.items():
+        assert models.by_name(name) is model
+
+
+def test_own_model_by_import_path(tmp_path):
+    assert models.by_name("tests.dynamics.test_model:own") is own
+    (tmp_path / "beside_the_configuration.py").write_text(
+        "from tests.dynamics.test_model import own as mine\n"
+    )
+    found = models.by_name("beside_the_configuration:mine", folder=tmp_path)
+    assert found.name == "own"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("rol", "unknown model 'rol'; did you mean 'roll'"),
+        ("roll_on_stand", "did you mean 'roll-on-stand'"),
+        ("", "unknown model ''"),
+        ("no_such_module:model", "cannot import 'no_such_module'"),
+        ("tests.dynamics.test_model:nothing", "is nothing, wanted is a heli_jax.Model"),
+        ("tests.dynamics.test_model:U", "is a ndarray, wanted is a heli_jax.Model"),
+        ("os:system('ls')", "unknown model"),
+    ],
+)
+def test_what_is_no_model(name, said):
+    with pytest.raises(InputError, match=f"^f.yaml: model: .*{said}"):
+        models.by_name(name, "f.yaml: model")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("broken_syntax", "def broken(:\n"), ("broken_import", "import heli_jax.nothing_here\n")],
+)
+def test_a_module_that_cannot_be_imported_is_an_input_error(tmp_path, name, text):
+    (tmp_path / f"{name}.py").write_text(text)
+    with pytest.raises(InputError, match=f"f.yaml.*{name}"):
+        models.by_name(f"{name}:model", "f.yaml", folder=tmp_path)

@@ -1,0 +1,413 @@
+"""simulate against scipy.signal, scipy.integrate and finite differences."""
+
+import functools
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+import scipy.signal
+
+from heli_jax import Flight, Helicopter, Model, accumulate, load_vehicle, models, naming, simulate
+from tests.dynamics.paper import BENCH, matrices, rates, scattered
+
+DT, N = 0.02, 60
+STAND = models.roll_on_stand
+X0 = np.array([0.05, -0.2, 0.01, 1.0])
+
+
+def stick(n=N, seed=0, hold=4):
+    levels = np.random.default_rng(seed).uniform(-1.0, 1.0, n // hold + 1)
+    return 2e-6 * np.repeat(levels, hold)[:n]
+
+
+U = stick()
+
+
+def recurrence(v, u, x0, dt=DT):
+    """States (N, 4) by SciPy's zero-order hold."""
+    A, B = matrices(v, True)
+    Ad, Bd, *_ = scipy.signal.cont2discrete((A, B, np.eye(4), np.zeros((4, 1))), dt)
+    x = [np.asarray(x0, float)]
+    for one in u[:-1]:
+        x.append(Ad @ x[-1] + Bd[:, 0] * one)
+    return np.array(x)
+
+
+def switching(v, u, x0, delay, dt=DT):
+    """States (N, 4) by solve_ivp, stopped at every sample and at every change of a late input."""
+    A, B = matrices(v, True)
+    n = len(u)
+    ends = np.unique(np.round([*(np.arange(n) * dt), *(np.arange(n) * dt + delay)], 12))
+    ends = ends[(ends >= 0) & (ends <= (n - 1) * dt + 1e-9)]
+    x, states = np.asarray(x0, float), {0.0: np.asarray(x0, float)}
+    for a, b in zip(ends[:-1], ends[1:], strict=True):
+        k = int(np.floor((0.5 * (a + b) - delay) / dt))
+        now = u[min(max(k, 0), n - 1)]
+        x = scipy.integrate.solve_ivp(
+            lambda t, y, now=now: A @ y + B[:, 0] * now, (a, b), x,
+            method="DOP853", rtol=1e-11, atol=1e-13,
+        ).y[:, -1]  # fmt: skip
+        states[b] = x
+    return np.array([states[t] for t in np.round(np.arange(n) * dt, 12)])
+
+
+def start(x=X0):
+    return models.roll.State(*(jnp.asarray(s) for s in x))
+
+
+@functools.cache
+def compiled(solver="exact", delayed=False, substeps=4, adjoint=None):
+    made = {"exact": "exact", "rk4": "rk4", "tsit5": dfx.Tsit5(), "heun": dfx.Heun()}[solver]
+
+    def run(p, u, x0, delay):
+        return simulate(
+            STAND, p, models.roll.Inputs(u), dt=DT, initial_state=x0, solver=made,
+            substeps=substeps, delay=delay if delayed else None, adjoint=adjoint,
+        )  # fmt: skip
+
+    return jax.jit(run)
+
+
+def run(v, u=U, x0=X0, delay=None, **how):
+    go = compiled(delayed=delay is not None, **how)
+    return go(Helicopter(**v), jnp.asarray(u), start(x0), jnp.asarray(delay or 0.0))
+
+
+def table(trajectory):
+    return np.stack([np.asarray(x) for x in trajectory.states], axis=1)
+
+
+def close(found, wanted, rtol):
+    """Each column within rtol of its largest value."""
+    size = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(np.asarray(found) / size, wanted / size, rtol=0, atol=rtol)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_is_scipys_zero_order_hold(seed):
+    v = scattered(seed)
+    found = run(v)
+    close(table(found), recurrence(v, U, X0), 1e-10)
+    np.testing.assert_array_equal(found.outputs.roll, found.states.phi)
+    np.testing.assert_array_equal(found.outputs.roll_rate, found.states.dphi)
+    np.testing.assert_allclose(found.times, DT * np.arange(N), rtol=1e-15)
+    assert bool(found.finite)
+    assert bool(found.result == dfx.RESULTS.successful)
+
+
+def test_exact_is_a_digital_filter(bench30):
+    A, B = matrices(BENCH, True)
+    u = stick(6000, 3, 25)
+    den = np.poly(A)
+    num = (np.poly(A - B @ np.eye(4)[:1]) - den)[2:]  # det(sI - A + BC) - det(sI - A), eq. 23
+    b, a, _ = scipy.signal.cont2discrete((num, den), DT)
+    wanted = scipy.signal.lfilter(np.ravel(b), a, u)
+    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={})
+    found = simulate(STAND, bench30, flight)
+    close(np.asarray(found.outputs.roll), wanted, 1e-9)
+
+
+def test_exact_against_integration_interval_by_interval():
+    close(table(run(BENCH)), switching(BENCH, U, X0, 0.0), 1e-9)
+
+
+def test_rk4_converges_with_order_four():
+    exact = recurrence(BENCH, U, X0)
+    errors = [
+        np.abs(table(run(BENCH, solver="rk4", substeps=s)) - exact)[:, 0].max() for s in (8, 16, 32)
+    ]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    np.testing.assert_allclose(orders, 4.0, atol=0.3)
+
+
+def test_the_input_is_held_to_the_end_of_its_interval():
+    # A method that read the next sample in its last stage would be wrong by first order: 1e-2.
+    close(table(run(BENCH, solver="rk4", substeps=32)), recurrence(BENCH, U, X0), 1e-5)
+    close(table(run(BENCH, solver="tsit5", substeps=32)), recurrence(BENCH, U, X0), 1e-7)
+
+
+def test_adaptive_dopri8():
+    found = simulate(
+        STAND, Helicopter(**BENCH), models.roll.Inputs(U), dt=DT, initial_state=start(),
+        solver=dfx.Dopri8(), controller=dfx.PIDController(rtol=1e-10, atol=1e-13),
+        delay=jnp.asarray(0.013),
+    )  # fmt: skip
+    close(table(found), table(run(BENCH, delay=0.013)), 1e-8)
+    close(table(found), switching(BENCH, U, X0, 0.013), 1e-8)
+
+
+def test_adaptive_steps_that_run_out_are_a_result(bench30):
+    found = simulate(
+        STAND, bench30, models.roll.Inputs(U), dt=DT, initial_state=start(), max_steps=20,
+        controller=dfx.PIDController(rtol=1e-10, atol=1e-13),
+    )  # fmt: skip
+    assert bool(found.result == dfx.RESULTS.max_steps_reached)
+    assert not bool(found.finite)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 3, -1, -2])
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_whole_samples_of_delay_shift_the_input(solver, samples):
+    shifted = U[np.clip(np.arange(N) - samples, 0, N - 1)]
+    found = run(BENCH, delay=samples * DT, solver=solver)
+    close(table(found), table(run(BENCH, shifted, solver=solver)), 1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.004, 0.0199, 0.033, -0.007, -0.05])
+def test_part_of_a_sample_of_delay(delay):
+    wanted = switching(BENCH, U, X0, delay)
+    close(table(run(BENCH, delay=delay)), wanted, 1e-9)
+    close(table(run(BENCH, delay=delay, solver="rk4", substeps=16)), wanted, 1e-4)
+
+
+def test_outputs_feel_the_input_that_acts():
+    """An output with direct feed-through shows the delayed stick, not the logged one."""
+    through = Model(
+        "through", STAND.vector_field, lambda p, s, u: models.roll.Outputs(u.x_roll, s.dphi),
+        Helicopter, models.roll.State, models.roll.Inputs, models.roll.Outputs, linear=True,
+    )  # fmt: skip
+    u, p = np.arange(10.0), Helicopter(**BENCH)
+    go = jax.jit(lambda d: simulate(through, p, models.roll.Inputs(u), dt=DT, delay=d).outputs)
+    for delay, shift in ((0.0, 0), (0.02, 1), (0.03, 2), (-0.02, -1), (-0.01, 0)):
+        found = go(jnp.asarray(delay))
+        np.testing.assert_array_equal(found.roll, np.clip(u - shift, 0, 9))
+
+
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_derivative_by_delay(solver):
+    go = compiled(solver, True, adjoint=dfx.ForwardMode())
+    p, u, x0 = Helicopter(**BENCH), jnp.asarray(U), start()
+
+    def roll(delay):
+        return go(p, u, x0, delay).outputs.roll
+
+    slope = jax.jit(jax.jacfwd(roll))
+    # On a whole sample RK4's steps change their lengths: its truncation error has a kink there.
+    for delay in (0.0, 0.013, -0.028) if solver == "exact" else (0.013, -0.028):
+        h = 1e-6
+        wanted = (roll(jnp.asarray(delay + h)) - roll(jnp.asarray(delay - h))) / (2.0 * h)
+        close(slope(jnp.asarray(delay)), np.asarray(wanted), 1e-4)
+
+
+NAMES = ("Ixx", "If", "a", "kappa", "L3", "Omega")
+
+
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_forward_reverse_and_finite_differences_agree(solver):
+    weights = np.random.default_rng(5).standard_normal(N)
+    go = compiled(solver, substeps=16) if solver == "rk4" else compiled(solver)
+
+    def cost(logs):
+        p = Helicopter(**{**BENCH, **dict(zip(NAMES, jnp.exp(logs), strict=True))})
+        return jnp.sum(weights * go(p, jnp.asarray(U), start(), jnp.asarray(0.0)).states.phi)
+
+    def by_scipy(logs):
+        v = {**BENCH, **dict(zip(NAMES, np.exp(logs), strict=True))}
+        return np.sum(weights * recurrence(v, U, X0)[:, 0])
+
+    logs = np.log([BENCH[n] for n in NAMES])
+    forward = np.asarray(jax.jit(jax.jacfwd(cost))(jnp.asarray(logs)))
+    reverse = np.asarray(jax.jit(jax.grad(cost))(jnp.asarray(logs)))
+    h = 1e-5
+    wanted = [(by_scipy(logs + e) - by_scipy(logs - e)) / (2.0 * h) for e in np.eye(len(logs)) * h]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-11 * np.abs(forward).max())
+    tight = 1e-6 if solver == "exact" else 1e-3
+    np.testing.assert_allclose(forward, wanted, rtol=tight, atol=tight * np.abs(wanted).max())
+
+
+def test_other_adjoints_give_the_same_derivative(bench30):
+    def cost(x_roll, adjoint):
+        inputs = models.roll.Inputs(x_roll * jnp.ones(10))
+        return jnp.sum(simulate(STAND, bench30, inputs, dt=DT, adjoint=adjoint).outputs.roll)
+
+    one = jnp.asarray(1e-6)
+    checkpointed = jax.jit(jax.grad(lambda x: cost(x, dfx.RecursiveCheckpointAdjoint())))(one)
+    forward = jax.jit(jax.jacfwd(lambda x: cost(x, dfx.ForwardMode())))(one)
+    wanted = recurrence(BENCH, np.ones(10), np.zeros(4))[:, 0].sum()
+    np.testing.assert_allclose([checkpointed, forward], wanted, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    """Six machines as one batch: four sound ones, one not a number, one that flies apart."""
+    machines = [scattered(k) for k in range(4)]
+    machines.insert(1, {**BENCH, "Ixx": np.nan, "Ixx_added": 0.0})
+    machines.insert(3, {**BENCH, "Ixx": 1e-7, "Ixx_added": 0.0})
+    batch = {n: jnp.asarray([v[n] for v in machines]) for n in machines[0]}
+    return machines, Helicopter(**{n: batch[n] for n in batch})
+
+
+@pytest.mark.parametrize(("solver", "substeps"), [("exact", 4), ("rk4", 16)])
+def test_many_equal_one_by_one_and_the_broken_break_alone(fleet, solver, substeps):
+    machines, batch = fleet
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, batch)
+    go = compiled(solver, substeps=substeps)
+    u = jnp.asarray(stick(300, 1))
+    many = jax.jit(jax.vmap(go, in_axes=(axes, None, None, None)))(
+        batch, u, start(), jnp.asarray(0.0)
+    )
+    np.testing.assert_array_equal(many.finite, [True, False, True, False, True, True])
+    for k, v in enumerate(machines):
+        if k in (1, 3):
+            continue
+        one = run(v, u, solver=solver, substeps=substeps)
+        for a, b in zip(many.states, one.states, strict=True):
+            np.testing.assert_allclose(a[k], b, rtol=0, atol=1e-11 * np.abs(b).max())
+        if solver == "exact":
+            close(np.asarray(many.states.phi[k]), recurrence(v, np.asarray(u), X0)[:, 0], 1e-9)
+
+
+def test_adaptive_batch_with_a_broken_machine(fleet):
+    machines, batch = fleet
+    batch = jax.tree.map(lambda x: x[:3] if jnp.ndim(x) else x, batch)
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, batch)
+
+    def go(p):
+        return simulate(
+            STAND, p, models.roll.Inputs(U[:10]), dt=DT, initial_state=start(), max_steps=1000,
+            controller=dfx.PIDController(rtol=1e-9, atol=1e-12),
+        )  # fmt: skip
+
+    many = jax.jit(jax.vmap(go, in_axes=(axes,)))(batch)
+    np.testing.assert_array_equal(many.finite, [True, False, True])
+    for k in (0, 2):
+        found = np.stack([np.asarray(x[k]) for x in many.states], axis=1)
+        close(found, recurrence(machines[k], U[:10], X0), 1e-7)
+
+
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_accumulate_is_the_sum_over_simulate(bench30, solver):
+    measured = np.random.default_rng(2).standard_normal(N)
+
+    def square(total, outputs, data):
+        return total + (outputs.roll - data) ** 2
+
+    inputs = models.roll.Inputs(U)
+    total, result = accumulate(
+        STAND, bench30, inputs, square, jnp.asarray(0.0), data=jnp.asarray(measured), dt=DT,
+        initial_state=start(), solver=solver,
+    )  # fmt: skip
+    roll = np.asarray(run(BENCH, solver=solver).outputs.roll)
+    assert float(total) == pytest.approx(np.sum((roll - measured) ** 2), rel=1e-12)
+    assert bool(result == dfx.RESULTS.successful)
+
+
+def test_accumulate_sees_every_sample_once_and_in_order(bench30):
+    def update(value, outputs, k):
+        return 10.0 * value + k
+
+    total, _ = accumulate(
+        STAND, bench30, models.roll.Inputs(U[:6]), update, jnp.asarray(0.0),
+        data=jnp.arange(1.0, 7.0), dt=DT,
+    )  # fmt: skip
+    assert float(total) == 123456.0
+
+
+def test_accumulate_has_a_gradient(bench30):
+    def cost(Ixx):
+        p = naming.replace(bench30, Ixx=Ixx)
+        inputs = models.roll.Inputs(U[:20])
+        return accumulate(
+            STAND, p, inputs, lambda s, y, d: s + y.roll**2, jnp.asarray(0.0), dt=DT
+        )[0]
+
+    def by_scipy(Ixx):
+        return np.sum(recurrence({**BENCH, "Ixx": Ixx}, U[:20], np.zeros(4))[:, 0] ** 2)
+
+    wanted = (by_scipy(0.024 + 1e-7) - by_scipy(0.024 - 1e-7)) / 2e-7
+    assert float(jax.jit(jax.grad(cost))(jnp.asarray(0.024))) == pytest.approx(wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("double", [True, False], ids=["beside float64", "float32 alone"])
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_single_precision_stays_single_and_close(vehicles_folder, solver, double):
+    with jax.enable_x64(double):
+        p = load_vehicle(vehicles_folder / "bench-30.yaml")
+        p = jax.tree.map(lambda x: x.astype(jnp.float32), p)
+        inputs = models.roll.Inputs(U.astype(np.float32))
+        found = simulate(STAND, p, inputs, dt=DT, solver=solver, substeps=8)
+    for leaf in (*found.states, *found.outputs):
+        assert leaf.dtype == jnp.float32
+    wanted = recurrence(BENCH, U, np.zeros(4))
+    close(found.states.phi, wanted[:, 0], 1e-3)
+
+
+def test_flight_and_arrays_are_the_same(bench30):
+    flight = Flight(dt=DT, inputs={"x_roll": U, "x_yaw": U}, outputs={"roll": U})
+    one = simulate(STAND, bench30, flight)
+    two = simulate(STAND, bench30, models.roll.Inputs(U), dt=DT)
+    np.testing.assert_array_equal(one.outputs.roll, two.outputs.roll)
+
+
+def test_linear_in_input_and_state(bench30):
+    one = table(run(BENCH))
+    np.testing.assert_allclose(
+        table(run(BENCH, 2 * U, 2 * X0)), 2 * one, rtol=1e-9, atol=1e-12 * np.abs(one).max()
+    )
+
+
+def test_energy_of_the_stand_without_flybar(bench30):
+    # No lift: a pendulum and a free oscillator. phi' ^2 + kappa phi^2 and its flybar twin stay.
+    p = naming.replace(bench30, a=jnp.asarray(0.0), zeta=jnp.asarray(0.0))
+    s = simulate(STAND, p, models.roll.Inputs(U), dt=DT, initial_state=start()).states
+    np.testing.assert_allclose(s.dphi**2 + 4.0 * s.phi**2, 0.04 + 4.0 * 0.05**2, rtol=1e-10)
+    np.testing.assert_allclose(
+        s.dbeta_roll**2 + 150.0**2 * s.beta_roll**2, 1.0 + 150.0**2 * 1e-4, rtol=1e-9
+    )
+
+
+bent = Model(
+    "bent", lambda p, s, u: models.roll.State(*jax.tree.map(lambda x: -(x**3), tuple(s))),
+    models.roll.output, Helicopter, models.roll.State, models.roll.Inputs, models.roll.Outputs,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("model", "inputs", "how", "said"),
+    [
+        (bent, U, {"solver": "exact"}, "'bent' is not linear: use solver='rk4'"),
+        (STAND, U, {"solver": "euler"}, "unknown solver 'euler': use 'exact', 'rk4'"),
+        (STAND, U, {"solver": "rk4", "substeps": 0}, "substeps is 0, wanted is at least 1"),
+        (STAND, U, {"dt": None}, "need dt"),
+        (STAND, U[:1], {}, r"shapes \[\(1,\)\], wanted is \(N,\)"),
+        (STAND, U[None], {}, r"shapes \[\(1, 60\)\], wanted is \(N,\)"),
+        (STAND, 1.0, {}, r"shapes \[\(\)\], wanted is \(N,\)"),
+        (STAND, U, {"key": 0}, "'roll-on-stand' has no noise to draw"),
+        (STAND, U, {"solver": "rk4", "controller": 1e-6}, "error estimate: Dopri8"),
+        (STAND, U, {"solver": "exact", "controller": 1e-6}, "error estimate: Dopri8"),
+    ],
+)
+def test_wrong_arguments(bench30, model, inputs, how, said):
+    how = {"dt": DT, **how}
+    if "key" in how:
+        how["key"] = jax.random.key(how["key"])
+    if "controller" in how:
+        how["controller"] = dfx.PIDController(rtol=how["controller"], atol=how["controller"])
+    with pytest.raises(ValueError, match=said):
+        simulate(model, bench30, models.roll.Inputs(inputs), **how)
+
+
+def test_noise_needs_the_exact_solver_and_no_delay(bench30):
+    from heli_jax.dynamics.disturbance import with_disturbance
+
+    model = with_disturbance(STAND, "roll")
+    p = model.Params(**naming.asdict(bench30))
+    for how in ({"solver": "rk4"}, {"delay": jnp.asarray(0.01)}):
+        with pytest.raises(ValueError, match="noise is drawn with solver='exact' and without a"):
+            simulate(model, p, models.roll.Inputs(U), dt=DT, key=jax.random.key(0), **how)
+
+
+def test_missing_input_of_a_flight_is_named(bench30):
+    flight = Flight(dt=DT, inputs={"x_pitch": U}, outputs={})
+    with pytest.raises(ValueError, match="no input 'x_roll', which roll-on-stand needs"):
+        simulate(STAND, bench30, flight)
+
+
+def test_rates_oracle_and_matrices_agree():
+    # The oracle's two faces: the matrices are the rates at unit vectors, so they must be linear.
+    A, B = matrices(BENCH, True)
+    np.testing.assert_allclose(A @ X0 + B[:, 0] * 1e-6, rates(BENCH, X0, 1e-6, True), rtol=1e-12)

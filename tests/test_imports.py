@@ -1,0 +1,186 @@
+"""Who may import whom: read from the source, so that nothing has to run."""
+
+import ast
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import heli_jax
+
+ROOT = Path(heli_jax.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+
+BASE = {"errors", "units", "naming", "yaml_file", "vehicle"}
+# What each part may import of heli_jax, beside itself.
+ALLOWED = {
+    "errors": set(),
+    "units": {"errors"},
+    "naming": set(),
+    "yaml_file": {"errors"},
+    "vehicle": {"naming", "units", "errors", "yaml_file"},
+    "flights": {"errors", "units"},
+    "dynamics": {"vehicle", "naming"},
+    "simulation": {"dynamics", *BASE},
+    "analysis": {"simulation", "dynamics", *BASE},
+    "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},
+    "models": {"dynamics", *BASE},
+    "report": {
+        "identification", "analysis", "simulation", "dynamics", "flights", "models", *BASE,
+    },
+}  # fmt: skip
+# Entry points may import everything below them, never the command line.
+ENTRY = {"config", "generate", "output", "run_directory", "cli", "__init__", "__main__", "sweep"}
+
+
+def part(path):
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def imported(path):
+    """(module, line) of every import in a file, those inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            if node.level:
+                package = path.relative_to(ROOT.parent).parts[: -node.level]
+                module = ".".join([*package, *([module] if module else [])])
+            yield from ((f"{module}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def inner(path):
+    """Parts of heli_jax that a file imports."""
+    for module, line in imported(path):
+        names = module.split(".")
+        if names[0] == "heli_jax" and len(names) > 1:
+            yield names[1], line
+
+
+def importers(library):
+    return {
+        str(path.relative_to(ROOT))
+        for path in FILES
+        for module, _ in imported(path)
+        if module.split(".")[0] == library
+    }
+
+
+def test_the_parts_are_known():
+    assert {part(p) for p in FILES} <= set(ALLOWED) | ENTRY
+
+
+@pytest.mark.parametrize("name", ALLOWED)
+def test_imports_point_one_way(name):
+    mine = [p for p in FILES if part(p) == name]
+    assert mine
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {other}"
+        for path in mine
+        for other, line in inner(path)
+        if other != name and other not in ALLOWED[name]
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", ["config", "generate", "output"])
+def test_nothing_imports_the_command_line(name):
+    path = ROOT / f"{name}.py"
+    assert "cli" not in {other for other, _ in inner(path)}
+
+
+@pytest.mark.parametrize(
+    ("library", "homes"),
+    [
+        # residual.py names diffrax.ForwardMode, the derivative that Levenberg-Marquardt needs.
+        ("diffrax", {"simulation", "identification/residual.py"}),
+        ("optimistix", {"identification"}),
+        ("lineax", {"identification"}),
+        ("pydantic", {"config.py"}),
+        ("matplotlib", {"report"}),
+        ("yaml", {"yaml_file.py", "output.py"}),
+        ("pint", {"units.py"}),
+        ("jinja2", {"report"}),
+        ("pickle", set()),
+        ("marshal", set()),
+        ("shelve", set()),
+        ("cloudpickle", set()),
+        ("dill", set()),
+    ],
+)
+def test_libraries_stay_at_home(library, homes):
+    def at_home(file):
+        return file in homes or any(file.startswith(f"{home}/") for home in homes)
+
+    assert [file for file in sorted(importers(library)) if not at_home(file)] == []
+
+
+def test_identification_takes_only_the_adjoint_from_diffrax():
+    source = (ROOT / "identification/residual.py").read_text()
+    names = {
+        node.attr
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id in ("dfx", "diffrax")
+    }
+    assert names <= {"ForwardMode"}
+
+
+def test_nothing_evaluates_text():
+    wrong = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in FILES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in ("eval", "exec", "compile", "__import__")
+    ]
+    assert not wrong
+
+
+def test_importing_changes_no_setting_and_prints_nothing():
+    modules = [
+        ".".join(("heli_jax", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(
+            ".__init__"
+        )
+        for path in FILES
+        if path.stem not in ("cli", "__main__")
+    ]
+    program = (
+        "import importlib, json, logging, sys, warnings\n"
+        "import jax, equinox, diffrax, optimistix\n"
+        "def now():\n"
+        "    return [repr(sorted(jax.config.values.items(), key=str)), logging.root.level,\n"
+        "            len(logging.root.handlers), len(warnings.filters)]\n"
+        "before = now()\n"
+        f"for name in {modules!r}:\n"
+        "    importlib.import_module(name)\n"
+        "assert now()[:3] == before[:3], 'a setting changed'\n"
+        "assert not jax.config.jax_enable_x64\n"
+        "light = sys.modules.keys() & {'matplotlib.pyplot'}\n"
+        "print(json.dumps(sorted(light)))\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert json.loads(run.stdout) == []
+
+
+def test_the_package_itself_imports_nothing_heavy():
+    program = "import sys, heli_jax; print(sorted({'jax', 'diffrax', 'pydantic'} & {*sys.modules}))"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_every_name_at_the_top_exists():
+    for name in heli_jax.__all__:
+        assert getattr(heli_jax, name) is not None
+    assert importlib.import_module("heli_jax.models") is heli_jax.models
+    with pytest.raises(AttributeError, match="nothing"):
+        heli_jax.nothing  # noqa: B018

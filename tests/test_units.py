@@ -1,0 +1,185 @@
+"""Units against the definitions of SI, not against the package's own table."""
+
+import math
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from heli_jax import units
+
+FACTORS = [
+    ("mm", "m", 1e-3),
+    ("cm", "m", 1e-2),
+    ("km", "m", 1e3),
+    ("in", "m", 0.0254),
+    ("ft", "m", 0.3048),
+    ("ms", "s", 1e-3),
+    ("µs", "s", 1e-6),
+    ("us", "s", 1e-6),
+    ("min", "s", 60.0),
+    ("deg", "rad", math.pi / 180.0),
+    ("°", "rad", math.pi / 180.0),
+    ("mrad", "rad", 1e-3),
+    ("rev", "rad", 2.0 * math.pi),
+    ("rpm", "rad/s", 2.0 * math.pi / 60.0),
+    ("Hz", "rad/s", 2.0 * math.pi),
+    ("deg/s", "rad/s", math.pi / 180.0),
+    ("deg/s^2", "rad/s^2", math.pi / 180.0),
+    ("deg/s**2", "rad/s^2", math.pi / 180.0),
+    ("1/deg", "1/rad", 180.0 / math.pi),
+    ("g", "kg", 1e-3),
+    ("lb", "kg", 0.45359237),
+    ("g cm^2", "kg m^2", 1e-7),
+    ("g*cm^2", "kg*m^2", 1e-7),
+    ("g·cm^2", "kg m^2", 1e-7),
+    ("kg mm^2", "kg m^2", 1e-6),
+    ("km/h", "m/s", 1.0 / 3.6),
+    ("N mm", "N m", 1e-3),
+    ("kPa", "Pa", 1e3),
+    ("%", "1", 1e-2),
+    ("percent", "1", 1e-2),
+    ("stick", "1", 1.0),
+    ("gee", "m/s^2", 9.80665),
+    ("1/ms^2", "1/s^2", 1e6),
+    ("lbf", "N", 4.4482216152605),
+    ("kg", "kg", 1.0),
+    ("", "1", 1.0),
+    ("-", "1", 1.0),
+    # A plain number passes for radians, as SI has it.
+    ("1/s", "rad/s", 1.0),
+    ("1", "rad", 1.0),
+    ("1", "1/rad", 1.0),
+]
+
+
+@pytest.mark.parametrize(("unit", "si", "wanted"), FACTORS)
+def test_factors(unit, si, wanted):
+    assert units.factor(unit, si) == pytest.approx(wanted, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "have", "want"),
+    [
+        ("mm", "rad", "length", "angle"),
+        ("deg", "m", "angle", "length"),
+        ("kg", "kg m^2", "mass", "moment of inertia"),
+        ("deg", "rad/s", "angle", "angular speed"),
+        ("s", "1", "time", "plain number"),
+        ("%", "m", "plain number", "length"),
+        ("m/s", "m", "speed", "length"),
+        ("rpm", "rad", "angular speed", "angle"),
+    ],
+)
+def test_wrong_kinds_are_named_on_both_sides(unit, si, have, want):
+    with pytest.raises(ValueError, match=rf"'{unit}' is an? {have}.*an? {want} such as '") as e:
+        units.factor(unit, si)
+    assert repr(si) in str(e.value)
+
+
+def test_radians_do_not_pass_for_a_plain_number():
+    # The other way round is SI's habit; this way a Hz could pass for 1/s.
+    with pytest.raises(ValueError, match="Hz"):
+        units.factor("Hz", "1/s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "near"), [("Deg", "deg"), ("radd", "rad"), ("RPM", "rpm"), ("hz", "Hz"), ("mmm", "mm")]
+)
+def test_unknown_unit_names_the_nearest(unit, near):
+    with pytest.raises(ValueError, match=rf"unknown unit '{unit}'; did you mean '{near}'\?"):
+        units.factor(unit, "rad")
+
+
+HOSTILE = [
+    "9**9**9**9",
+    "m**9**9**9**9",
+    "m^99999999",
+    "10^10^10",
+    '__import__("os")',
+    "().__class__",
+    "m" * 1_000_000,
+    "m*" * 500_000,
+    " " * 1_000_000 + "!",
+    "m " * 29 + "!",
+    "nan",
+    "inf",
+    "(" * 10_000,
+    "m/0",
+    "0",
+    "2",
+    "1e400",
+    "m;s",
+    "\x00",
+    "ммм",
+    "{unit}",
+    "m + m",
+]
+
+
+@pytest.mark.parametrize("unit", HOSTILE, ids=[f"{u[:12]!r}" for u in HOSTILE])
+def test_hostile_text_is_refused_fast_and_in_one_short_line(unit):
+    begin = time.process_time()
+    with pytest.raises(ValueError, match="unknown unit") as e:
+        units.factor(unit, "rad/s^2")
+    assert time.process_time() - begin < 1.0
+    assert len(str(e.value)) < 300
+    assert "\n" not in str(e.value)
+
+
+@given(st.text(max_size=70))
+def test_no_text_raises_anything_but_value_error(text):
+    try:
+        number = units.factor(text, "rad")
+    except ValueError as e:
+        assert str(e)
+    else:
+        assert math.isfinite(number)
+        assert number > 0
+
+
+prefixed = st.builds(
+    str.__add__, st.sampled_from(["", "m", "k", "c"]), st.sampled_from(["m", "s", "g", "rad", "N"])
+)
+powered = st.builds(lambda u, n: f"{u}^{n}", prefixed, st.integers(1, 4))
+compound = st.builds(lambda a, op, b: a + op + b, powered, st.sampled_from(["*", "/", " "]), powered)
+
+
+@given(compound)
+def test_factor_is_positive_and_inverts(unit):
+    try:
+        si = units.si_of(unit)
+    except ValueError:  # of a kind without a listed SI unit: against itself then
+        si = unit
+    assert units.factor(unit, si) * units.factor(si, unit) == pytest.approx(1.0, rel=1e-12)
+
+
+@given(
+    st.sampled_from(["mm", "m", "ft", "in", "km"]),
+    st.sampled_from(["s", "ms", "min", "h"]),
+    st.integers(1, 3),
+)
+def test_a_quotient_is_the_quotient_of_its_factors(length, time_unit, power):
+    wanted = units.factor(length, "m") / units.factor(time_unit, "s") ** power
+    assert units.factor(f"{length}/{time_unit}^{power}", f"m/s^{power}") == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(
+    ("unit", "si"),
+    [("deg", "rad"), ("rpm", "rad/s"), ("Hz", "rad/s"), ("mm", "m"), ("%", "1"), ("g", "kg")],
+)
+def test_si_of(unit, si):
+    assert units.si_of(unit) == si
+
+
+def test_si_of_refuses_what_does_not_occur():
+    with pytest.raises(ValueError, match="no SI unit is listed"):
+        units.si_of("kg^3")
+
+
+@pytest.mark.parametrize(
+    ("unit", "plain"), [("1", True), ("%", True), ("stick", True), ("rad", False), ("m", False)]
+)
+def test_is_plain(unit, plain):
+    assert units.is_plain(unit) is plain
