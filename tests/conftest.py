@@ -12,13 +12,14 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Before the package's first import: the hook checks the shapes that its annotations state.
-# Left out are modules that are called with other types than their annotations say, on purpose:
+# Left out are modules that are called with other types than their annotations say:
 # flights (beartype cannot check its Table, a Protocol that is not runtime_checkable), the equations
-# (any record with the names of a Helicopter passes for one, such as with_disturbance's) and
-# identification.problem (takes a list of flights for a tuple).
+# (any record with the names of a Helicopter passes for one, such as with_disturbance's),
+# identification.problem (takes a list of flights for a tuple), identification.rls (its symbolic
+# axes name no argument) and analysis.lti (its own errors for wrong arguments are tested).
 _CHECKED = (
-    "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation analysis "
-    "identification.rls identification.coordinates identification.baseline identification.metrics "
+    "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
+    "analysis.linear identification.coordinates identification.baseline identification.metrics "
     "identification.residual"
 )
 jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")

@@ -174,7 +174,9 @@ def test_importing_changes_no_setting_and_prints_nothing():
 
 def test_the_package_itself_imports_nothing_heavy():
     program = "import sys, heli_jax; print(sorted({'jax', 'diffrax', 'pydantic'} & {*sys.modules}))"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert run.stdout.strip() == "[]"
 
 

@@ -132,18 +132,19 @@ def test_hostile_text_is_refused_fast_and_in_one_short_line(unit):
 def test_no_text_raises_anything_but_value_error(text):
     try:
         number = units.factor(text, "rad")
-    except ValueError as e:
-        assert str(e)
-    else:
-        assert math.isfinite(number)
-        assert number > 0
+    except ValueError:
+        return
+    assert math.isfinite(number)
+    assert number > 0
 
 
 prefixed = st.builds(
     str.__add__, st.sampled_from(["", "m", "k", "c"]), st.sampled_from(["m", "s", "g", "rad", "N"])
 )
 powered = st.builds(lambda u, n: f"{u}^{n}", prefixed, st.integers(1, 4))
-compound = st.builds(lambda a, op, b: a + op + b, powered, st.sampled_from(["*", "/", " "]), powered)
+compound = st.builds(
+    lambda a, op, b: a + op + b, powered, st.sampled_from(["*", "/", " "]), powered
+)
 
 
 @given(compound)

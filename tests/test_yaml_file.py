@@ -163,6 +163,14 @@ def test_no_file_and_folder(tmp_path):
         read_mapping(tmp_path / "f" / "under.yaml")
 
 
+def mapping_or_error(read):
+    """What was read, or else the sentence that refused it."""
+    try:
+        return read(), ""
+    except InputError as e:
+        return None, str(e)
+
+
 yamlish = st.text(st.sampled_from(list("ab1-:?,[]{}&*!|>'\"%@` #\n\t.<~eé\x00\x85")), max_size=40)
 
 
@@ -181,13 +189,8 @@ yamlish = st.text(st.sampled_from(list("ab1-:?,[]{}&*!|>'\"%@` #\n\t.<~eé\x00\x
 @example("a: !!omap [{}]")
 @example("a: 1\ud800")
 def test_no_text_raises_anything_but_input_error(text):
-    try:
-        found = parse_mapping(text, "here")
-    except InputError as e:
-        assert str(e).startswith("here")
-        assert "\n" not in str(e)
-    else:
-        assert isinstance(found, dict)
+    found, said = mapping_or_error(lambda: parse_mapping(text, "here"))
+    assert isinstance(found, dict) or (said.startswith("here") and "\n" not in said)
 
 
 @given(st.binary(max_size=60))
@@ -197,11 +200,8 @@ def test_no_bytes_raise_anything_but_input_error(content):
     with tempfile.NamedTemporaryFile(suffix=".yaml") as f:
         f.write(content)
         f.flush()
-        try:
-            assert isinstance(read_mapping(f.name), dict)
-        except InputError as e:
-            assert str(e).startswith(f.name)
-            assert "\n" not in str(e)
+        found, said = mapping_or_error(lambda: read_mapping(f.name))
+    assert isinstance(found, dict) or (said.startswith(f.name) and "\n" not in said)
 
 
 names = st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True).filter(

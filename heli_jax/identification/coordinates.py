@@ -49,7 +49,7 @@ def plain_kind(free: Free) -> str:
 def inside(free: Free, value: float) -> bool:
     """Whether a value lies within the bounds."""
     low, high = limits(free)
-    return low <= value <= high
+    return bool(low <= value <= high)
 
 
 def to_value(how: str, z: Any, sign: Any, low: Any, high: Any) -> Any:

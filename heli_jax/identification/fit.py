@@ -80,7 +80,7 @@ def fit(
     before = verdict_of(problem, layout, evaluate(layout, data, sd, z0))
     tell(f"fitting {', '.join(layout.named)}")
     points = starting.draw(layout, problem, z0, starts, seed)
-    search = starting.Search(problem, layout, data, max_steps, many=starts > 1)
+    search = starting.Search(problem, layout, data, max_steps)
     runs = search.run(sd, points, tell)
     best = min(runs, key=lambda o: (not bool(o.converged), _finite_cost(o)))
     best, sd, trace = _settle_noise(search, sd, best)

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from heli_jax.identification.residual import (
     Data,
     Layout,
-    evaluate,
     residuals,
     residuals_and_jacobian,
 )
@@ -113,7 +112,7 @@ def optimise(
     @scaled.defjvp
     def scaled_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
         r, J = residuals_and_jacobian(layout, data, sd, z0 + units.unit * primals[0])
-        return r / units.level, (J * (units.unit / units.level)) @ tangents[0]
+        return r / units.level, J @ (tangents[0] * units.unit / units.level)
 
     def fn(xi: Array, _: Any) -> Array:
         return scaled(xi)
@@ -134,23 +133,6 @@ def optimise(
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
     converged = (solution.result == optx.RESULTS.successful) & fine
     return Optimum(z, cost, solution.stats["num_steps"], converged)
-
-
-@eqx.filter_jit
-def optimise_many(
-    layout: Layout,
-    data: Data,
-    sd: tuple[dict[str, Any], ...],
-    starts: Float[Array, "s q"],
-    max_steps: int = 100,
-) -> Optimum:
-    """`optimise` from several starts at once, by vmap; every field gains an axis (s,)."""
-
-    def one(z0: Array) -> Optimum:
-        e = evaluate(layout, data, sd, z0)
-        return optimise(layout, data, sd, z0, scaling(e.r, e.J), max_steps)
-
-    return jax.vmap(one)(starts)
 
 
 def residuals_count(layout: Layout, data: Data) -> int:

@@ -22,7 +22,6 @@ from heli_jax.identification import coordinates
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.simulation.simulate import Trajectory, simulate
 
-
 _BLOCK = 32
 
 
@@ -68,17 +67,14 @@ class Layout(eqx.Module):
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     solver: str | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+    """samples per step of the exact recurrence"""
 
     @property
     def named(self) -> tuple[str, ...]:
         """The unknowns that the verdict speaks of: parameters, gains, the shift."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
-
-    @property
-    def exact(self) -> bool:
-        """Whether runs are integrated by the exact recurrence."""
-        return self.solver == "exact" or (self.solver is None and self.model.linear)
 
     @property
     def size(self) -> int:
@@ -106,6 +102,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
     """
     how = coordinates.kind if bounded else coordinates.plain_kind
     nuisance = problem.nuisance
+    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
     return Layout(
         model=problem.model,
         free=tuple(problem.free),
@@ -117,6 +114,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         outputs=tuple(tuple(f.outputs) for f in flights),
         solver=problem.solver,
         substeps=problem.substeps,
+        block=_BLOCK if exact else 1,
     )
 
 
@@ -265,7 +263,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
                 solver=layout.solver,
                 substeps=layout.substeps,
                 delay=u.shift,
-                block=_BLOCK if layout.exact else 1,
+                block=layout.block,
                 adjoint=dfx.ForwardMode(),
             )
         )
@@ -294,6 +292,7 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     return z[len(layout.named) :]
 
 
+@eqx.filter_jit  # within a larger trace this is traced once, however often it is called
 def residuals(
     layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
 ) -> Float[Array, " n"]:
@@ -306,6 +305,7 @@ def _whitened(layout: Layout, data: Data, sd: Any, z: Array, raw: Any) -> Array:
     return jnp.concatenate([*rows, prior_rows(layout, data, z), weak_rows(layout, z)])
 
 
+@eqx.filter_jit
 def residuals_and_jacobian(
     layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n q"]]:

@@ -25,6 +25,7 @@ from heli_jax.identification.metrics import (
     whiteness,
 )
 from heli_jax.report import frequency, style
+from heli_jax.report.numbers import percent
 from heli_jax.report.style import label, legend_above, line, subtitle
 
 BAND99 = 2.5758293035489004
@@ -67,7 +68,7 @@ def response(
     line(top, t, signals.measured[output], color=style.PALE, lw=1.9, label="measured")
     line(top, t, signals.simulated[output], color=style.BLUE, lw=0.9, label="simulated")
     top.set_ylabel(label(output, unit))
-    top.set_title(_agreement(signals, output))
+    top.set_title(_agreement(signals, output), loc="left")
     legend_above(top)
     residual = signals.residual(output)
     line(below, t, residual, color=style.VERMILLION, lw=0.7)
@@ -84,7 +85,7 @@ def response(
 def _agreement(signals: Signals, output: str) -> str:
     m = metrics(signals.measured[output], signals.simulated[output])
     how = "held out, predicted" if signals.hold_out else "fitted"
-    vaf = f", VAF {100 * m.vaf:.2f} %" if np.isfinite(m.vaf) else ""
+    vaf = f", VAF {percent(m.vaf)}" if np.isfinite(m.vaf) else ""
     return f"{output}, {signals.flight}: {how}{vaf}"
 
 
@@ -100,7 +101,7 @@ def residual_correlation(signals: Signals, output: str, *, figure: Figure | None
     _stems(axes[0], dt * np.arange(1, lags + 1), r, BAND99 / np.sqrt(n))
     axes[0].set_xlim(0.0, dt * (lags + 0.5))
     axes[0].set_ylabel("autocorrelation")
-    axes[0].set_title(f"Residual of {output}, {signals.flight}: {found}")
+    axes[0].set_title(f"Residual of {output}, {signals.flight}: {found}", loc="left")
     first = f"{w.lag1:+.2f}".replace("-", "−")
     subtitle(
         axes[0],
@@ -159,7 +160,7 @@ def bode(
     record = frequency.empirical(signals.inputs[input], signals.measured[output], dt, memory)
     found = isinstance(record, frequency.Empirical)
     axes = _panels(figure, 6.0 if found else 4.6, [1.4, 1.2, 0.6] if found else [1.2, 1.0])
-    axes[0].set_title(f"{input} to {output}: frequency response")
+    axes[0].set_title(f"{input} to {output}: frequency response", loc="left")
     continuous, sampled = frequency.responses(model, params, output, input, dt)
     omega, below = frequency.log_grid(low, top), frequency.log_grid(low, 0.999 * nyquist)
     H = continuous(omega) * frequency.nuisance_factor(fit, input, omega)
@@ -171,7 +172,9 @@ def bode(
         _curve(axes, reference, below, frequency.discrete(baseline, below),
                color=style.ORANGE, lw=1.5, ls=(0, (4, 2)), label="RLS")  # fmt: skip
     note = _draw_record(axes, reference, record, _others(signals, input))
-    if not model.linear:
+    if not np.isfinite(H).any():
+        note = f"the model cannot be linearised about zero; {note}"
+    elif not model.linear:
         note = f"linearised about zero; {note}"
     _finish_bode(axes, nyquist, (low, top), _bode_unit(model, output, input), note)
     return axes
@@ -221,7 +224,8 @@ def _draw_record(
     clear = record.coherence > _COHERENT
     omega, H = record.omega[clear], record.H[clear]
     how: dict[str, Any] = {"ls": "", "marker": "o", "ms": 2.2, "mew": 0, "color": style.BLACK}
-    axes[0].plot(omega, 20 * np.log10(np.abs(H)), alpha=0.6, label="record", zorder=1.5, **how)
+    name = "record" if clear.any() else None
+    axes[0].plot(omega, 20 * np.log10(np.abs(H)), alpha=0.6, label=name, zorder=1.5, **how)
     axes[1].plot(omega, reference.beside(omega, H), alpha=0.6, zorder=1.5, **how)
     line(axes[2], record.omega, record.coherence, color=style.BLACK, lw=0.8)
     axes[2].axhline(_COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
@@ -299,7 +303,7 @@ def correlation_matrix(verdict: Verdict, *, figure: Figure | None = None) -> Pan
             color = "white" if abs(r[i, j]) > 0.6 else "black"
             text = _correlation(float(r[i, j]), i == j)
             ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
-    ax.set_title("Correlation of the estimates")
+    ax.set_title("Correlation of the estimates", loc="left")
     if verdict.undetermined:
         subtitle(ax, "what the data leave open is left out")
     return (ax,)
@@ -344,7 +348,7 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> 
     ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=16))
     ax.set_xlabel("start, sorted by cost")
     ax.set_ylabel("cost")
-    ax.set_title(_starts_said(rows))
+    ax.set_title(_starts_said(rows), loc="left")
     if not finite.all():
         subtitle(ax, "starts that ended without a finite cost are drawn on top")
     legend_above(ax, raised=not finite.all())
@@ -397,7 +401,7 @@ def rls_history(baseline: Baseline, *, figure: Figure | None = None) -> Panels:
         ax.legend(
             loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0
         )
-    axes[0].set_title(f"RLS coefficients over the record, order {n}")
+    axes[0].set_title(f"RLS coefficients over the record, order {n}", loc="left")
     subtitle(
         axes[0], f"{baseline.input} to {baseline.output}; scaled to the second half of the record"
     )

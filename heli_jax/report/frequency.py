@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.signal
 
 from heli_jax import naming
-from heli_jax.analysis.linear import linearize, modes
+from heli_jax.analysis.linear import linearize
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit
@@ -75,8 +75,11 @@ def responses(
 
 def memory(model: Model, params: Any) -> float:
     """Four times the slowest time constant of the linearised model [s], integrators left out."""
-    size = np.abs(modes(model, params))
-    size = size[np.isfinite(size) & (size > 1e-6 * np.max(size, initial=0.0))]
+    A = np.asarray(linearize(model, params).matrices.A)
+    if not np.isfinite(A).all():
+        return 0.0
+    size = np.abs(np.linalg.eigvals(A))
+    size = size[size > 1e-6 * np.max(size, initial=0.0)]
     return 4.0 / float(size.min()) if size.size else 0.0
 
 

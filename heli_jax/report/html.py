@@ -73,7 +73,8 @@ def _drawings(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str
                 drawings[f"residual{part}_{output}"] = _drawing(
                     figures.residual_correlation, s, output
                 )
-    drawings["bode"] = _bode(fit, problem, baseline)
+    if fit.signals[0].inputs:
+        drawings["bode"] = _bode(fit, problem, baseline)
     if len(fit.verdict.names) > 1:
         drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
     drawings["starts"] = _drawing(figures.waterfall, fit.starts)

@@ -31,7 +31,9 @@ def relative(sd: float | None, value: float) -> str:
     if sd is None or value == 0 or not math.isfinite(sd / value):
         return NOTHING
     share = 100 * abs(sd / value)
-    return f"{share:.0f} %" if share >= 100 else f"{number(share, 2)} %"
+    if share >= 100:
+        return f"{share:.0f} %"
+    return f"{share:#.2g}".rstrip(".") + " %" if share >= 1e-4 else f"{number(share, 2)} %"
 
 
 def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
@@ -43,12 +45,12 @@ def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
     if sd is None or not (math.isfinite(sd) and sd > 0) or first is None:
         return (*(number(v, 6) for v in values), number(sd, 2))
     power = _power(max(abs(first), sd))
-    places = min(max(0, 1 - math.floor(math.log10(sd)) + power), 15)
+    places = min(1 - math.floor(math.log10(sd)) + power, 15)
 
     def one(v: float | None) -> str:
         if v is None or not math.isfinite(v):
             return number(v)
-        return _signed(f"{v / 10.0**power:.{places}f}") + _times(power)
+        return _signed(f"{round(v / 10.0**power, places):.{max(places, 0)}f}") + _times(power)
 
     return (*(one(v) for v in values), one(sd))
 

@@ -48,9 +48,8 @@ def headline(fit: Fit) -> Headline:
         return Headline("bad", "not converged", text)
     if fit.status == "not-identifiable":
         lost = [n for n in v.names if n in v.undetermined or n in v.without_effect]
-        return Headline(
-            "bad", "not identifiable", f"the data do not determine {_listed(lost or list(v.names))}"
-        )
+        text = f"the data do not determine {_listed(lost or list(v.names))}"
+        return Headline("bad", "not identifiable", text)
     resting = v.rank_without_priors < v.rank
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {_listed(names)}"
@@ -218,11 +217,12 @@ def verdict(fit: Fit) -> Table:
 def starts(fit: Fit) -> Table:
     """Where every start led."""
     names = list(fit.starts[0].start) if fit.starts else []
+    lost = {*fit.verdict.undetermined, *fit.verdict.without_effect}
     rows = [
         (
             str(i + 1),
             *(number(s.start[n], 4) for n in names),
-            *(number(s.end[n], 6) for n in names),
+            *(NOT_DETERMINED if n in lost else number(s.end[n], 6) for n in names),
             number(s.cost, 7),
             str(s.steps),
             f"optimum {s.optimum}" if s.converged else "failed",

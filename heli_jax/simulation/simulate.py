@@ -18,7 +18,6 @@ from heli_jax.simulation.solvers import (
     Accumulating,
     Exact,
     Held,
-    Now,
     PerSample,
     at,
 )

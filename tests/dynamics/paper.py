@@ -5,10 +5,24 @@ A state is (phi, dphi, beta, dbeta); a vehicle is a mapping of the paper's names
 
 import numpy as np
 
-BENCH = dict(
-    Ixx=0.024, If=0.00017, a=5.1, R=0.62, c=0.045, R1=0.13, R2=0.21, L1=0.02, L2=0.012, L3=0.028,
-    L4=0.0087, L5=0.02, Omega=150.0, rho=1.2, kappa=4.0, zeta=0.2,
-)  # fmt: skip
+BENCH = {
+    "Ixx": 0.024,
+    "If": 0.00017,
+    "a": 5.1,
+    "R": 0.62,
+    "c": 0.045,
+    "R1": 0.13,
+    "R2": 0.21,
+    "L1": 0.02,
+    "L2": 0.012,
+    "L3": 0.028,
+    "L4": 0.0087,
+    "L5": 0.02,
+    "Omega": 150.0,
+    "rho": 1.2,
+    "kappa": 4.0,
+    "zeta": 0.2,
+}
 
 
 def rates(v, state, x_roll, stand):

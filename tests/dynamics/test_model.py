@@ -86,9 +86,7 @@ def test_jacobians_at_a_point_against_finite_differences():
     params, x, u, h = Params(Lp=-3.0, Lda=20.0, drag=0.4), np.array([0.2, 1.5]), 0.3, 1e-6
 
     def f(x, u):
-        return np.array(
-            [x[1], params.Lp * x[1] - params.drag * abs(x[1]) * x[1] + params.Lda * u]
-        )
+        return np.array([x[1], params.Lp * x[1] - params.drag * abs(x[1]) * x[1] + params.Lda * u])
 
     A, B, C, D = jacobians(own, params, State(*x), Inputs(u))
     for k, e in enumerate(np.eye(2) * h):

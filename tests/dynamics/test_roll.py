@@ -118,9 +118,7 @@ def test_two_parameters_not_three(bench30):
     def field(logs):
         p = naming.replace(bench30, **dict(zip(("Ixx", "If", "a"), jnp.exp(logs), strict=True)))
         each = [
-            jnp.stack(
-                models.roll.vector_field(p, models.roll.State(*map(jnp.asarray, s)), inputs)
-            )
+            jnp.stack(models.roll.vector_field(p, models.roll.State(*map(jnp.asarray, s)), inputs))
             for s in states
         ]
         return jnp.concatenate(each)

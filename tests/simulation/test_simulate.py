@@ -1,6 +1,7 @@
 """simulate against scipy.signal, scipy.integrate and finite differences."""
 
 import functools
+import itertools
 
 import diffrax as dfx
 import jax
@@ -44,7 +45,7 @@ def switching(v, u, x0, delay, dt=DT):
     ends = np.unique(np.round([*(np.arange(n) * dt), *(np.arange(n) * dt + delay)], 12))
     ends = ends[(ends >= 0) & (ends <= (n - 1) * dt + 1e-9)]
     x, states = np.asarray(x0, float), {0.0: np.asarray(x0, float)}
-    for a, b in zip(ends[:-1], ends[1:], strict=True):
+    for a, b in itertools.pairwise(ends):
         k = int(np.floor((0.5 * (a + b) - delay) / dt))
         now = u[min(max(k, 0), n - 1)]
         x = scipy.integrate.solve_ivp(
@@ -130,25 +131,6 @@ def test_the_input_is_held_to_the_end_of_its_interval():
     close(table(run(BENCH, solver="tsit5", substeps=32)), recurrence(BENCH, U, X0), 1e-7)
 
 
-def test_adaptive_dopri8():
-    found = simulate(
-        STAND, Helicopter(**BENCH), models.roll.Inputs(U), dt=DT, initial_state=start(),
-        solver=dfx.Dopri8(), controller=dfx.PIDController(rtol=1e-10, atol=1e-13),
-        delay=jnp.asarray(0.013),
-    )  # fmt: skip
-    close(table(found), table(run(BENCH, delay=0.013)), 1e-8)
-    close(table(found), switching(BENCH, U, X0, 0.013), 1e-8)
-
-
-def test_adaptive_steps_that_run_out_are_a_result(bench30):
-    found = simulate(
-        STAND, bench30, models.roll.Inputs(U), dt=DT, initial_state=start(), max_steps=20,
-        controller=dfx.PIDController(rtol=1e-10, atol=1e-13),
-    )  # fmt: skip
-    assert bool(found.result == dfx.RESULTS.max_steps_reached)
-    assert not bool(found.finite)
-
-
 @pytest.mark.parametrize("samples", [0, 1, 3, -1, -2])
 @pytest.mark.parametrize("solver", ["exact", "rk4"])
 def test_whole_samples_of_delay_shift_the_input(solver, samples):
@@ -196,39 +178,43 @@ def test_derivative_by_delay(solver):
 NAMES = ("Ixx", "If", "a", "kappa", "L3", "Omega")
 
 
-@pytest.mark.parametrize("solver", ["exact", "rk4"])
-def test_forward_reverse_and_finite_differences_agree(solver):
+@pytest.fixture(scope="module")
+def slopes():
+    """(weights, logs, d cost / d logs by finite differences of SciPy's simulation)"""
     weights = np.random.default_rng(5).standard_normal(N)
-    go = compiled(solver, substeps=16) if solver == "rk4" else compiled(solver)
 
     def cost(logs):
-        p = Helicopter(**{**BENCH, **dict(zip(NAMES, jnp.exp(logs), strict=True))})
-        return jnp.sum(weights * go(p, jnp.asarray(U), start(), jnp.asarray(0.0)).states.phi)
-
-    def by_scipy(logs):
         v = {**BENCH, **dict(zip(NAMES, np.exp(logs), strict=True))}
         return np.sum(weights * recurrence(v, U, X0)[:, 0])
 
-    logs = np.log([BENCH[n] for n in NAMES])
-    forward = np.asarray(jax.jit(jax.jacfwd(cost))(jnp.asarray(logs)))
-    reverse = np.asarray(jax.jit(jax.grad(cost))(jnp.asarray(logs)))
-    h = 1e-5
-    wanted = [(by_scipy(logs + e) - by_scipy(logs - e)) / (2.0 * h) for e in np.eye(len(logs)) * h]
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-11 * np.abs(forward).max())
-    tight = 1e-6 if solver == "exact" else 1e-3
-    np.testing.assert_allclose(forward, wanted, rtol=tight, atol=tight * np.abs(wanted).max())
+    logs, h = np.log([BENCH[n] for n in NAMES]), 1e-5
+    wanted = [(cost(logs + e) - cost(logs - e)) / (2.0 * h) for e in np.eye(len(logs)) * h]
+    return weights, logs, np.array(wanted)
 
 
-def test_other_adjoints_give_the_same_derivative(bench30):
-    def cost(x_roll, adjoint):
-        inputs = models.roll.Inputs(x_roll * jnp.ones(10))
-        return jnp.sum(simulate(STAND, bench30, inputs, dt=DT, adjoint=adjoint).outputs.roll)
+def cost_of(weights, **how):
+    def cost(logs):
+        p = Helicopter(**{**BENCH, **dict(zip(NAMES, jnp.exp(logs), strict=True))})
+        roll = compiled(**how)(p, jnp.asarray(U), start(), jnp.asarray(0.0)).states.phi
+        return jnp.sum(weights * roll)
 
-    one = jnp.asarray(1e-6)
-    checkpointed = jax.jit(jax.grad(lambda x: cost(x, dfx.RecursiveCheckpointAdjoint())))(one)
-    forward = jax.jit(jax.jacfwd(lambda x: cost(x, dfx.ForwardMode())))(one)
-    wanted = recurrence(BENCH, np.ones(10), np.zeros(4))[:, 0].sum()
-    np.testing.assert_allclose([checkpointed, forward], wanted, rtol=1e-9)
+    return cost
+
+
+def test_forward_reverse_and_finite_differences_agree(slopes):
+    weights, logs, wanted = slopes
+    forward = np.asarray(jax.jit(jax.jacfwd(cost_of(weights)))(jnp.asarray(logs)))
+    reverse = np.asarray(jax.jit(jax.grad(cost_of(weights)))(jnp.asarray(logs)))
+    size = np.abs(wanted).max()
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-11 * size)
+    np.testing.assert_allclose(forward, wanted, rtol=1e-6, atol=1e-6 * size)
+
+
+def test_checkpointed_reverse_mode_through_rk4(slopes):
+    weights, logs, wanted = slopes
+    how = {"solver": "rk4", "substeps": 16, "adjoint": dfx.RecursiveCheckpointAdjoint()}
+    reverse = np.asarray(jax.jit(jax.grad(cost_of(weights, **how)))(jnp.asarray(logs)))
+    np.testing.assert_allclose(reverse, wanted, rtol=1e-3, atol=1e-3 * np.abs(wanted).max())
 
 
 @pytest.fixture(scope="module")
@@ -261,22 +247,25 @@ def test_many_equal_one_by_one_and_the_broken_break_alone(fleet, solver, substep
             close(np.asarray(many.states.phi[k]), recurrence(v, np.asarray(u), X0)[:, 0], 1e-9)
 
 
-def test_adaptive_batch_with_a_broken_machine(fleet):
+def test_adaptive_dopri8_in_a_batch_with_a_broken_machine(fleet):
     machines, batch = fleet
     batch = jax.tree.map(lambda x: x[:3] if jnp.ndim(x) else x, batch)
     axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, batch)
+    u, delay = U[:12], 0.013
 
     def go(p):
         return simulate(
-            STAND, p, models.roll.Inputs(U[:10]), dt=DT, initial_state=start(), max_steps=1000,
-            controller=dfx.PIDController(rtol=1e-9, atol=1e-12),
+            STAND, p, models.roll.Inputs(u), dt=DT, initial_state=start(), max_steps=2000,
+            solver=dfx.Dopri8(), controller=dfx.PIDController(rtol=1e-10, atol=1e-13),
+            delay=jnp.asarray(delay),
         )  # fmt: skip
 
     many = jax.jit(jax.vmap(go, in_axes=(axes,)))(batch)
     np.testing.assert_array_equal(many.finite, [True, False, True])
+    np.testing.assert_array_equal(many.result == dfx.RESULTS.successful, [True, False, True])
     for k in (0, 2):
         found = np.stack([np.asarray(x[k]) for x in many.states], axis=1)
-        close(found, recurrence(machines[k], U[:10], X0), 1e-7)
+        close(found, switching(machines[k], u, X0, delay), 1e-8)
 
 
 @pytest.mark.parametrize("solver", ["exact", "rk4"])
@@ -307,23 +296,23 @@ def test_accumulate_sees_every_sample_once_and_in_order(bench30):
     assert float(total) == 123456.0
 
 
-def test_accumulate_has_a_gradient(bench30):
+def test_accumulate_has_a_derivative(bench30):
     def cost(Ixx):
         p = naming.replace(bench30, Ixx=Ixx)
         inputs = models.roll.Inputs(U[:20])
         return accumulate(
-            STAND, p, inputs, lambda s, y, d: s + y.roll**2, jnp.asarray(0.0), dt=DT
-        )[0]
+            STAND, p, inputs, lambda s, y, d: s + y.roll**2, jnp.asarray(0.0), dt=DT,
+            adjoint=dfx.ForwardMode(),
+        )[0]  # fmt: skip
 
     def by_scipy(Ixx):
         return np.sum(recurrence({**BENCH, "Ixx": Ixx}, U[:20], np.zeros(4))[:, 0] ** 2)
 
     wanted = (by_scipy(0.024 + 1e-7) - by_scipy(0.024 - 1e-7)) / 2e-7
-    assert float(jax.jit(jax.grad(cost))(jnp.asarray(0.024))) == pytest.approx(wanted, rel=1e-6)
+    assert float(jax.jit(jax.jacfwd(cost))(jnp.asarray(0.024))) == pytest.approx(wanted, rel=1e-6)
 
 
-@pytest.mark.parametrize("double", [True, False], ids=["beside float64", "float32 alone"])
-@pytest.mark.parametrize("solver", ["exact", "rk4"])
+@pytest.mark.parametrize(("solver", "double"), [("exact", True), ("rk4", True), ("rk4", False)])
 def test_single_precision_stays_single_and_close(vehicles_folder, solver, double):
     with jax.enable_x64(double):
         p = load_vehicle(vehicles_folder / "bench-30.yaml")
@@ -336,24 +325,16 @@ def test_single_precision_stays_single_and_close(vehicles_folder, solver, double
     close(found.states.phi, wanted[:, 0], 1e-3)
 
 
-def test_flight_and_arrays_are_the_same(bench30):
-    flight = Flight(dt=DT, inputs={"x_roll": U, "x_yaw": U}, outputs={"roll": U})
-    one = simulate(STAND, bench30, flight)
-    two = simulate(STAND, bench30, models.roll.Inputs(U), dt=DT)
-    np.testing.assert_array_equal(one.outputs.roll, two.outputs.roll)
-
-
-def test_linear_in_input_and_state(bench30):
+def test_linear_in_input_and_state():
     one = table(run(BENCH))
     np.testing.assert_allclose(
         table(run(BENCH, 2 * U, 2 * X0)), 2 * one, rtol=1e-9, atol=1e-12 * np.abs(one).max()
     )
 
 
-def test_energy_of_the_stand_without_flybar(bench30):
+def test_energy_of_the_stand_without_flybar():
     # No lift: a pendulum and a free oscillator. phi' ^2 + kappa phi^2 and its flybar twin stay.
-    p = naming.replace(bench30, a=jnp.asarray(0.0), zeta=jnp.asarray(0.0))
-    s = simulate(STAND, p, models.roll.Inputs(U), dt=DT, initial_state=start()).states
+    s = run({**BENCH, "a": 0.0, "zeta": 0.0}).states
     np.testing.assert_allclose(s.dphi**2 + 4.0 * s.phi**2, 0.04 + 4.0 * 0.05**2, rtol=1e-10)
     np.testing.assert_allclose(
         s.dbeta_roll**2 + 150.0**2 * s.beta_roll**2, 1.0 + 150.0**2 * 1e-4, rtol=1e-9

@@ -1,0 +1,38 @@
+"""Small fits of a short bench record, made once for all of the report's tests."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from heli_jax import Free, Problem, fit, models
+from heli_jax.flights.flight import Source
+from heli_jax.identification.baseline import baseline
+from tests.identification.bench import BENCH, record, vehicle
+
+IXX, IF = Free(0.05, 0.001, 1.0), Free(5e-4, 1e-6, 1e-2)
+SCRIPT = "<script>alert(1)</script>"
+
+
+def _made(free, **how):
+    source = Source("/logs/<b>bench</b>.csv", "ab" * 32, ("stick: <i>mm</i> to m",))
+    flight = record(BENCH, seed=1, n=400, dt=0.05, source=source, **how)
+    problem = Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
+    with jax.numpy_rank_promotion("allow"):  # the report is tested here, not the fit
+        found = fit(problem)
+    [row] = found.starts
+    other = row._replace(cost=40.0 * row.cost, converged=False, optimum=0)
+    found = dataclasses.replace(found, starts=(row, other))
+    return found, problem, baseline(problem.model, problem.vehicle, flight)
+
+
+@pytest.fixture(scope="session")
+def sound():
+    """Fit, problem and baseline where the data determine both parameters."""
+    return _made({"Ixx": IXX, "If": IF}, name=SCRIPT)
+
+
+@pytest.fixture(scope="session")
+def lost():
+    """The same where the data determine two ratios of three parameters."""
+    return _made({"Ixx": IXX, "If": IF, "a": Free(5.0, 1.0, 20.0)})

@@ -1,0 +1,180 @@
+"""Figures: nothing empty, no peak lost, bands where they belong, curves on one phase branch."""
+
+import matplotlib
+import matplotlib.image
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from heli_jax import models
+from heli_jax.analysis.lti import c2d
+from heli_jax.dynamics.roll import roll_transfer_function
+from heli_jax.identification.fit import Signals, StartRow
+from heli_jax.identification.metrics import lags_for
+from heli_jax.report import figures, frequency, style
+
+
+def noise_signals(n=900, inputs=("x_roll",), seed=0):
+    rng = np.random.default_rng(seed)
+    u = {name: np.repeat(rng.standard_normal(n // 10 + 1), 10)[:n] for name in inputs}
+    y = rng.standard_normal(n)
+    return Signals("one", False, 0.02 * np.arange(n), u, {"roll": y}, {"roll": np.zeros(n)})
+
+
+@given(
+    st.integers(1, 5000),
+    st.integers(4, 400),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["normal", "steps", "constant"]),
+)
+def test_thinning_keeps_extremes_ends_and_order(n, most, seed, kind):
+    rng = np.random.default_rng(seed)
+    y = {
+        "normal": rng.standard_normal(n),
+        "steps": np.round(rng.standard_normal(n)),
+        "constant": np.ones(n),
+    }[kind]
+    x = np.arange(n, dtype=float)
+    tx, ty = style.thinned(x, y, most)
+    assert tx.size == ty.size <= max(most, 4)
+    assert ty.max() == y.max()
+    assert ty.min() == y.min()
+    assert (tx[0], tx[-1]) == (x[0], x[-1])
+    assert np.all(np.diff(tx) > 0)
+    assert np.array_equal(ty, y[tx.astype(int)])
+
+
+@pytest.mark.parametrize("n", [40, 900, 6000])
+def test_residual_bands_and_lags(n):
+    axes = figures.residual_correlation(noise_signals(n), "roll")
+    band, lags = 2.5758 / np.sqrt(n), lags_for(n)
+    for ax in axes:
+        [patch] = ax.patches
+        low, high = patch.get_extents().transformed(ax.transData.inverted()).intervaly
+        assert high == pytest.approx(band, rel=1e-3)
+        assert low == pytest.approx(-band, rel=1e-3)
+    drawn = [np.asarray(c.get_xdata()) for c in axes[0].get_lines()[:2]]
+    assert sorted(set(np.concatenate(drawn))) == pytest.approx(0.02 * np.arange(1, lags + 1))
+    assert axes[1].get_xlim() == pytest.approx((-0.02 * (lags + 0.5), 0.02 * (lags + 0.5)))
+
+
+def test_residual_that_follows_the_input_stands_out_at_its_lag():
+    s = noise_signals()
+    late = np.roll(s.inputs["x_roll"], 7)
+    s = s._replace(measured={"roll": s.measured["roll"] + 5.0 * late})
+    ax = figures.residual_correlation(s, "roll")[1]
+    outside = ax.get_lines()[1]
+    peak = np.nanargmax(np.asarray(outside.get_ydata()))
+    assert outside.get_xdata()[peak] == pytest.approx(7 * 0.02)
+
+
+def test_every_figure_has_something_in_it(sound, tmp_path):
+    fit, problem, baseline = sound
+    s = fit.signals[0]
+    drawn = {
+        "response": figures.response(s, "roll", problem.model),
+        "residual": figures.residual_correlation(s, "roll"),
+        "bode": figures.bode(problem.model, fit.params, fit, baseline, s),
+        "matrix": figures.correlation_matrix(fit.verdict),
+        "starts": figures.waterfall(fit.starts),
+        "rls": figures.rls_history(baseline),
+    }
+    for name, axes in drawn.items():
+        saved = style.save(lambda axes=axes: axes[0].figure, tmp_path / name)
+        assert saved is not None
+        title, svg = saved
+        assert title
+        assert svg.count(b"<path") > 10
+        assert len(svg) < 400_000
+        pixels = matplotlib.image.imread(tmp_path / f"{name}.png")[..., :3]
+        for ax in axes:
+            assert ax.has_data(), name
+        assert pixels.std() > 0.02
+
+
+def test_labels_carry_units(sound):
+    fit, problem, _ = sound
+    top, below, stick = figures.response(fit.signals[0], "roll", problem.model)
+    assert top.get_ylabel() == "roll [rad]"
+    assert below.get_ylabel() == "residual [rad]"
+    assert stick.get_ylabel() == "x_roll [m]"
+    assert stick.get_xlabel() == "time [s]"
+
+
+def test_one_start_is_no_waterfall():
+    assert figures.waterfall((StartRow({"a": 1.0}, {"a": 2.0}, 1.0, 3, True, 1),)) == ()
+
+
+def test_waterfall_marks_failures_and_spans_decades():
+    rows = tuple(
+        StartRow({}, {}, cost, 1, ok, k)
+        for cost, ok, k in [(1e3, False, 0), (1.0, True, 1), (np.inf, False, 0), (9.0, True, 2)]
+    )
+    [ax] = figures.waterfall(rows)
+    assert ax.get_yscale() == "log"
+    joined, converged, failed = (np.asarray(c.get_ydata()) for c in ax.get_lines())
+    assert joined.tolist() == [1.0, 9.0, 1e3]
+    assert converged.tolist() == [1.0, 9.0]
+    assert failed[0] == 1e3
+    assert np.isfinite(failed).all()
+    assert {t.get_text() for t in ax.texts} >= {"optimum 1", "optimum 2"}
+
+
+def test_sampled_response_is_that_of_c2d(sound):
+    _, problem, _ = sound
+    p, dt = problem.vehicle, 0.05
+    omega = np.geomspace(0.1, 0.99 * np.pi / dt, 50)
+    tf = roll_transfer_function(p, stand=True)
+    continuous, sampled = frequency.responses(problem.model, p, "roll", "x_roll", dt)
+    num, den = (np.array([float(v) for v in c]) for c in tf)
+    s, z = 1j * omega, np.exp(1j * omega * dt)
+    assert continuous(omega) == pytest.approx(np.polyval(num, s) / np.polyval(den, s), rel=1e-8)
+    num, den = c2d(num, den, dt)
+    assert sampled(omega) == pytest.approx(np.polyval(num, z) / np.polyval(den, z), rel=1e-6)
+
+
+def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
+    from tests.identification.bench import BENCH, record
+
+    flight = record(BENCH, seed=3, n=6000, noise=1e-5)
+    found = frequency.empirical(flight.inputs["x_roll"], flight.outputs["roll"], 0.02, 4.0)
+    assert isinstance(found, frequency.Empirical)
+    assert found.segments >= frequency.SEGMENTS
+    clear = (found.coherence > 0.9) & (found.omega > 2.0) & (found.omega < 10.0)
+    _, sampled = frequency.responses(models.roll_on_stand, bench30, "roll", "x_roll", 0.02)
+    ratio = found.H[clear] / sampled(found.omega[clear])
+    assert clear.sum() > 5
+    assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.1)
+    assert np.median(np.degrees(np.angle(ratio))) == pytest.approx(0.0, abs=8.0)
+
+
+def test_empirical_response_says_why_it_is_missing():
+    still = frequency.empirical(np.zeros(4000), np.ones(4000), 0.02, 1.0)
+    short = frequency.empirical(np.arange(100.0), np.ones(100), 0.02, 1.0)
+    assert still == "the input does not move"
+    assert isinstance(short, str)
+    assert "segments" in short
+
+
+def test_bode_says_why_the_record_is_missing(sound):
+    fit, problem, baseline = sound
+    s = fit.signals[0]
+    s = s._replace(inputs={"x_roll": np.zeros_like(s.times)})
+    axes = figures.bode(problem.model, fit.params, fit, baseline, s)
+    assert len(axes) == 2
+    said = " ".join(t.get_text() for t in axes[0].texts)
+    assert "no empirical response: the input does not move" in said
+
+
+def test_phase_begins_on_one_branch():
+    turns = np.exp(1j * np.radians(np.linspace(-180.0, -900.0, 200)))
+    assert frequency.phase(turns)[0] == pytest.approx(-180.0)
+    assert frequency.phase(turns)[-1] == pytest.approx(-900.0)
+    assert frequency.phase(-turns)[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_style_does_not_leak():
+    before = dict(matplotlib.rcParams)
+    style.save(lambda: None, None)  # type: ignore[arg-type]
+    assert dict(matplotlib.rcParams) == before

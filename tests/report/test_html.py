@@ -1,0 +1,164 @@
+"""The page: in one file, escaped, verdict first, and no number that the data do not bear."""
+
+import dataclasses
+import html
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from heli_jax.identification.metrics import Whiteness
+from heli_jax.report import numbers, tables
+from heli_jax.report.html import write_report
+from heli_jax.vehicle import Constant
+from tests.report.conftest import SCRIPT
+
+CONSTANTS = {"Ixx": Constant(0.024, "kg m^2", "measured & <u>swung</u>")}
+
+
+class Links(HTMLParser):
+    """Everything a browser would load, and every tag."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.tags = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.found += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "action")]
+
+
+def page(made, folder, **changes):
+    fit, problem, baseline = made
+    fit = dataclasses.replace(fit, **changes)
+    names = write_report(folder, fit, problem, baseline, f"bench {SCRIPT}", CONSTANTS)
+    return (folder / "report.html").read_text(encoding="utf-8"), names
+
+
+def words(text):
+    text = re.sub(r"<style>.*?</style>", "", text, flags=re.S)
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]+>", " ", text)))
+
+
+@pytest.fixture(scope="module")
+def sound_page(sound, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sound")
+    return *page(sound, folder), folder
+
+
+@pytest.fixture(scope="module")
+def lost_page(lost, tmp_path_factory):
+    return page(lost, tmp_path_factory.mktemp("lost"))[0]
+
+
+def test_page_holds_everything_itself(sound_page):
+    text, names, folder = sound_page
+    links = Links(text)
+    assert "http" not in text
+    assert "@import" not in text
+    assert "url(" not in text
+    assert all(v.startswith(("data:image/svg+xml;base64,", "#")) for v in links.found)
+    assert links.tags.count("img") == len(names) == 6
+    anchors = {v[1:] for v in links.found if v.startswith("#")}
+    assert anchors <= set(re.findall(r'id="([^"]+)"', text))
+    for name in names:
+        assert (folder / "figures" / f"{name}.svg").stat().st_size > 2000
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 2000
+    assert len(text) < 1_500_000
+
+
+def test_text_from_logs_and_configurations_is_escaped(sound_page):
+    text, names, _ = sound_page
+    tags = Links(text).tags
+    assert not {"script", "b", "i", "u"} & set(tags)
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert "&lt;b&gt;bench&lt;/b&gt;" in text
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", n) for n in names)
+
+
+def test_verdict_comes_first(sound_page):
+    text = words(sound_page[0])
+    verdict = text.index("converged: the data determine Ixx and If")
+    assert verdict < text.index("Estimates")
+    assert text.count("Estimates") >= 1
+
+
+def test_paper_s_factor_is_told(sound_page):
+    assert "cyclic_moment" in words(sound_page[0])
+
+
+def test_undetermined_parameters_have_no_numbers(lost, lost_page):
+    fit = lost[0]
+    assert "✗ not identifiable: the data do not determine Ixx, If and a" in words(lost_page)
+    for row in tables.parameters(fit).rows:
+        assert row[1] == "not determined"
+        assert row[2:5] == ("–",) * 3
+    for name, e in fit.estimates.items():
+        for text in (numbers.number(e.value, k) for k in (4, 5, 6)):
+            assert text not in words(lost_page), name
+    assert "a/Ixx" in words(lost_page)
+
+
+def test_combinations_stand_beside_the_baseline(lost, sound):
+    for fit, _, baseline in (lost, sound):
+        rows = {row[0]: row for row in tables.baseline_ratios(fit, baseline).rows}
+        assert set(rows) == {"a/Ixx", "a/If"}
+        for row in rows.values():
+            assert "±" in row[2]
+    fit, _, baseline = sound
+    mean, sd = rows["a/Ixx"][2].split(" ± ")
+    e = fit.estimates["Ixx"]
+    assert float(mean) == pytest.approx(5.1 / e.value, rel=1e-2)
+    assert float(sd) / float(mean) == pytest.approx(e.sd / e.value, rel=0.1)
+
+
+def test_coloured_residuals_are_announced_before_the_numbers(sound, tmp_path):
+    name = next(iter(sound[0].whiteness))
+    coloured = {name: Whiteness(False, 1e-9, 100, 0.4, 0.9)}
+    text = words(page(sound, tmp_path, whiteness=coloured)[0])
+    assert "! converged: the data determine Ixx and If, but the intervals are too narrow" in text
+    assert text.index("The residuals are not white") < text.index("95 % interval (too narrow)")
+
+
+def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
+    fit, problem, _ = sound
+    fit = dataclasses.replace(fit, status="not-converged", starts=fit.starts[:1])
+    names = write_report(tmp_path, fit, problem, None, "bench", {})
+    assert "rls" not in names
+    assert "starts" not in names
+    text = words((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "✗ not converged:" in text
+    assert "One start" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "text"),
+    [
+        (0.024, 2.1e-5, "0.024000 ± 0.000021"),
+        (0.024, 0.0019, "0.0240 ± 0.0019"),
+        (1.7e-4, 1.234e-7, "1.7000·10⁻⁴ ± 0.0012·10⁻⁴"),
+        (-0.0461, 0.0058, "−0.0461 ± 0.0058"),
+        (0.0001, 0.5, "0.00 ± 0.50"),
+        (28480.0, 284.0, "28480 ± 280"),
+        (212.61, 0.36, "212.61 ± 0.36"),
+    ],
+)
+def test_digits_follow_the_standard_deviation(value, sd, text):
+    assert numbers.with_sd(value, sd) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (float("nan"), "–"),
+        (np.inf, "∞"),
+        (0.0, "0"),
+        (-2.5e-12, "−2.5·10⁻¹²"),
+        (12345.6, "12346"),
+    ],
+)
+def test_numbers(value, text):
+    assert numbers.number(value, 4) == text
