@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.errors import InputError
+from heli_jax.flights import write as tables
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.identifiability import Verdict
@@ -147,21 +148,13 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
     Raises:
         InputError: the place cannot be written to.
     """
-    import pyarrow as pa
-    import pyarrow.csv
-    import pyarrow.parquet
-
-    table = pa.table({name: pa.array(values) for name, values in columns.items()})
     if out is None:
-        pyarrow.csv.write_csv(table, pa.PythonFile(sys.stdout.buffer, mode="w"))
+        tables.write_table(sys.stdout.buffer, columns)
         return
-    temporary = out.with_name(f".{out.name}.part")
+    temporary = out.with_name(f".{out.stem}.part{out.suffix}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        if out.suffix.lower() == ".csv":
-            pyarrow.csv.write_csv(table, temporary)
-        else:
-            pyarrow.parquet.write_table(table, temporary)
+        tables.write_table(temporary, columns)
         temporary.replace(out)
     except OSError as e:
         raise InputError(f"--out {out}: cannot be written ({e.strerror or e})") from e

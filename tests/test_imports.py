@@ -1,6 +1,7 @@
 """Who may import whom: read from the source, so that nothing has to run."""
 
 import ast
+import functools
 import importlib
 import json
 import subprocess
@@ -40,8 +41,13 @@ def part(path):
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
+@functools.cache
 def imported(path):
     """(module, line) of every import in a file, those inside functions too."""
+    return tuple(_imported(path))
+
+
+def _imported(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)

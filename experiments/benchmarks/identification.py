@@ -64,14 +64,16 @@ def bench_record() -> Flight:
     rng = np.random.default_rng(0)
     u = 3e-6 * np.repeat(rng.uniform(-1, 1, N // 25), 25)
     num, den = roll_transfer_function(VEHICLE, stand=True)
-    b, a, _ = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+    discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+    b, a = discrete[:2]
     y = scipy.signal.lfilter(np.ravel(b), a, u) + 2e-3 * rng.standard_normal(N)
     return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
 
 
 def ratios(ours: Callable[[], Any], theirs: Callable[[], Any], runs: int = 9) -> tuple[float, ...]:
     """Median times of both [s] and the median ratio ours/theirs, taken in turn."""
-    ours(), theirs()
+    ours()
+    theirs()
     times = []
     for _ in range(runs):
         pair = []
@@ -91,8 +93,9 @@ def fit_against_scipy(flight: Flight) -> tuple[float, ...]:
     u, y = flight.inputs["x_roll"], flight.outputs["roll"]
 
     def residual(z: np.ndarray) -> np.ndarray:
-        v = base | dict(zip(("Ixx", "If", "a"), np.exp(z), strict=True))
-        b, a, _ = scipy.signal.cont2discrete(closed_form(v), DT)
+        v: Any = base | dict(zip(("Ixx", "If", "a"), np.exp(z), strict=True))
+        discrete: Any = scipy.signal.cont2discrete(closed_form(v), DT)
+        b, a = discrete[:2]
         r = (y - scipy.signal.lfilter(np.ravel(b), a, u)) / 2e-3
         return np.append(r, (v["a"] - 5.5) / 0.5)
 
@@ -103,7 +106,9 @@ def fit_against_scipy(flight: Flight) -> tuple[float, ...]:
     assert np.allclose(ours, np.exp(theirs.x), rtol=1e-3), (ours, np.exp(theirs.x))
     return ratios(
         lambda: fit(problem),
-        lambda: scipy.optimize.least_squares(residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10),
+        lambda: scipy.optimize.least_squares(
+            residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10
+        ),
     )
 
 

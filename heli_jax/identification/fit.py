@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
+import scipy.special
 from jaxtyping import Array
 
 from heli_jax import naming
@@ -190,7 +190,7 @@ def _assemble(
     if usable and not verdict.identifiable:
         status = "not-identifiable"
     n = sum(y.size for f in problem.training for y in f.outputs.values())
-    quantile = float(scipy.stats.t.ppf(0.975, max(n - layout.size, 1)))
+    quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
     named = estimates_of(problem, layout, e, verdict, quantile)
     signals = _signals(e.raw, problem.training)
     held = tuple(f for f in problem.flights if f.hold_out)

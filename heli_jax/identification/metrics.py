@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 
 class Metrics(NamedTuple):
@@ -84,7 +84,7 @@ def whiteness(residual: np.ndarray) -> Whiteness:
     q_short = n * (n + 2) * np.sum(r[:short] ** 2 / (n - np.arange(1, short + 1)))
     p = min(
         1.0,
-        2.0 * min(scipy.stats.chi2.sf(statistic, lags), scipy.stats.chi2.sf(q_short, short)),
+        2.0 * min(scipy.special.chdtrc(lags, statistic), scipy.special.chdtrc(short, q_short)),
     )
     outside = float(np.mean(np.abs(r) > 2.5758 / np.sqrt(n)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0]))

@@ -9,12 +9,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from heli_jax.identification.residual import (
-    Data,
-    Layout,
-    residuals,
-    residuals_and_jacobian,
-)
+from heli_jax.identification.residual import Data, Layout, evaluate
 
 
 class Optimum(NamedTuple):
@@ -107,12 +102,12 @@ def optimise(
     # pass that gives the residuals, and multiplied as a matrix.
     @jax.custom_jvp
     def scaled(xi: Array) -> Array:
-        return residuals(layout, data, sd, z0 + units.unit * xi) / units.level
+        return evaluate(layout, data, sd, z0 + units.unit * xi).r / units.level
 
     @scaled.defjvp
     def scaled_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        r, J = residuals_and_jacobian(layout, data, sd, z0 + units.unit * primals[0])
-        return r / units.level, J @ (tangents[0] * units.unit / units.level)
+        e = evaluate(layout, data, sd, z0 + units.unit * primals[0])
+        return e.r / units.level, e.J @ (tangents[0] * units.unit / units.level)
 
     def fn(xi: Array, _: Any) -> Array:
         return scaled(xi)

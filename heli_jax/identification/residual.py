@@ -292,31 +292,9 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     return z[len(layout.named) :]
 
 
-@eqx.filter_jit  # within a larger trace this is traced once, however often it is called
-def residuals(
-    layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
-) -> Float[Array, " n"]:
-    """Whitened residuals of all flights and outputs, then the prior rows."""
-    return _whitened(layout, data, sd, z, raw_residuals(layout, data, z))
-
-
 def _whitened(layout: Layout, data: Data, sd: Any, z: Array, raw: Any) -> Array:
     rows = [r / s[n] for by_name, s in zip(raw, sd, strict=True) for n, r in by_name.items()]
     return jnp.concatenate([*rows, prior_rows(layout, data, z), weak_rows(layout, z)])
-
-
-@eqx.filter_jit
-def residuals_and_jacobian(
-    layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
-) -> tuple[Float[Array, " n"], Float[Array, "n q"]]:
-    """Residuals and their derivative by z, in forward mode, in one pass."""
-
-    def both(z: Array) -> tuple[Array, Array]:
-        r = residuals(layout, data, sd, z)
-        return r, r
-
-    J, r = jax.jacfwd(both, has_aux=True)(z)
-    return r, J
 
 
 class Evaluation(NamedTuple):
@@ -338,7 +316,11 @@ class Evaluation(NamedTuple):
 def evaluate(
     layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
 ) -> Evaluation:
-    """Residuals, their Jacobian in forward mode, and the named unknowns, in one pass."""
+    """Residuals, their Jacobian in forward mode, and the named unknowns, in one pass.
+
+    The residual: measured - bias - simulated over sd for all flights and outputs, then the
+    priors' rows (value - mean) / sd, then the weak priors' rows.
+    """
 
     def rows(z: Array) -> tuple[Array, Any]:
         raw = raw_residuals(layout, data, z)

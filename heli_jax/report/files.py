@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.flights import Flight
+from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.identifiability import Verdict
@@ -171,10 +172,6 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
 
     A flight without some signal has empty cells there.
     """
-    import pyarrow as pa
-    import pyarrow.csv
-
-    columns: dict[str, list[Any]] = {}
     names = ["flight", "time"]
     for s in signals:
         names += [n for n in s.inputs if n not in names]
@@ -184,16 +181,12 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
             for what in ("measured", "simulated", "residual")
             if f"{n}_{what}" not in names
         ]
+    parts = []
     for s in signals:
-        n = s.times.size
-        here: dict[str, Any] = {"flight": [s.flight] * n, "time": s.times, **s.inputs}
+        here: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
         for output, measured in s.measured.items():
             here[f"{output}_measured"] = measured
             here[f"{output}_simulated"] = s.simulated[output]
             here[f"{output}_residual"] = s.residual(output)
-        for name in names:
-            columns.setdefault(name, []).append(
-                pa.array(here[name]) if name in here else pa.nulls(n, pa.float64())
-            )
-    table = pa.table({name: pa.chunked_array(parts) for name, parts in columns.items()})
-    pyarrow.csv.write_csv(table, path)
+        parts.append(here)
+    write_table(path, stacked(parts, names))

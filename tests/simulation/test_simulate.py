@@ -118,11 +118,10 @@ def test_exact_against_integration_interval_by_interval():
 
 def test_rk4_converges_with_order_four():
     exact = recurrence(BENCH, U, X0)
-    errors = [
-        np.abs(table(run(BENCH, solver="rk4", substeps=s)) - exact)[:, 0].max() for s in (8, 16, 32)
-    ]
-    orders = np.log2(np.divide(errors[:-1], errors[1:]))
-    np.testing.assert_allclose(orders, 4.0, atol=0.3)
+    coarse, fine = (
+        np.abs(table(run(BENCH, solver="rk4", substeps=s)) - exact)[:, 0].max() for s in (16, 32)
+    )
+    assert np.log2(coarse / fine) == pytest.approx(4.0, abs=0.2)
 
 
 def test_the_input_is_held_to_the_end_of_its_interval():
@@ -135,8 +134,9 @@ def test_the_input_is_held_to_the_end_of_its_interval():
 @pytest.mark.parametrize("solver", ["exact", "rk4"])
 def test_whole_samples_of_delay_shift_the_input(solver, samples):
     shifted = U[np.clip(np.arange(N) - samples, 0, N - 1)]
-    found = run(BENCH, delay=samples * DT, solver=solver)
-    close(table(found), table(run(BENCH, shifted, solver=solver)), 1e-9)
+    how = {"solver": solver, "substeps": 4 if solver == "exact" else 16}
+    found = run(BENCH, delay=samples * DT, **how)
+    close(table(found), table(run(BENCH, shifted, **how)), 1e-9)
 
 
 @pytest.mark.parametrize("delay", [0.004, 0.0199, 0.033, -0.007, -0.05])
@@ -161,13 +161,15 @@ def test_outputs_feel_the_input_that_acts():
 
 @pytest.mark.parametrize("solver", ["exact", "rk4"])
 def test_derivative_by_delay(solver):
-    go = compiled(solver, True, adjoint=dfx.ForwardMode())
+    steps = 4 if solver == "exact" else 16
+    go = compiled(solver, True, steps)
+    forward = compiled(solver, True, steps, dfx.ForwardMode())
     p, u, x0 = Helicopter(**BENCH), jnp.asarray(U), start()
 
     def roll(delay):
         return go(p, u, x0, delay).outputs.roll
 
-    slope = jax.jit(jax.jacfwd(roll))
+    slope = jax.jit(jax.jacfwd(lambda delay: forward(p, u, x0, delay).outputs.roll))
     # On a whole sample RK4's steps change their lengths: its truncation error has a kink there.
     for delay in (0.0, 0.013, -0.028) if solver == "exact" else (0.013, -0.028):
         h = 1e-6
@@ -201,6 +203,7 @@ def cost_of(weights, **how):
     return cost
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_finite_differences_agree(slopes):
     weights, logs, wanted = slopes
     forward = np.asarray(jax.jit(jax.jacfwd(cost_of(weights)))(jnp.asarray(logs)))
@@ -210,6 +213,7 @@ def test_forward_reverse_and_finite_differences_agree(slopes):
     np.testing.assert_allclose(forward, wanted, rtol=1e-6, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_checkpointed_reverse_mode_through_rk4(slopes):
     weights, logs, wanted = slopes
     how = {"solver": "rk4", "substeps": 16, "adjoint": dfx.RecursiveCheckpointAdjoint()}
@@ -247,6 +251,7 @@ def test_many_equal_one_by_one_and_the_broken_break_alone(fleet, solver, substep
             close(np.asarray(many.states.phi[k]), recurrence(v, np.asarray(u), X0)[:, 0], 1e-9)
 
 
+@pytest.mark.slow
 def test_adaptive_dopri8_in_a_batch_with_a_broken_machine(fleet):
     machines, batch = fleet
     batch = jax.tree.map(lambda x: x[:3] if jnp.ndim(x) else x, batch)
@@ -279,8 +284,9 @@ def test_accumulate_is_the_sum_over_simulate(bench30, solver):
     total, result = accumulate(
         STAND, bench30, inputs, square, jnp.asarray(0.0), data=jnp.asarray(measured), dt=DT,
         initial_state=start(), solver=solver,
+        substeps=16,
     )  # fmt: skip
-    roll = np.asarray(run(BENCH, solver=solver).outputs.roll)
+    roll = np.asarray(run(BENCH, solver=solver, substeps=16 if solver == "rk4" else 4).outputs.roll)
     assert float(total) == pytest.approx(np.sum((roll - measured) ** 2), rel=1e-12)
     assert bool(result == dfx.RESULTS.successful)
 
@@ -312,7 +318,7 @@ def test_accumulate_has_a_derivative(bench30):
     assert float(jax.jit(jax.jacfwd(cost))(jnp.asarray(0.024))) == pytest.approx(wanted, rel=1e-6)
 
 
-@pytest.mark.parametrize(("solver", "double"), [("exact", True), ("rk4", True), ("rk4", False)])
+@pytest.mark.parametrize(("solver", "double"), [("exact", True), ("rk4", False)])
 def test_single_precision_stays_single_and_close(vehicles_folder, solver, double):
     with jax.enable_x64(double):
         p = load_vehicle(vehicles_folder / "bench-30.yaml")

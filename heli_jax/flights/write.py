@@ -1,0 +1,43 @@
+"""Tables as log files: the formats that `read_flight` reads."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+
+def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
+    """Write columns of equal length as CSV, or as Parquet where the name ends so.
+
+    A column is an array (N,) or a list of text; None in a list is an empty cell.
+
+    Raises:
+        OSError: the place cannot be written to.
+    """
+    import pyarrow as pa
+
+    table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    if isinstance(target, Path) and target.suffix.lower() == ".parquet":
+        import pyarrow.parquet
+
+        pyarrow.parquet.write_table(table, target)
+        return
+    import pyarrow.csv
+
+    pyarrow.csv.write_csv(table, target if isinstance(target, Path) else pa.PythonFile(target))
+
+
+def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
+    """Tables one below the other; a column that a part lacks is empty there."""
+    out: dict[str, Any] = {}
+    for name in names:
+        if all(name in part for part in parts):
+            out[name] = np.concatenate([np.asarray(part[name]) for part in parts])
+            continue
+        cells: list[Any] = []
+        for part in parts:
+            n = len(next(iter(part.values())))
+            cells += list(part[name]) if name in part else [None] * n
+        out[name] = cells
+    return out
