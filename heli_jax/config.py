@@ -80,7 +80,7 @@ class FitConfig(_Strict):
     nuisance: NuisanceConfig = NuisanceConfig()
     starts: Annotated[int, Field(ge=1, le=10_000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
-    max_steps: Annotated[int, Field(ge=1)] = 100
+    max_steps: Annotated[int, Field(ge=1)] = 200
 
 
 class RLSConfig(_Strict):

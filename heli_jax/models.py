@@ -35,7 +35,7 @@ def by_name(name: str, where: str = "model", folder: str | Path | None = None) -
         sys.path.insert(0, str(folder))
     try:
         module = importlib.import_module(module_name)
-    except ImportError as e:
+    except (ImportError, SyntaxError) as e:
         raise InputError(f"{where}: cannot import {module_name!r} for {name!r} ({e})") from e
     model = getattr(module, attribute, None)
     if not isinstance(model, Model):

@@ -93,7 +93,15 @@ def _load(text: str, where: str) -> Any:
         line = f", line {mark.line + 1}" if mark else ""
         problem = " ".join(str(e.problem or e.context or "broken").split())
         raise InputError(f"{where}{line}: {problem}; wanted is plain YAML") from e
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as e:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        LookupError,
+        AttributeError,
+        TypeError,
+        RecursionError,
+        OverflowError,
+    ) as e:
         if isinstance(e, InputError):
             raise
         text = " ".join(str(e).split())[:120]

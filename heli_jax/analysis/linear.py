@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
+from heli_jax.analysis.lti import siso_polynomials
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import Model
 
@@ -43,17 +44,17 @@ def transfer_function(
     """Numerator and denominator in s, highest power first, from the linearisation about zero.
 
     The denominator has n + 1 numbers and begins with 1; leading zeros of the numerator are cut.
+
+    Raises:
+        ValueError: the model has no such output or input.
     """
     lin = linearize(model, params)
-    A, B, C, D = (np.asarray(M) for M in lin.matrices)
+    for name, known, what in ((output, lin.outputs, "output"), (input, lin.inputs, "input")):
+        if name not in known:
+            raise ValueError(f"model {model.name} has no {what} {name!r}; it has {known}")
+    A, B, C, D = (np.asarray(M, dtype=np.float64) for M in lin.matrices)
     i, j = lin.outputs.index(output), lin.inputs.index(input)
-    den = np.poly(A)
-    num = np.poly(A - np.outer(B[:, j], C[i])) + (D[i, j] - 1.0) * den
-    # What is left of cancelled leading terms lies far below the size that the matrices allow.
-    scale = np.abs(np.poly(A - np.outer(B[:, j], C[i]))) + np.abs(den)
-    small = np.abs(num) <= 1e-9 * scale
-    first = int(np.argmin(small)) if not small.all() else len(num) - 1
-    return num[first:], den
+    return siso_polynomials(A, B[:, j], C[i], float(D[i, j]))
 
 
 def frequency_response(
@@ -61,7 +62,8 @@ def frequency_response(
 ) -> Complex[Array, "k p m"]:
     """H(i omega) = C (i omega - A)^-1 B + D of the linearisation about zero; omega in rad/s."""
     A, B, C, D = jacobians(model, params)
-    s = 1j * jnp.asarray(omega, A.dtype)
+    w = jnp.asarray(omega, A.dtype)
+    s = jax.lax.complex(jnp.zeros_like(w), w)
     eye = jnp.eye(A.shape[0], dtype=s.dtype)
 
     def at(one: Array) -> Array:

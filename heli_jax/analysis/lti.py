@@ -4,7 +4,6 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 from numpy.typing import ArrayLike
 
 Polynomials = tuple[np.ndarray, np.ndarray]
@@ -77,10 +76,45 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
         raise ValueError("den must have a power of one at least")
     if num.size > den.size:
         raise ValueError("num is of higher order than den: not a proper transfer function")
-    A, B, C, D = scipy.signal.tf2ss(num if num.size else np.zeros(1), den)
-    return A, B, C, D
+    num, den = num / den[0], den / den[0]
+    padded = np.concatenate([np.zeros(den.size - num.size), num])
+    n = den.size - 1
+    A = np.eye(n, k=-1)
+    A[0] = -den[1:]
+    B = np.eye(n, 1)
+    C = (padded[1:] - padded[0] * den[1:])[None, :]
+    return A, B, C, padded[:1, None]
 
 
 def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
-    num, den = scipy.signal.ss2tf(A, B, C, D)
-    return np.asarray(num)[0], np.asarray(den)
+    den = np.real(np.poly(A))
+    num = D[0, 0] * den + _numerator(A, B[:, 0], C[0])
+    return num, den
+
+
+def siso_polynomials(A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float) -> Polynomials:
+    """num and den of c (s - A)^-1 b + d; leading zeros of num are cut, and zero stays one number.
+
+    What rounding leaves of a coefficient that is zero is judged against the Markov parameters
+    c A^k b, which set its scale.
+    """
+    den = np.real(np.poly(A))
+    proper = _numerator(A, b, c)
+    size = np.linalg.norm(c) * np.linalg.norm(b)
+    spread = np.linalg.norm(A, 2) if A.size else 0.0
+    limit = 1e-12 * size * np.array([max(spread, 1.0) ** max(k - 1, 0) for k in range(den.size)])
+    num = d * den + np.where(np.abs(proper) <= limit, 0.0, proper)
+    kept = np.flatnonzero(num)
+    return (num[kept[0] :] if kept.size else np.zeros(1)), den
+
+
+def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """num of c (s - A)^-1 b by Leverrier's recursion: linear in b and c, nothing cancels."""
+    n = A.shape[0]
+    den = np.real(np.poly(A))
+    num = np.zeros(n + 1)
+    v = b.astype(float)
+    for k in range(n):
+        num[k + 1] = c @ v
+        v = A @ v + den[k + 1] * b
+    return num

@@ -57,7 +57,7 @@ def fit(
     *,
     starts: int = 1,
     seed: int = 0,
-    max_steps: int = 100,
+    max_steps: int = 200,
     progress: starting.Progress | None = None,
 ) -> Fit:
     """Estimate the free parameters by output error: minimise the simulation error.

@@ -94,7 +94,7 @@ def optimise(
     sd: tuple[dict[str, Any], ...],
     z0: Float[Array, " q"],
     units: Scaling,
-    max_steps: int = 100,
+    max_steps: int = 200,
 ) -> Optimum:
     """The least-squares optimum from z0; compiled once per layout and shapes."""
 

@@ -98,7 +98,7 @@ def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
 def square_root(Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A factor L with L L^T = Q for a covariance that may be singular."""
     values, vectors = jnp.linalg.eigh(Q)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
 
 
 def _held(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:

@@ -109,6 +109,7 @@ def simulate(
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = _start(model, params, initial_state, inputs, dt)
+    dtype = jax.tree.leaves(x0)[0].dtype
     adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
     if controller is not None:
         sol = _adaptive(
@@ -127,9 +128,9 @@ def simulate(
         sol = dfx.diffeqsolve(
             term,
             method,
-            t0=0.0,
-            t1=float(steps),
-            dt0=1.0,
+            t0=jnp.zeros((), dtype),
+            t1=jnp.asarray(steps, dtype),
+            dt0=jnp.ones((), dtype),
             y0=x0,
             args=held,
             saveat=dfx.SaveAt(t0=True, steps=True),
@@ -172,6 +173,7 @@ def accumulate(
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = _start(model, params, initial_state, inputs, dt)
+    dtype = jax.tree.leaves(x0)[0].dtype
     method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, None)
 
     def per_sample(value: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
@@ -180,9 +182,9 @@ def accumulate(
     sol = dfx.diffeqsolve(
         term,
         Accumulating(method, per_sample),
-        t0=0.0,
-        t1=float(n - 1),
-        dt0=1.0,
+        t0=jnp.zeros((), dtype),
+        t1=jnp.asarray(n - 1, dtype),
+        dt0=jnp.ones((), dtype),
         y0=(x0, start),
         args=(held, data),
         saveat=dfx.SaveAt(t1=True),

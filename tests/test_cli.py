@@ -1,0 +1,347 @@
+"""The command line as a user meets it: exit codes, sentences, files."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax.cli import main
+
+ROOT = Path(__file__).parents[1]
+TREX = ROOT.parent / "shared" / "data" / "trex550" / "Pitchtest.csv"
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """The demo's configuration on a short log in a folder of its own; returns the config's path."""
+    content = yaml.safe_load((ROOT / "configs" / "bench-roll.yaml").read_text())
+    content["vehicle"] = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
+    content["flights"][0]["log"] = "bench.csv"
+    content["simulate"]["duration"] = 12
+    content["fit"]["starts"] = 1
+    path = tmp_path / "bench.yaml"
+    path.write_text(yaml.safe_dump(content))
+    assert main(["simulate", str(path), "--out", str(tmp_path / "bench.csv")]) == 0
+    return path
+
+
+def edited(path, change):
+    content = yaml.safe_load(path.read_text())
+    change(content)
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def refused(capsys, arguments, *words):
+    """The command ends with exit code 2, one sentence on standard error, nothing on output."""
+    capsys.readouterr()
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as e:
+        code = e.code
+    out, err = capsys.readouterr()
+    assert code == 2
+    lines = [line for line in err.splitlines() if line]
+    assert len(lines) == 1, err
+    assert "Traceback" not in err
+    for word in words:
+        assert str(word) in lines[0], lines[0]
+    assert out == ""
+
+
+def test_fit_writes_a_whole_run_directory(bench, capsys):
+    out = bench.parent / "run"
+    assert main(["fit", str(bench), "--out", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "rest on the prior of a" in shown.out
+    assert "report:" in shown.out
+    assert "Ixx" in shown.out
+    assert {p.name for p in out.iterdir()} == {
+        "config.yaml", "fit.json", "signals.csv", "report.html", "figures",
+    }  # fmt: skip
+    result = json.loads((out / "fit.json").read_text())
+    assert result["status"] == "converged"
+    assert result["identifiable"] is True
+    assert result["parameters"]["a"]["prior_share"] > 0.95
+    assert result["n_samples"] == 600
+    assert len(result["baseline_rls"]["theta"]) == 9
+    assert len(result["data"][0]["sha256"]) == 64
+    assert {"jax", "heli_jax", "python"} <= set(result["versions"])
+    assert {p.suffix for p in (out / "figures").iterdir()} == {".svg", ".png"}
+    assert not list(bench.parent.glob(".run*"))
+    # The resolved configuration runs again from elsewhere.
+    again = bench.parent / "elsewhere"
+    again.mkdir()
+    (again / "again.yaml").write_text((out / "config.yaml").read_text())
+    assert main(["check", str(again / "again.yaml")]) == 0
+
+
+def test_three_free_end_with_exit_code_3(bench, capsys):
+    edited(bench, lambda c: c["fit"]["free"]["a"].pop("prior"))
+    out = bench.parent / "run"
+    assert main(["check", str(bench)]) == 3
+    assert "only a/Ixx and a/If" in capsys.readouterr().out
+    assert main(["fit", str(bench), "--out", str(out)]) == 3
+    result = json.loads((out / "fit.json").read_text())
+    assert result["status"] == "not-identifiable"
+    [null] = result["null_directions"]
+    assert np.allclose(list(null.values()), 3**-0.5, atol=1e-3)
+    assert {c["name"] for c in result["determined_combinations"]} == {"a/Ixx", "a/If"}
+    assert result["parameters"]["Ixx"]["sd"] is None
+    assert "not determined" in capsys.readouterr().out
+
+
+def test_too_few_steps_end_with_exit_code_4(bench):
+    out = bench.parent / "run"
+    arguments = ["fit", str(bench), "--set", "fit.max_steps=2", "--out", str(out)]
+    assert main(arguments) == 4
+    assert json.loads((out / "fit.json").read_text())["status"] == "not-converged"
+
+
+def test_info_tells_rate_and_signals(bench, capsys):
+    assert main(["info", str(bench.parent / "bench.csv")]) == 0
+    shown = capsys.readouterr().out
+    assert "50 Hz" in shown
+    assert "stick_roll" in shown
+
+
+def test_simulate_without_a_simulate_section_follows_the_flights(bench, capfd):
+    edited(bench, lambda c: c.pop("simulate"))
+    assert main(["simulate", str(bench)]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[0].replace('"', "").split(",")[:4] == ["flight", "time", "x_roll", "roll"]
+    assert len(lines) == 601
+
+
+WRONG = {
+    "unknown key": (lambda c: c.update(vehicel=1), ["vehicel", "did you mean 'vehicle'"]),
+    "unknown key below": (
+        lambda c: c["fit"].update(fre=1), ["fit.fre", "unknown key"],
+    ),
+    "unknown model": (lambda c: c.update(model="rol"), ["model", "did you mean 'roll'"]),
+    "model by path": (lambda c: c.update(model="nowhere:here"), ["cannot import", "nowhere"]),
+    "unknown parameter": (
+        lambda c: c["fit"]["free"].update(Ixy={"start": 1.0}), ["Ixy", "did you mean"],
+    ),
+    "nothing free": (lambda c: c["fit"].update(free={}), ["nothing is free"]),
+    "start outside": (
+        lambda c: c["fit"]["free"]["Ixx"].update(start=2.0), ["Ixx.start", "inside 0.001 to 1"],
+    ),
+    "start nan": (
+        lambda c: c["fit"]["free"]["Ixx"].update(start=float("nan")), ["free.Ixx.start", "finite"],
+    ),
+    "negative inertia": (
+        lambda c: c["fit"]["free"].update(If={"start": -1e-4}), ["If is -0.0001"],
+    ),
+    "missing column": (
+        lambda c: c["flights"][0]["signals"]["outputs"]["roll"].update(signal="ph"),
+        ["bench.csv", "'ph'", "phi"],
+    ),
+    "unknown unit": (
+        lambda c: c["flights"][0]["signals"]["outputs"]["roll"].update(unit="degre"),
+        ["roll.unit", "degre"],
+    ),
+    "unit of the wrong kind": (
+        lambda c: c["flights"][0]["signals"]["inputs"]["x_roll"].update(unit="deg"),
+        ["x_roll.unit", "an angle", "a length"],
+    ),
+    "plain stick": (
+        lambda c: c["flights"][0]["signals"]["inputs"]["x_roll"].update(unit="1"),
+        ["x_roll.unit", "input_gain"],
+    ),
+    "unknown output": (
+        lambda c: c["flights"][0]["signals"]["outputs"].update(rol={"signal": "phi"}),
+        ["no output 'rol'", "did you mean 'roll'"],
+    ),
+    "unknown known": (
+        lambda c: c["flights"][0].update(known={"Ixx_aded": 1.0}), ["did you mean 'Ixx_added'"],
+    ),
+    "no flights": (lambda c: c.update(flights=[]), ["flights", "at least one log"]),
+    "missing log": (lambda c: c["flights"][0].update(log="none.csv"), ["none.csv"]),
+    "missing vehicle": (lambda c: c.update(vehicle="none.yaml"), ["none.yaml", "no such file"]),
+    "rotor at rest": (
+        lambda c: c.update(vehicle={**BENCH_30, "Omega": 0}), ["vehicle", "Omega is 0"],
+    ),
+    "paddle inside out": (
+        lambda c: c.update(vehicle={**BENCH_30, "R1": 0.3}), ["R1 is 0.3", "inner"],
+    ),
+    "vehicle nan": (
+        lambda c: c.update(vehicle={**BENCH_30, "c": float("nan")}), ["vehicle: c", "finite"],
+    ),
+    "vehicle incomplete": (
+        lambda c: c.update(vehicle={k: v for k, v in BENCH_30.items() if k != "R"}),
+        ["R missing"],
+    ),
+    "window outside": (
+        lambda c: c["flights"][0].update(window=[50, 60]), ["bench.csv", "window"],
+    ),
+    "too few samples": (
+        lambda c: c["flights"][0].update(window=[0, 0.1]), ["bench.csv", "samples"],
+    ),
+    "method": (lambda c: c["fit"].update(method="guess"), ["fit.method", "output-error"]),
+    "forgetting": (lambda c: c.update(rls={"forgetting": 1.5}), ["rls.forgetting", "1.5"]),
+}  # fmt: skip
+BENCH_30 = yaml.safe_load((ROOT / "configs" / "vehicles" / "bench-30.yaml").read_text())
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_sentence(bench, capsys, case):
+    change, words = WRONG[case]
+    edited(bench, change)
+    out = bench.parent / "run"
+    refused(capsys, ["fit", bench, "--out", out], *words)
+    assert not out.exists()
+    assert not list(bench.parent.glob(".run*"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["nothing"]),
+        ("a: [1, 2", ["line"]),
+        ("- 1\n- 2\n", ["list"]),
+        ("model: roll\nmodel: pitch\n", ["line 2", "twice"]),
+        ("a: !!python/object/apply:os.system ['true']\n", ["line 1"]),
+        ("a: &a [*a]\n", ["line"]),
+        ("[" * 5000, ["nested"]),
+        ("\x00\x01", ["bad.yaml"]),
+    ],
+)
+def test_broken_and_hostile_yaml(tmp_path, capsys, text, words):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    refused(capsys, ["check", path], "bad.yaml", *words)
+
+
+def test_an_input_that_never_moves(bench, capsys):
+    log = bench.parent / "bench.csv"
+    rows = [line.split(",") for line in log.read_text().splitlines()]
+    log.write_text("\n".join(",".join([r[0], r[1] if i == 0 else "1.0", r[2]])
+                             for i, r in enumerate(rows)) + "\n")  # fmt: skip
+    refused(capsys, ["fit", bench, "--out", bench.parent / "run"], "bench.csv", "x_roll")
+
+
+def test_usage_and_places_to_write(bench, capsys):
+    refused(capsys, ["fly", bench], "fly")
+    refused(capsys, ["fit", bench, "--set", "fit.free"], "key.path=value")
+    refused(capsys, ["fit", bench, "--set", "flights.9.rate=1"], "9")
+    (bench.parent / "there").mkdir()
+    refused(capsys, ["fit", bench, "--out", bench.parent / "there"], "exists already")
+    refused(capsys, ["simulate", bench, "--out", bench.parent / "x.doc"], ".csv or .parquet")
+    refused(capsys, ["info", bench.parent / "none.csv"], "none.csv")
+
+
+def test_interrupt_leaves_nothing_behind(bench):
+    out = bench.parent / "run"
+    command = [sys.executable, "-m", "heli_jax.cli", "fit", str(bench), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    assert process.stderr is not None
+    process.stderr.readline()  # it is at work
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert not out.exists()
+    assert not list(bench.parent.glob(".run*"))
+
+
+MODEL = """
+from typing import NamedTuple
+
+from heli_jax import Model
+
+
+class Params(NamedTuple):
+    Lp: float
+    Lda: float
+
+
+class State(NamedTuple):
+    p: float
+
+
+class Inputs(NamedTuple):
+    da: float
+
+
+class Outputs(NamedTuple):
+    p: float
+
+
+def field(q, x, u):
+    return State(p=q.Lp * x.p + q.Lda * u.da)
+
+
+rolling = Model("rolling", field, lambda q, x, u: Outputs(p=x.p), Params, State, Inputs, Outputs,
+                linear=True)
+"""
+
+
+def test_a_model_of_ones_own(tmp_path, capsys):
+    (tmp_path / "own_roll_model.py").write_text(MODEL)
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1, 1, 40), 25)
+    p, decay = [0.0], np.exp(-4.0 * 0.02)
+    for value in u[:-1]:
+        p.append(decay * p[-1] + 2.5 / 4.0 * (1 - decay) * value)
+    p = np.array(p) + 1e-3 * rng.standard_normal(1000)
+    rows = [f"{0.02 * k:.2f},{a:.9g},{b:.9g}" for k, (a, b) in enumerate(zip(u, p, strict=True))]
+    (tmp_path / "run.csv").write_text("t,u,p\n" + "\n".join(rows) + "\n")
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": {"da": {"signal": "u"}},
+        "outputs": {"p": {"signal": "p"}},
+    }
+    config = {
+        "model": "own_roll_model:rolling",
+        "vehicle": {"Lp": -1.0, "Lda": 1.0},
+        "flights": [{"log": "run.csv", "signals": signals}],
+        "fit": {"free": {"Lp": {"start": -1.0}, "Lda": {"start": 1.0}}},
+    }
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump(config))
+    assert main(["fit", str(path), "--out", str(tmp_path / "run")]) == 0
+    found = json.loads((tmp_path / "run" / "fit.json").read_text())["parameters"]
+    assert found["Lp"]["value"] == pytest.approx(-4.0, abs=4 * found["Lp"]["sd"])
+    assert found["Lda"]["value"] == pytest.approx(2.5, abs=4 * found["Lda"]["sd"])
+    assert found["Lp"]["lower95"] < found["Lp"]["value"] < found["Lp"]["upper95"] < 0
+
+
+@pytest.mark.skipif(not TREX.exists(), reason="the real logs are not at ../shared/data")
+@pytest.mark.parametrize("flybar_free", [False, True], ids=["If-fixed", "If-free"])
+def test_a_real_record(tmp_path, capsys, flybar_free):
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": {"x_roll": {"signal": "lat", "unit": "1"}},
+        "outputs": {"roll_rate": {"signal": "p", "unit": "rad/s"}},
+    }
+    free = {"Ixx": {"start": 0.05}} | ({"If": {"start": 5e-4}} if flybar_free else {})
+    config = {
+        "model": "roll",
+        "vehicle": str(ROOT / "configs" / "vehicles" / "bench-30.yaml"),
+        "flights": [{"log": str(TREX), "signals": signals, "window": [18, 32]}],
+        "fit": {"free": free, "nuisance": {"time_shift": True, "input_gain": True}},
+    }
+    path = tmp_path / "trex.yaml"
+    path.write_text(yaml.safe_dump(config))
+    code = main(["fit", str(path), "--out", str(tmp_path / "run")])
+    result = json.loads((tmp_path / "run" / "fit.json").read_text())
+    assert result["metrics"]["roll_rate"]["vaf"] >= 0.97
+    assert -0.25 < result["nuisance"]["time_shift"]["value"] < -0.05
+    assert not result["residuals"]["white"]
+    if flybar_free:
+        assert code in (0, 3)
+        assert "Ixx" in result["verdict"]["text"]
+        assert "gain x_roll" in result["verdict"]["text"]
+        assert "If" in result["verdict"]["text"]
+    else:
+        assert code == 0
