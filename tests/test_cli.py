@@ -27,7 +27,7 @@ def bench(tmp_path):
     content["simulate"]["duration"] = 12
     content["fit"]["starts"] = 1
     path = tmp_path / "bench.yaml"
-    path.write_text(yaml.safe_dump(content))
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
     assert main(["simulate", str(path), "--out", str(tmp_path / "bench.csv")]) == 0
     return path
 
@@ -35,7 +35,7 @@ def bench(tmp_path):
 def edited(path, change):
     content = yaml.safe_load(path.read_text())
     change(content)
-    path.write_text(yaml.safe_dump(content))
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
     return path
 
 

@@ -66,23 +66,24 @@ def d2c(
 
 
 def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray, ...]:
-    num, den = np.atleast_1d(np.asarray(num, float)), np.atleast_1d(np.asarray(den, float))
+    b: np.ndarray = np.atleast_1d(np.asarray(num, float))
+    a: np.ndarray = np.atleast_1d(np.asarray(den, float))
     if not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"dt is {dt}, wanted is a sample time in seconds above zero")
-    if num.ndim != 1 or den.ndim != 1 or not (np.isfinite(num).all() and np.isfinite(den).all()):
+    if b.ndim != 1 or a.ndim != 1 or not (np.isfinite(b).all() and np.isfinite(a).all()):
         raise ValueError("num and den must be lists of finite numbers")
-    num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
-    if den.size < 2:
+    b, a = np.trim_zeros(b, "f"), np.trim_zeros(a, "f")
+    if a.size < 2:
         raise ValueError("den must have a power of one at least")
-    if num.size > den.size:
+    if b.size > a.size:
         raise ValueError("num is of higher order than den: not a proper transfer function")
-    num, den = num / den[0], den / den[0]
-    padded = np.concatenate([np.zeros(den.size - num.size), num])
-    n = den.size - 1
+    b, a = b / a[0], a / a[0]
+    padded = np.concatenate([np.zeros(a.size - b.size), b])
+    n = a.size - 1
     A = np.eye(n, k=-1)
-    A[0] = -den[1:]
+    A[0] = -a[1:]
     B = np.eye(n, 1)
-    C = (padded[1:] - padded[0] * den[1:])[None, :]
+    C = (padded[1:] - padded[0] * a[1:])[None, :]
     return A, B, C, padded[:1, None]
 
 

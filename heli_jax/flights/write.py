@@ -25,7 +25,9 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
         return
     import pyarrow.csv
 
-    pyarrow.csv.write_csv(table, target if isinstance(target, Path) else pa.PythonFile(target))
+    pyarrow.csv.write_csv(
+        table, target if isinstance(target, Path) else pa.PythonFile(target, mode="w")
+    )
 
 
 def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
