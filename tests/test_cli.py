@@ -241,7 +241,14 @@ def test_usage_and_places_to_write(bench, capsys):
 def test_interrupt_leaves_nothing_behind(bench):
     out = bench.parent / "run"
     command = [sys.executable, "-m", "heli_jax.cli", "fit", str(bench), "--out", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    # A shell's background job ignores interrupts, and its children with it, unless told otherwise.
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=dict(os.environ),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     assert process.stderr is not None
     process.stderr.readline()  # it is at work
     time.sleep(0.5)
