@@ -1,7 +1,6 @@
 """The command line as a user meets it: exit codes, sentences, files."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -240,15 +239,13 @@ def test_usage_and_places_to_write(bench, capsys):
 
 def test_interrupt_leaves_nothing_behind(bench):
     out = bench.parent / "run"
-    command = [sys.executable, "-m", "heli_jax.cli", "fit", str(bench), "--out", str(out)]
     # A shell's background job ignores interrupts, and its children with it, unless told otherwise.
-    process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=dict(os.environ),
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from heli_jax.cli import main; sys.exit(main(sys.argv[1:]))"
     )
+    command = [sys.executable, "-c", program, "fit", str(bench), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     process.stderr.readline()  # it is at work
     time.sleep(0.5)

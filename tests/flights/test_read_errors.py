@@ -182,6 +182,8 @@ BAD_REQUEST = {
     "rate nan": ({"rate": math.nan}, ["rate is nan"]),
     "rate infinite": ({"rate": math.inf}, ["rate is inf"]),
     "rate far too high": ({"rate": 1e9}, ["1e+09 Hz", "50 Hz"]),
+    "rate next to infinite": ({"rate": 1e308}, ["1e+308 Hz"]),
+    "rate next to zero": ({"rate": 1e-320}, ["fewer than 8"]),
     "rate far too low": ({"rate": 2.0}, ["2 Hz", "fewer than 8"]),
     "window reversed": ({"window": (0.3, 0.1)}, ["window", "reversed", "0.3"]),
     "window empty": ({"window": (0.1, 0.1)}, ["window", "empty"]),

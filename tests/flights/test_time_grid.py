@@ -107,11 +107,23 @@ def test_resampling_bridges_a_lost_sample(tmp_path):
     assert np.array_equal(flight.inputs["u"], want)
 
 
-def test_rate_of_a_rounded_log_keeps_its_samples(tmp_path):
+@pytest.mark.parametrize("rate", [30.0, 49.0])
+def test_rate_of_a_rounded_log_keeps_its_samples(tmp_path, rate):
     x = np.random.default_rng(1).normal(size=300)
-    flight = read(tmp_path / "log.csv", [f"{i / 30:.3f}" for i in range(300)], x, rate=30.0)
-    assert flight.dt == 1 / 30
+    stamps = [f"{i / rate:.3f}" for i in range(300)]
+    flight = read(tmp_path / "log.csv", stamps, x, rate=rate)
+    assert flight.dt == 1 / rate
+    assert "resampled" not in notes(flight)
     assert np.array_equal(flight.inputs["u"], x)
+
+
+@pytest.mark.parametrize("part", [2, 3, 5])
+def test_a_slower_clock_takes_whole_samples(tmp_path, part):
+    x = np.random.default_rng(1).normal(size=300)
+    stamps = [f"{i / 30:.3f}" for i in range(300)]
+    flight = read(tmp_path / "log.csv", stamps, x, rate=30.0 / part)
+    assert np.array_equal(flight.inputs["u"], x[::part])
+    assert np.allclose(flight.outputs["y"], x[::part], atol=1e-9)
 
 
 def test_held_inputs_do_not_slip_on_rounded_stamps(tmp_path):
