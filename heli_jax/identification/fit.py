@@ -1,6 +1,7 @@
 """fit and check: parameters with intervals and a verdict, from a Problem."""
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -43,12 +44,12 @@ def check(problem: Problem) -> Check:
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
-    sd, notes = _first_noise(problem)
+    sd = _first_noise(problem.training)
     z = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
     e = evaluate(layout, data, sd, z)
     verdict = verdict_of(problem, layout, e)
     runs = tuple(s.simulated for s in _signals(e.raw, problem.training))
-    notes += excitation.notes(problem, runs, sd)
+    notes = excitation.notes(problem, runs, sd)
     return Check(verdict, _noise_by_name(problem, sd), tuple(notes))
 
 
@@ -75,14 +76,14 @@ def fit(
     begin = time.perf_counter()
     tell = progress or (lambda _: None)
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
-    sd, notes = _first_noise(problem)
+    sd = _first_noise(problem.training)
     z0 = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
     before = verdict_of(problem, layout, evaluate(layout, data, sd, z0))
     tell(f"fitting {', '.join(layout.named)}")
     points = starting.draw(layout, problem, z0, starts, seed)
     search = starting.Search(problem, layout, data, max_steps)
     runs = search.run(sd, points, tell)
-    best = min(runs, key=lambda o: (not bool(o.converged), _finite_cost(o)))
+    best = min(runs, key=starting.rank)
     best, sd, trace = _settle_noise(search, sd, best)
     return _assemble(
         problem,
@@ -94,27 +95,20 @@ def fit(
         points,
         runs,
         trace,
-        notes,
         seed,
         {"fit": time.perf_counter() - begin},
     )
 
 
-def _finite_cost(o: Optimum) -> float:
-    cost = float(o.cost)
-    return cost if np.isfinite(cost) else np.inf
-
-
-def _first_noise(problem: Problem) -> tuple[Any, list[str]]:
-    """The noise to begin with: as stated, else guessed."""
-    sd, notes = [], []
-    for flight in problem.training:
-        one = {}
-        for name, y in flight.outputs.items():
-            guess = flight.sd.get(name) or noise_guess(y)
-            one[name] = jnp.asarray(guess, jnp.result_type(float))
-        sd.append(one)
-    return tuple(sd), notes
+def _first_noise(flights: Sequence[Flight]) -> Any:
+    """The noise to begin with, by flight and output: as stated, else guessed."""
+    return tuple(
+        {
+            name: jnp.asarray(flight.sd.get(name) or noise_guess(y), jnp.result_type(float))
+            for name, y in flight.outputs.items()
+        }
+        for flight in flights
+    )
 
 
 def _noise_by_name(problem: Problem, sd: Any) -> dict[str, float]:
@@ -171,7 +165,6 @@ def _assemble(
     points: Array,
     runs: list[Optimum],
     trace: tuple[tuple[int, float], ...],
-    notes: list[str],
     seed: int,
     timing: dict[str, float],
 ) -> Fit:
@@ -182,7 +175,6 @@ def _assemble(
     if not bool(best.converged) or not usable:
         status = "not-converged"
     notes = [
-        *notes,
         *excitation.sampling(
             problem, {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
         ),
@@ -249,10 +241,7 @@ def _validation(
     other, data = layout_of(problem, held), data_of(problem, held)
     q = len(layout.named)
     full = jnp.concatenate([z[:q], jnp.zeros(other.size - q, z.dtype)])
-    noise = tuple(
-        {n: jnp.asarray(f.sd.get(n) or noise_guess(y), z.dtype) for n, y in f.outputs.items()}
-        for f in held
-    )
+    noise = _first_noise(held)
     if other.size > q:
         e = evaluate(other, data, noise, full)
         step, *_ = np.linalg.lstsq(np.asarray(e.J)[:, q:], -np.asarray(e.r), rcond=1e-10)

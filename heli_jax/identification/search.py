@@ -189,7 +189,7 @@ def table(
     layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
 ) -> tuple[StartRow, ...]:
     """Start, end and cost of every run, best first; equal optima share a number."""
-    order = sorted(range(len(runs)), key=lambda i: (not bool(runs[i].converged), _cost(runs[i])))
+    order = sorted(range(len(runs)), key=lambda i: rank(runs[i]))
     rows, optimum, last = [], 0, None
     for i in order:
         cost, converged = _cost(runs[i]), bool(runs[i].converged)
@@ -206,6 +206,11 @@ def table(
             )
         )
     return tuple(rows)
+
+
+def rank(run: Optimum) -> tuple[bool, float]:
+    """Sorts runs: those that converged first, then by cost."""
+    return not bool(run.converged), _cost(run)
 
 
 def _cost(run: Optimum) -> float:
