@@ -1,4 +1,8 @@
-"""The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12)."""
+"""The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12).
+
+Factors of parameters alone stand in brackets of their own here and in the other equations: they
+are then computed once, outside the loop over time, and no division is left in it.
+"""
 
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
@@ -11,7 +15,7 @@ def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
 
     `x_cyc` is the cyclic input displacement [m], `beta` the flybar's flapping angle [rad].
     """
-    return (p.L3 * x_cyc + p.L2 * p.L4 * beta) / (p.L1 * (p.L2 + p.L3))
+    return (1.0 / (p.L1 * (p.L2 + p.L3))) * (p.L3 * x_cyc + (p.L2 * p.L4) * beta)
 
 
 def flapping_rate_gain(p: Helicopter) -> Scalar:
@@ -30,4 +34,5 @@ def flapping_acceleration(
     `omega` is the body's rate about the same axis [rad/s]. The paper's text prints
     $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the denominator of eq. 23.
     """
-    return flapping_rate_gain(p) * (x_cyc / p.L5 - (dbeta + omega) / p.Omega) - p.Omega**2 * beta
+    pull = (1.0 / p.L5) * x_cyc - (1.0 / p.Omega) * (dbeta + omega)
+    return flapping_rate_gain(p) * pull - (p.Omega**2) * beta

@@ -64,12 +64,12 @@ def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
     $$\ddot\phi = \frac{\rho\Omega^2 a c R^4}{2 I_{xx} L_1 (L_2+L_3)}
       (L_3 x_{roll} + L_2 L_4 \beta)$$
     """
-    return cyclic_moment(p, cyclic_pitch(p, x_roll, beta)) / roll_inertia(p)
+    return (1.0 / roll_inertia(p)) * cyclic_moment(p, cyclic_pitch(p, x_roll, beta))
 
 
 def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
     """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll."""
-    return cyclic_moment(p, cyclic_pitch(p, x_pitch, beta)) / pitch_inertia(p)
+    return (1.0 / pitch_inertia(p)) * cyclic_moment(p, cyclic_pitch(p, x_pitch, beta))
 
 
 def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
@@ -150,7 +150,7 @@ def on_stand(model: Model) -> Model:
         for axis in axes:
             inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
             pull = p.kappa * getattr(s, axis.angle) + p.zeta * getattr(s, axis.rate)
-            slowed = getattr(rates, axis.rate) - pull * inertia / (inertia + added)
+            slowed = getattr(rates, axis.rate) - (inertia / (inertia + added)) * pull
             rates = naming.replace(rates, **{axis.rate: slowed})
         return rates
 

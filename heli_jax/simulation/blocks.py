@@ -41,7 +41,7 @@ def blocked(held: Held, m: int) -> Blocked:
     n = A.shape[0]
     eye = tuple(tuple(row) for row in jnp.eye(n, dtype=A.dtype))
     rows = tuple(tuple(row) for row in Am)
-    coarse = Held(held.params, tuple(w.T), None, Discrete(rows, eye, None))
+    coarse = Held(held.params, tuple(w.T), held.dt, None, Discrete(rows, eye, None))
     return Blocked(coarse, count, powers, response, U)
 
 

@@ -233,13 +233,14 @@ def _per_sample(
     method = _method(model, solver)
     parts = None if delay is None else _split(delay, dt)
 
-    term = _term(model, dt)
+    term = _term(model)
+    dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         late = None if parts is None else parts[1] * dt
-        return method, Held(params, inputs, parts, discretize(model, params, dt, late)), term
+        return method, Held(params, inputs, dt, parts, discretize(model, params, dt, late)), term
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, wanted is at least 1")
-    return PerSample(method, substeps), Held(params, inputs, parts, None), term
+    return PerSample(method, substeps), Held(params, inputs, dt, parts, None), term
 
 
 def _require_blocks(method: Any, block: int) -> None:
@@ -264,8 +265,8 @@ def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> Hel
     )
 
 
-def _term(model: Model, scale: Any) -> dfx.ODETerm:
-    """The vector field per `scale` seconds.
+def _term(model: Model) -> dfx.ODETerm:
+    """The vector field, per second, within one sample.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
     """
@@ -275,8 +276,7 @@ def _term(model: Model, scale: Any) -> dfx.ODETerm:
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, Held):
             return x  # only the shapes are asked for; the inputs may not be the model's
-        rates = model.vector_field(now.params, x, now.inputs)
-        return jax.tree.map(lambda v: v * scale, rates)
+        return model.vector_field(now.params, x, now.inputs)
 
     return dfx.ODETerm(field)
 

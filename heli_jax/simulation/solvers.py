@@ -19,11 +19,13 @@ class Held(NamedTuple):
     """What a step needs to know: the parameters and the inputs, sample by sample.
 
     `inputs` holds arrays (N,). `delay` is None, or the whole samples (integer) and the rest
-    (fraction of a sample in [0, 1)) by which the inputs act later than given.
+    (fraction of a sample in [0, 1)) by which the inputs act later than given. `dt` [s] is the
+    sample time.
     """
 
     params: Any
     inputs: Any
+    dt: Any
     delay: Any
     discrete: Discrete | None
 
@@ -108,7 +110,9 @@ class RK4(dfx.AbstractSolver):
         h = t1 - t0
 
         def f(t: Any, y: Any) -> Any:
-            return terms.vf(t, y, args)
+            # Behind a barrier each slope is computed once: without it XLA computes all of them
+            # again for every state variable.
+            return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
         def along(y: Any, slope: Any, step: Any) -> Any:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
@@ -152,30 +156,31 @@ class PerSample(dfx.AbstractSolver):
     ) -> Any:
         k = _sample(t0)
         if args.delay is None:
-            parts = [(t0, t1, k)]
+            parts = [(args.dt, k)]
         else:
             whole, rest = args.delay
-            parts = [(t0, t0 + rest, k - whole - 1), (t0 + rest, t1, k - whole)]
+            parts = [(rest * args.dt, k - whole - 1), ((1.0 - rest) * args.dt, k - whole)]
         y, result = y0, dfx.RESULTS.successful
-        for begin, end, sample in parts:
+        for length, sample in parts:
             now = Now(args.params, at(args.inputs, sample))
-            y, one = self._steps(terms, begin, end, y, now)
+            y, one = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)
         return y, None, {"y0": y0, "y1": y}, None, result
 
-    def _steps(self, terms: Any, begin: Any, end: Any, y0: Any, now: Now) -> Any:
-        h = (end - begin) / self.substeps
+    def _steps(self, terms: Any, h: Any, y0: Any, now: Now) -> Any:
+        """`substeps` steps of h [s]. Nothing depends on time while the input is held, so each
+        begins at 0: a step length that is the same number in all steps makes the code faster.
+        """
+        begin = jnp.zeros_like(h)
 
-        def body(carry: Any, i: Any) -> Any:
+        def body(carry: Any, _: Any) -> Any:
             y, result = carry
-            a, b = begin + i * h, begin + (i + 1.0) * h
-            state = self.solver.init(terms, a, b, y, now)
-            y, _, _, _, one = self.solver.step(terms, a, b, y, now, state, False)
+            state = self.solver.init(terms, begin, h, y, now)
+            y, _, _, _, one = self.solver.step(terms, begin, h, y, now, state, False)
             return (y, dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)), None
 
         carry = (y0, dfx.RESULTS.successful)
-        steps = jnp.arange(self.substeps, dtype=jnp.result_type(begin))
-        (y, result), _ = jax.lax.scan(body, carry, steps)
+        (y, result), _ = jax.lax.scan(body, carry, None, length=self.substeps)
         return y, result
 
 
