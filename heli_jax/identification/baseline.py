@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+from scipy.linalg import get_lapack_funcs
 
 from heli_jax import naming
 from heli_jax.analysis.lti import d2c
@@ -16,6 +16,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.metrics import Metrics, metrics, whiteness
 from heli_jax.identification.rls import rls, transfer_function
 from heli_jax.vehicle import Helicopter
+
+_solve_banded: Any = get_lapack_funcs("tbtrs")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +120,13 @@ def _rms(signal: np.ndarray) -> float:
 def _simulate(num: np.ndarray, den: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Hd driven by the whole input, started from the first measured outputs."""
     n = den.size - 1
-    start = scipy.signal.lfiltic(num, den, y[n - 1 :: -1][:n], u[n - 1 :: -1][:n])
-    rest, _ = scipy.signal.lfilter(num, den, u[n:], zi=start)
-    return np.concatenate([y[:n], rest])
+    forced = np.convolve(u, num / den[0])[n : u.size]
+    band = np.tile(np.asarray(den / den[0])[:, None], u.size - n)
+    past = np.convolve(np.concatenate([y[:n], np.zeros(n)]), den / den[0])[n : 2 * n]
+    forced[:n] -= past[: forced.size]
+    # den(q) y = num(q) u row by row is a triangular banded system.
+    rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
+    return np.concatenate([y[:n], np.ravel(rest)])
 
 
 def _output(model: Model, flight: Flight) -> str:

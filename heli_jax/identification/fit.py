@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
@@ -27,6 +28,7 @@ from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import (
     Data,
+    Evaluation,
     Layout,
     data_of,
     evaluate,
@@ -46,7 +48,7 @@ def check(problem: Problem) -> Check:
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     sd = _first_noise(problem.training)
     z = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
-    e = evaluate(layout, data, sd, z)
+    e = _evaluation(layout, data, sd, z)
     verdict = verdict_of(problem, layout, e)
     runs = tuple(s.simulated for s in _signals(e.raw, problem.training))
     notes = excitation.notes(problem, runs, sd)
@@ -78,7 +80,7 @@ def fit(
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     sd = _first_noise(problem.training)
     z0 = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
-    before = verdict_of(problem, layout, evaluate(layout, data, sd, z0))
+    before = verdict_of(problem, layout, _evaluation(layout, data, sd, z0))
     tell(f"fitting {', '.join(layout.named)}")
     points = starting.draw(layout, problem, z0, starts, seed)
     search = starting.Search(problem, layout, data, max_steps)
@@ -100,11 +102,17 @@ def fit(
     )
 
 
+def _evaluation(layout: Layout, data: Data, sd: Any, z: Array) -> Evaluation:
+    """`evaluate` as NumPy arrays, for what is not compiled."""
+    return jax.device_get(evaluate(layout, data, sd, z))
+
+
 def _first_noise(flights: Sequence[Flight]) -> Any:
     """The noise to begin with, by flight and output: as stated, else guessed."""
+    dtype = np.dtype(jnp.result_type(float))
     return tuple(
         {
-            name: jnp.asarray(flight.sd.get(name) or noise_guess(y), jnp.result_type(float))
+            name: np.asarray(flight.sd.get(name) or noise_guess(y), dtype)
             for name, y in flight.outputs.items()
         }
         for flight in flights
@@ -125,10 +133,10 @@ def _settle_noise(
     """Alternate between the optimum and the residual sd until both stay (relaxation of R)."""
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(8):
-        raw = evaluate(search.layout, search.data, sd, best.z).raw
+        raw = _evaluation(search.layout, search.data, sd, best.z).raw
         new = _residual_sd(search.layout, search.data, raw)
         change = max(
-            abs(float(jnp.log(n[k] / s[k]))) for n, s in zip(new, sd, strict=True) for k in s
+            abs(float(np.log(n[k] / s[k]))) for n, s in zip(new, sd, strict=True) for k in s
         )
         if not np.isfinite(change):
             break
@@ -145,9 +153,9 @@ def _residual_sd(layout: Layout, data: Data, raw: Any) -> Any:
     n = residuals_count(layout, data)
     freedom = n / max(n - layout.size, 1)
 
-    def sd(r: Array, y: Array) -> Array:
-        floor = 1e-12 * jnp.sqrt(jnp.mean(jnp.square(y))) + 1e-300
-        return jnp.maximum(jnp.sqrt(jnp.mean(jnp.square(r)) * freedom), floor)
+    def sd(r: np.ndarray, y: Any) -> np.ndarray:
+        floor = 1e-12 * np.sqrt(np.mean(np.square(np.asarray(y)))) + 1e-300
+        return np.asarray(max(np.sqrt(np.mean(np.square(r)) * freedom), floor), r.dtype)
 
     return tuple(
         {k: sd(r, flight.outputs[k]) for k, r in by_name.items()}
@@ -168,8 +176,8 @@ def _assemble(
     seed: int,
     timing: dict[str, float],
 ) -> Fit:
-    e = evaluate(layout, data, sd, best.z)
-    usable = bool(jnp.all(jnp.isfinite(e.J)))
+    e = _evaluation(layout, data, sd, best.z)
+    usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e) if usable else before
     status: Status = "converged"
     if not bool(best.converged) or not usable:
@@ -190,7 +198,8 @@ def _assemble(
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
     nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile)
-    values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
+    dtype = jnp.result_type(float)
+    values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     notes = [*notes, *stated_noise_notes(problem, sd), *bound_notes(estimates)]
     return Fit(
         model=problem.model.name,
@@ -243,10 +252,10 @@ def _validation(
     full = jnp.concatenate([z[:q], jnp.zeros(other.size - q, z.dtype)])
     noise = _first_noise(held)
     if other.size > q:
-        e = evaluate(other, data, noise, full)
+        e = _evaluation(other, data, noise, full)
         step, *_ = np.linalg.lstsq(np.asarray(e.J)[:, q:], -np.asarray(e.r), rcond=1e-10)
         full = full.at[q:].add(jnp.asarray(step, z.dtype))
-    return _signals(evaluate(other, data, noise, full).raw, held)
+    return _signals(_evaluation(other, data, noise, full).raw, held)
 
 
 def _pooled(signals: tuple[Signals, ...]) -> dict[str, Metrics]:

@@ -1,6 +1,5 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -84,7 +83,7 @@ def _remedy(problem: Problem) -> str:
 
 
 def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
-    if not bool(jnp.all(jnp.isfinite(e.J))):
+    if not bool(np.all(np.isfinite(e.J))):
         raise ValueError(
             "the simulation is not finite at the given values: the model is unstable there over "
             "the length of this record; start elsewhere or use a shorter window"
@@ -92,5 +91,5 @@ def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
     unknowns = unknowns_of(problem, layout, e)
     sensitivity, nuisances = _split(problem, layout, e, unknowns)
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
-    null_below = max(NULL, 100.0 * float(jnp.finfo(e.J.dtype).eps))
+    null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     return judge(projected(sensitivity, nuisances), unknowns, _remedy(problem), null_below)

@@ -71,20 +71,20 @@ _COLUMN = 300.0
 then a hundred-thousandth of J'J; a step that fails raises it tenfold."""
 
 
-class Scaling(NamedTuple):
+class _Scaling(NamedTuple):
     """Units in which the optimiser sees a start: z = z0 + unit * xi, residuals / level."""
 
     unit: Float[Array, " q"]
     level: Float[Array, ""]
 
 
-def scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> Scaling:
+def _scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> _Scaling:
     """Columns of equal norm and a cost of order one; an unknown without effect stays put."""
     norms = jnp.linalg.norm(J0, axis=0)
     norms = jnp.where(jnp.isfinite(norms), norms, 0.0)
     usable = norms > 1e-12 * jnp.max(norms)
     level = jnp.maximum(jnp.linalg.norm(r0), 1e-300)
-    return Scaling(jnp.where(usable, _COLUMN * level / jnp.where(usable, norms, 1.0), 0.0), level)
+    return _Scaling(jnp.where(usable, _COLUMN * level / jnp.where(usable, norms, 1.0), 0.0), level)
 
 
 @eqx.filter_jit
@@ -93,24 +93,31 @@ def optimise(
     data: Data,
     sd: tuple[dict[str, Any], ...],
     z0: Float[Array, " q"],
-    units: Scaling,
     max_steps: int = 200,
 ) -> Optimum:
     """The least-squares optimum from z0; compiled once per layout and shapes."""
+    first = evaluate(layout, data, sd, z0)
+    units = _scaling(first.r, first.J)
 
-    # The optimiser multiplies by J several times a step; by this rule it is made once, in the
-    # pass that gives the residuals, and multiplied as a matrix.
+    # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
+    # decomposition of [J r]: as many rows as unknowns, and one. The optimiser sees these rows.
+    def triangle(xi: Array) -> tuple[Array, Array]:
+        e = evaluate(layout, data, sd, z0 + units.unit * xi)
+        columns = jnp.concatenate([e.J * units.unit[None, :], e.r[:, None]], axis=1) / units.level
+        R = jnp.linalg.qr(columns, mode="r")
+        return R[:, -1], R[:, :-1]
+
     @jax.custom_jvp
-    def scaled(xi: Array) -> Array:
-        return evaluate(layout, data, sd, z0 + units.unit * xi).r / units.level
+    def rows(xi: Array) -> Array:
+        return triangle(xi)[0]
 
-    @scaled.defjvp
-    def scaled_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        e = evaluate(layout, data, sd, z0 + units.unit * primals[0])
-        return e.r / units.level, e.J @ (tangents[0] * units.unit / units.level)
+    @rows.defjvp
+    def rows_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        r, J = triangle(primals[0])
+        return r, J @ tangents[0]
 
     def fn(xi: Array, _: Any) -> Array:
-        return scaled(xi)
+        return rows(xi)
 
     solution = optx.least_squares(
         fn,
@@ -123,8 +130,8 @@ def optimise(
         options={"jac": "fwd"},
     )
     z = z0 + units.unit * solution.value
-    rows = residuals_count(layout, data)
-    cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / rows
+    count = residuals_count(layout, data)
+    cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / count
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
     converged = (solution.result == optx.RESULTS.successful) & fine
     return Optimum(z, cost, solution.stats["num_steps"], converged)

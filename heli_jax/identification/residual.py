@@ -120,73 +120,64 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
     """The numbers of a problem over the given flights."""
-    base = {n: jnp.asarray(v) for n, v in naming.asdict(problem.vehicle).items()}
-    frees = list(problem.free.values())
+    dtype = np.dtype(jnp.result_type(float))
+    nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [coordinates.limits(f) for f in frees]
 
-    def column(values: list[float]) -> Array:
-        return jnp.asarray(np.array(values, dtype=np.float64), jnp.result_type(float))
+    def column(values: list[float]) -> np.ndarray:
+        return np.array(values, dtype)
 
-    return Data(
-        base=base,
+    numbers = Data(
+        base={n: jnp.asarray(v) for n, v in naming.asdict(problem.vehicle).items()},
         sign=column([float(np.sign(f.start)) or 1.0 for f in frees]),
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
-        flights=tuple(_flight_data(problem, f) for f in flights),
+        flights=tuple(_flight_data(problem, f, dtype) for f in flights),
     )
+    numbers = jax.device_put(numbers)
+    return _with_state_scales(problem, flights, numbers) if nuisance.initial_state else numbers
 
 
-def _flight_data(problem: Problem, flight: Flight) -> FlightData:
-    model, dtype = problem.model, jnp.result_type(float)
-    inputs = {n: jnp.asarray(flight.inputs[n], dtype) for n in naming.names(model.Inputs)}
-    known = {n: jnp.asarray(v, dtype) for n, v in flight.known.items()}
-    outputs = {n: jnp.asarray(y, dtype) for n, y in flight.outputs.items()}
-    data = FlightData(
-        dt=jnp.asarray(flight.dt, dtype),
+def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:
+    model = problem.model
+    inputs = {n: np.asarray(flight.inputs[n], dtype) for n in naming.names(model.Inputs)}
+    outputs = {n: np.asarray(y, dtype) for n, y in flight.outputs.items()}
+    return FlightData(
+        dt=np.asarray(flight.dt, dtype),
         inputs=model.Inputs(**inputs),
         outputs=outputs,
-        known=known,
-        state_scale={},
-        bias_scale={n: 10.0 * _size(y) for n, y in outputs.items()},
+        known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
+        state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
+        bias_scale={n: np.asarray(10.0 * _size(y), dtype) for n, y in outputs.items()},
     )
-    return data._replace(state_scale=_state_scales(problem, data))
 
 
-def _size(values: Any) -> Array:
+def _size(values: Any) -> float:
     """rms of a signal, 1 where that says nothing."""
-    rms = jnp.sqrt(jnp.mean(jnp.square(values)))
-    return jnp.where(jnp.isfinite(rms) & (rms > 0), rms, jnp.ones_like(rms))
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = float(np.sqrt(np.mean(np.square(np.asarray(values)))))
+    return rms if np.isfinite(rms) and rms > 0 else 1.0
 
 
-def _state_scales(problem: Problem, data: FlightData) -> dict[str, Array]:
+def _with_state_scales(problem: Problem, flights: tuple[Flight, ...], data: Data) -> Data:
     """Ten times what each state does in a run from the start values: a weak prior's sd.
 
     The run is brought to the size of the measured outputs first, since a gain may be unknown.
     """
-    run = _simulate_start(
-        problem.model, problem.start_params(), data, problem.solver, problem.substeps
-    )
-    ratios = [_size(y) / _size(getattr(run.outputs, n)) for n, y in data.outputs.items()]
-    ratio = 10.0 * jnp.mean(jnp.stack(ratios))
-    return {n: ratio * _size(v) for n, v in naming.asdict(run.states).items()}
-
-
-@eqx.filter_jit
-def _simulate_start(
-    model: Model, params: Any, data: FlightData, solver: str | None, substeps: int
-) -> Trajectory:
-    params = naming.replace(params, **data.known)
-    return simulate(
-        model,
-        params,
-        data.inputs,
-        dt=data.dt,
-        solver=solver,
-        substeps=substeps,
-        adjoint=dfx.ForwardMode(),
-    )
+    layout = layout_of(problem, flights)
+    z = start_vector(layout, data, problem.free)
+    one = np.ones((), z.dtype)
+    sd = tuple(dict.fromkeys(flight.outputs, one) for flight in data.flights)
+    e = jax.device_get(evaluate(layout, data, sd, z))
+    scaled = []
+    for flight, raw, rms in zip(data.flights, e.raw, e.state_rms, strict=True):
+        y = {n: np.asarray(v) for n, v in flight.outputs.items()}
+        ratio = 10.0 * float(np.mean([_size(v) / _size(v - raw[n]) for n, v in y.items()]))
+        scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in rms.items()}
+        scaled.append(flight._replace(state_scale=jax.device_put(scale)))
+    return data._replace(flights=tuple(scaled))
 
 
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
@@ -270,16 +261,6 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
     return tuple(out)
 
 
-def raw_residuals(layout: Layout, data: Data, z: Float[Array, " q"]) -> tuple[dict[str, Any], ...]:
-    """measured - bias - simulated, in SI, by flight and output."""
-    u = unpack(layout, data, z)
-    runs = predict(layout, data, u)
-    return tuple(
-        {n: y - bias[n] - getattr(run.outputs, n) for n, y in flight.outputs.items()}
-        for flight, run, bias in zip(data.flights, runs, u.biases, strict=True)
-    )
-
-
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
     """(value - mean) / sd of the parameters' priors; zero where there is none."""
     u = unpack(layout, data, z)
@@ -302,6 +283,8 @@ class Evaluation(NamedTuple):
 
     raw: tuple[dict[str, Any], ...]
     """measured - bias - simulated, SI, by flight and output"""
+    state_rms: tuple[dict[str, Any], ...]
+    """root mean square of each state, by flight"""
     r: Any
     """(n,) whitened residuals with prior rows"""
     J: Any
@@ -323,14 +306,23 @@ def evaluate(
     """
 
     def rows(z: Array) -> tuple[Array, Any]:
-        raw = raw_residuals(layout, data, z)
+        u = unpack(layout, data, z)
+        runs = predict(layout, data, u)
+        raw = tuple(
+            {n: y - bias[n] - getattr(run.outputs, n) for n, y in flight.outputs.items()}
+            for flight, run, bias in zip(data.flights, runs, u.biases, strict=True)
+        )
+        rms = tuple(
+            {n: jnp.sqrt(jnp.mean(jnp.square(v))) for n, v in naming.asdict(run.states).items()}
+            for run in runs
+        )
         r = _whitened(layout, data, sd, z, raw)
-        return r, (raw, r)
+        return r, (raw, rms, r)
 
     def named(z: Array) -> Array:
         u = unpack(layout, data, z)
         shift = () if u.shift is None else (u.shift,)
         return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
 
-    J, (raw, r) = jax.jacfwd(rows, has_aux=True)(z)
-    return Evaluation(raw, r, J, named(z), jnp.diagonal(jax.jacfwd(named)(z)))
+    J, (raw, rms, r) = jax.jacfwd(rows, has_aux=True)(z)
+    return Evaluation(raw, rms, r, J, named(z), jnp.diagonal(jax.jacfwd(named)(z)))

@@ -14,10 +14,9 @@ from heli_jax.identification.optimise import (
     Optimum,
     optimise,
     residuals_count,
-    scaling,
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
-from heli_jax.identification.residual import Data, Layout, evaluate, layout_of, predict, unpack
+from heli_jax.identification.residual import Data, Layout, layout_of, predict, unpack
 from heli_jax.identification.result import StartRow
 
 Progress = Callable[[str], None]
@@ -135,20 +134,17 @@ class Search:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
-        for i, z in enumerate(points):
-            runs.append(self._one(layout, sd, z))
+        for i in range(points.shape[0]):
+            found = optimise(layout, self.data, sd, points[i], self.max_steps)
+            runs.append(jax.device_get(found)._replace(z=found.z))
             if tell is not None and points.shape[0] > 1:
                 tell(f"{i + 1} of {points.shape[0]} starts done")
         return runs
 
-    def _one(self, layout: Layout, sd: Any, z0: Array) -> Optimum:
-        e = evaluate(layout, self.data, sd, z0)
-        return optimise(layout, self.data, sd, z0, scaling(e.r, e.J), self.max_steps)
-
     def _worth(self, run: Optimum, sd: Any) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
         power = [
-            float(jnp.sum(jnp.square(y / s[n])))
+            float(np.sum(np.square(np.asarray(y) / np.asarray(s[n]))))
             for flight, s in zip(self.data.flights, sd, strict=True)
             for n, y in flight.outputs.items()
         ]
@@ -179,8 +175,9 @@ class Search:
 
 def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:
     """The free parameters' values at z."""
+    at, sign, low, high = (np.asarray(v) for v in (z, data.sign, data.low, data.high))
     return {
-        n: float(coordinates.to_value(how, z[i], data.sign[i], data.low[i], data.high[i]))
+        n: float(coordinates.to_value(how, at[i], sign[i], low[i], high[i]))
         for i, (n, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
     }
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
+from matplotlib import mlab
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
@@ -103,10 +103,10 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     if segments < SEGMENTS:
         wanted = needed * dt * (SEGMENTS + 1) / 2
         return f"wanted are {SEGMENTS} segments of {needed * dt:.3g} s, a record of {wanted:.3g} s"
-    how: dict[str, Any] = {"fs": 1.0 / dt, "nperseg": length, "detrend": "linear"}
-    f, Suu = scipy.signal.welch(u, **how)
-    _, Syy = scipy.signal.welch(y, **how)
-    _, Suy = scipy.signal.csd(u, y, **how)
+    how: dict[str, Any] = {"NFFT": length, "Fs": 1.0 / dt, "noverlap": length // 2}
+    how["detrend"] = "linear"
+    Suu, f = (np.asarray(v) for v in mlab.psd(u, **how))
+    Syy, Suy = np.asarray(mlab.psd(y, **how)[0]), np.asarray(mlab.csd(u, y, **how)[0])
     useful = (f > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
     f, Suu, Syy, Suy = f[useful], Suu[useful], Syy[useful], Suy[useful]
     return Empirical(2 * np.pi * f, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), segments)

@@ -4,65 +4,48 @@ For one record this takes a fraction of the time of a step per sample; for large
 vehicles a step per sample is better, since the products grow with m.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.solvers import Held, at
+from heli_jax.simulation.solvers import Held, advance, at
 
 
-class Blocked(NamedTuple):
-    """A record cut into blocks."""
+def blockwise(held: Held, m: int, x0: Any) -> Any:
+    """The states (N,) of a record from x0, cut into blocks of m samples, m a power of two.
 
-    held: Held
-    """the coarse recurrence X[k+1] = A^m X[k] + w[k], whose inputs are the columns of w"""
-    count: int
-    """number of blocks"""
-    powers: Float[Array, "m n n"]
-    """A^0 ... A^(m-1)"""
-    response: Float[Array, "m n r"]
-    """A^j B"""
-    inputs: Float[Array, "count m r"]
-
-
-def blocked(held: Held, m: int) -> Blocked:
-    """Cut a record into blocks of m samples; the last one is filled up with zeros."""
+    From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
+    its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
+    """
     assert held.discrete is not None
     A = _matrix(held.discrete.Ad)
     B, U = _columns(held)
-    count = -(-U.shape[0] // m)
-    U = jnp.pad(U, ((0, count * m - U.shape[0]), (0, 0))).reshape(count, m, -1)
+    n, size = U.shape[0], A.shape[0]
+    count = -(-n // m)
+    U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
     powers, Am = _powers(A, m)
     response = powers @ B
     w = jnp.einsum("kjr,jnr->kn", U, response[::-1])
-    n = A.shape[0]
-    eye = tuple(tuple(row) for row in jnp.eye(n, dtype=A.dtype))
-    rows = tuple(tuple(row) for row in Am)
-    coarse = Held(held.params, tuple(w.T), held.dt, None, Discrete(rows, eye, None))
-    return Blocked(coarse, count, powers, response, U)
+    eye = tuple(tuple(row) for row in jnp.eye(size, dtype=A.dtype))
+    coarse = Discrete(tuple(tuple(row) for row in Am), eye, None)
 
+    def step(x: Any, w: Any) -> tuple[Any, Any]:
+        return advance(coarse, x, w), jnp.stack(x)
 
-def expanded(cut: Blocked, starts: Any, n: int) -> Any:
-    """All n states from those at the starts of the blocks, one state variable at a time.
-
-    `starts` and the result are the model's State, with arrays (count,) and (n,).
-    """
-    X = jnp.stack(jax.tree.leaves(starts), axis=1)
-    m = cut.powers.shape[0]
+    _, starts = jax.lax.scan(step, jax.tree.leaves(x0), list(w.T))
     lag = jnp.arange(m)[:, None] - 1 - jnp.arange(m)[None, :]
     kept = (lag >= 0)[:, :, None]
 
     def one(i: int) -> Array:
-        past = jnp.where(kept, cut.response[jnp.maximum(lag, 0), i], 0.0)
-        free = X @ cut.powers[:, i].T
-        forced = cut.inputs.reshape(cut.count, -1) @ past.reshape(m, -1).T
+        past = jnp.where(kept, response[jnp.maximum(lag, 0), i], 0.0)
+        free = starts @ powers[:, i].T
+        forced = U.reshape(count, -1) @ past.reshape(m, -1).T
         return (free + forced).reshape(-1)[:n]
 
-    values = [one(i) for i in range(X.shape[1])]
-    return jax.tree.unflatten(jax.tree.structure(starts), values)
+    return jax.tree.unflatten(jax.tree.structure(x0), [one(i) for i in range(size)])
 
 
 def _matrix(rows: Any) -> Array:

@@ -32,7 +32,11 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     # Loops rather than unrolled sums: they run as fast and compile in half the time.
     degrees = jnp.arange(_DEGREE, 0, -1, dtype=M.dtype)
     E, _ = jax.lax.scan(lambda E, k: (eye + _product(X, E) / k, None), eye, degrees)
-    E = jax.lax.fori_loop(0, _SQUARINGS, lambda i, E: jnp.where(i < s, _product(E, E), E), E)
+
+    def square(i: Array, E: Array) -> Array:
+        return jax.lax.cond(i < s, lambda E: _product(E, E), lambda E: E, E)
+
+    E = jax.lax.fori_loop(0, _SQUARINGS, square, E)
     E = jnp.where(s <= _SQUARINGS, E, jnp.nan)
     return E * (d[:, None] / d[None, :])
 
@@ -42,9 +46,9 @@ def _product(X: Float[Array, "n n"], Y: Float[Array, "n n"]) -> Float[Array, "n 
     n = X.shape[0]
     if n > _SMALL:
         return X @ Y
-    total = X[:, 0, None] * Y[0]
+    total = X[:, 0, None] * Y[0, None]
     for k in range(1, n):
-        total = total + X[:, k, None] * Y[k]
+        total = total + X[:, k, None] * Y[k, None]
     return total
 
 

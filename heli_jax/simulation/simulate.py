@@ -4,14 +4,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.blocks import blocked, expanded
+from heli_jax.simulation.blocks import blockwise
 from heli_jax.simulation.discretize import discretize, process_noise, square_root
 from heli_jax.simulation.solvers import (
     RK4,
@@ -109,43 +108,24 @@ def simulate(
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = _start(model, params, initial_state, inputs, dt)
-    dtype = jax.tree.leaves(x0)[0].dtype
     adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
     if controller is not None:
-        sol = _adaptive(
+        states, result = _adaptive(
             model, params, inputs, dt, x0, solver, controller, delay, adjoint, max_steps
         )
     else:
         method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
         if key is not None:
             held = _with_noise(model, held, method, dt, key)
-        cut = None
         if block > 1:
             _require_blocks(method, block)
-            cut = blocked(held, block)
-            held = cut.held
-        steps = n - 1 if cut is None else max(cut.count - 1, 1)
-        sol = dfx.diffeqsolve(
-            term,
-            method,
-            t0=jnp.zeros((), dtype),
-            t1=jnp.asarray(steps, dtype),
-            dt0=jnp.ones((), dtype),
-            y0=x0,
-            args=held,
-            saveat=dfx.SaveAt(t0=True, steps=True),
-            max_steps=steps,
-            adjoint=adjoint,
-            throw=False,
-        )
-        if cut is not None:
-            starts = jax.tree.map(lambda v: v[: cut.count], sol.ys)
-            sol = eqx.tree_at(lambda s: s.ys, sol, expanded(cut, starts, n))
-    states: Any = sol.ys
+            states, result = blockwise(held, block, x0), dfx.RESULTS.successful
+        else:
+            states, result = _stepwise(method, held, term, x0, n, adjoint)
     outputs = _outputs(model, params, states, inputs, dt, delay)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
     times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
-    return Trajectory(times, states, outputs, sol.result, finite)
+    return Trajectory(times, states, outputs, result, finite)
 
 
 def accumulate(
@@ -281,6 +261,26 @@ def _term(model: Model) -> dfx.ODETerm:
     return dfx.ODETerm(field)
 
 
+def _stepwise(
+    method: Any, held: Held, term: dfx.ODETerm, x0: Any, n: int, adjoint: Any
+) -> tuple[Any, dfx.RESULTS]:
+    dtype = jax.tree.leaves(x0)[0].dtype
+    sol = dfx.diffeqsolve(
+        term,
+        method,
+        t0=jnp.zeros((), dtype),
+        t1=jnp.asarray(n - 1, dtype),
+        dt0=jnp.ones((), dtype),
+        y0=x0,
+        args=held,
+        saveat=dfx.SaveAt(t0=True, steps=True),
+        max_steps=n - 1,
+        adjoint=adjoint,
+        throw=False,
+    )
+    return sol.ys, sol.result
+
+
 def _adaptive(
     model: Model,
     params: Any,
@@ -292,7 +292,7 @@ def _adaptive(
     delay: Any,
     adjoint: Any,
     max_steps: int,
-) -> dfx.Solution:
+) -> tuple[Any, dfx.RESULTS]:
     method = _method(model, dfx.Dopri8() if solver is None else solver)
     if isinstance(method, Exact | RK4):
         raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
@@ -309,7 +309,7 @@ def _adaptive(
         k = jnp.searchsorted(jumps, jax.lax.stop_gradient(t), side="right") - 1
         return model.vector_field(params, x, at(inputs, k))
 
-    return dfx.diffeqsolve(
+    sol = dfx.diffeqsolve(
         dfx.ODETerm(field),
         method,
         t0=times[0],
@@ -323,6 +323,7 @@ def _adaptive(
         adjoint=adjoint,
         throw=False,
     )
+    return sol.ys, sol.result
 
 
 def _outputs(model: Model, params: Any, states: Any, inputs: Any, dt: Any, delay: Any) -> Any:

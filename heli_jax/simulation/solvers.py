@@ -66,18 +66,23 @@ class Exact(dfx.AbstractSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
     ) -> Any:
-        k, Ad, Bd, Bp = _sample(t0), *args.discrete  # type: ignore[misc]
+        assert args.discrete is not None
+        k = _sample(t0)
         if args.delay is not None:
             k = k - args.delay[0]
-        x = jax.tree.leaves(y0)
-        rows = list(zip(Ad, Bd, strict=True))
+        before = None if args.delay is None else jax.tree.leaves(at(args.inputs, k - 1))
         u = jax.tree.leaves(at(args.inputs, k))
-        new = [_dot(a, x) + _dot(b, u) for a, b in rows]
-        if Bp is not None:
-            before = jax.tree.leaves(at(args.inputs, k - 1))
-            new = [x + _dot(b, before) for x, b in zip(new, Bp, strict=True)]
+        new = advance(args.discrete, jax.tree.leaves(y0), u, before)
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+
+
+def advance(discrete: Discrete, x: Any, u: Any, before: Any = None) -> list[Any]:
+    """x[k+1] from lists of scalars; `before` is the input still held from the sample before."""
+    new = [_dot(a, x) + _dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
+    if discrete.Bp is not None:
+        new = [v + _dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
+    return new
 
 
 def _dot(coefficients: Any, values: Any) -> Any:
