@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.dynamics.model import Model, linear_misfit, zeros
+from heli_jax.dynamics.model import Model, field_and_output, linear_misfit, plain
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.vehicle import Helicopter, impossible
@@ -181,8 +181,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 def _check_model(problem: Problem) -> None:
     params = problem.start_params()
     for flight in problem.flights:
-        known = {n: jnp.asarray(v, jnp.result_type(float)) for n, v in flight.known.items()}
-        missing = needed_but_missing(problem.model, naming.replace(params, **known))
+        missing = needed_but_missing(problem.model, naming.replace(params, **flight.known))
         if missing:
             raise ValueError(
                 f"vehicle: {', '.join(missing)} missing, model {problem.model.name} needs it"
@@ -196,15 +195,16 @@ def _check_model(problem: Problem) -> None:
 
 def needed_but_missing(model: Model, params: Any) -> list[str]:
     """The parameters that are NaN (not given) and that the model reads, in field order."""
-    values = naming.asdict(params)
-    open_ = [n for n, v in values.items() if bool(np.isnan(np.asarray(v)))]
+    params = plain(params)
+    open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    one = np.float64(1.0)
+    x = model.State(**dict.fromkeys(naming.names(model.State), one))
+    u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
 
     def reads(name: str) -> bool:
-        one = jnp.ones((), jnp.result_type(float))
         filled = naming.replace(params, **{n: one for n in open_ if n != name})
-        x = jax.tree.map(jnp.ones_like, zeros(model.State))
-        u = jax.tree.map(jnp.ones_like, zeros(model.Inputs))
-        parts = model.vector_field(filled, x, u), model.output(filled, x, u)
-        return any(bool(np.isnan(np.asarray(v)).any()) for v in jax.tree.leaves(parts))
+        with np.errstate(all="ignore"):
+            parts = field_and_output(model, filled, x, u)
+        return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
 
     return [n for n in open_ if reads(n)]
