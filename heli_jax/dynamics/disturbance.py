@@ -78,4 +78,5 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         linear=model.linear,
         start=start,
         noise=noise,
+        spread=lambda p: dict.fromkeys(chain, p.sigma_w),
     )

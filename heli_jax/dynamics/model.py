@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from heli_jax import naming
 
@@ -34,6 +35,16 @@ class Model(eqx.Module):
     start: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     """noise(params): a State of white-noise intensities, 1 over sqrt(s) times the state's rate"""
+    spread: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
+    """spread(params): standard deviation at the first sample of the states that are random there,
+    by name; the others begin where `start` puts them"""
+
+    @property
+    def spread_names(self) -> tuple[str, ...]:
+        """The states that are random at the first sample."""
+        if self.spread is None:
+            return ()
+        return tuple(self.spread(self.Params(**dict.fromkeys(naming.names(self.Params), 1.0))))
 
     def initial_state(self, params: Any) -> Any:
         """The state at the first sample: `start(params)`, or all zeros."""
@@ -46,6 +57,13 @@ def zeros(record: type, dtype: Any = None) -> Any:
     """A record of scalar zeros of the default float type (or `dtype`)."""
     dtype = jnp.result_type(float) if dtype is None else dtype
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
+
+
+def spread_of(model: Model, params: Any, dtype: Any) -> Array:
+    """The standard deviations (n,) of all states at the first sample; zero where not random."""
+    given = model.spread(params) if model.spread is not None else {}
+    values = [given.get(n, 0.0) for n in naming.names(model.State)]
+    return jnp.stack([jnp.asarray(v, dtype) for v in values])
 
 
 def linear_misfit(model: Model, params: Any) -> float:

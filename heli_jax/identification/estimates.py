@@ -95,7 +95,7 @@ def stated_noise_notes(problem: Problem, sd: Any) -> list[str]:
 def flight_nuisances(
     problem: Problem, layout: Layout, data: Data, z: Array, e: Evaluation, quantile: float
 ) -> dict[str, Estimate]:
-    """Initial states and biases, with the weak priors they carry."""
+    """The disturbance, then initial states and biases with the weak priors they carry."""
     q = len(layout.named)
     if layout.size == q:
         return {}
@@ -104,17 +104,21 @@ def flight_nuisances(
     norms = np.where(norms > 0, norms, 1.0)
     inverse = np.linalg.pinv(J / norms, rcond=1e-10)
     sds = np.sqrt(np.sum(inverse**2, axis=1)) / norms
-    out, at = {}, q
-    state_names = naming.names(layout.model.State)
+    out, starts = {}, problem.noise
+    for i, name in enumerate(layout.noise):
+        value, relative = float(np.exp(z[q + i])), float(sds[q + i])
+        reach = float(np.exp(min(quantile * relative, 700.0)))
+        unit = naming.unit(layout.model.Params, name) or ""
+        limits = (value / reach, value * reach)
+        out[name] = Estimate(value, value * relative, *limits, unit, starts[name].start, 0.0, False)
+    at = layout.weak
     for label, flight, outputs in zip(
         labels(problem.training), data.flights, layout.outputs, strict=True
     ):
-        parts = []
-        if layout.initial_state:
-            parts += [
-                (f"initial {n}", flight.state_scale[n], naming.unit(layout.model.State, n))
-                for n in state_names
-            ]
+        parts = [
+            (f"initial {n}", flight.state_scale[n], naming.unit(layout.model.State, n))
+            for n in layout.states
+        ]
         if layout.bias:
             parts += [
                 (f"bias {n}", flight.bias_scale[n], naming.unit(layout.model.Outputs, n))
@@ -123,16 +127,8 @@ def flight_nuisances(
         for name, scale, unit in parts:
             value, sd = float(z[at] * scale), float(sds[at] * scale)
             share = min(1.0, float(sds[at]) ** 2)
-            out[f"{label}/{name}"] = Estimate(
-                value,
-                sd,
-                value - quantile * sd,
-                value + quantile * sd,
-                unit or "",
-                0.0,
-                share,
-                False,
-            )
+            limits = (value - quantile * sd, value + quantile * sd)
+            out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
             at += 1
     return out
 

@@ -23,13 +23,14 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.metrics import Metrics, metrics, noise_guess, whiteness
+from heli_jax.identification.metrics import Metrics, Whiteness, metrics, noise_guess, whiteness
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import (
     Data,
     Evaluation,
     Layout,
+    Noise,
     data_of,
     evaluate,
     layout_of,
@@ -46,13 +47,13 @@ def check(problem: Problem) -> Check:
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
-    sd = _first_noise(problem.training)
-    z = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
-    e = _evaluation(layout, data, sd, z)
+    noise = _first_noise(problem.training)
+    z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
+    e = _evaluation(layout, data, noise, z)
     verdict = verdict_of(problem, layout, e)
     runs = tuple(s.simulated for s in _signals(e.raw, problem.training))
-    notes = excitation.notes(problem, runs, sd)
-    return Check(verdict, _noise_by_name(problem, sd), tuple(notes))
+    notes = excitation.notes(problem, runs, noise.sd)
+    return Check(verdict, _noise_by_name(problem, noise), tuple(notes))
 
 
 def fit(
@@ -78,20 +79,20 @@ def fit(
     begin = time.perf_counter()
     tell = progress or (lambda _: None)
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
-    sd = _first_noise(problem.training)
-    z0 = starting.first_guess(layout, data, sd, start_vector(layout, data, problem.free))
-    before = verdict_of(problem, layout, _evaluation(layout, data, sd, z0))
+    noise = _first_noise(problem.training)
+    z0 = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
+    before = verdict_of(problem, layout, _evaluation(layout, data, noise, z0))
     tell(f"fitting {', '.join(layout.named)}")
     points = starting.draw(layout, problem, z0, starts, seed)
     search = starting.Search(problem, layout, data, max_steps)
-    runs = search.run(sd, points, tell)
+    runs = search.run(noise, points, tell)
     best = min(runs, key=starting.rank)
-    best, sd, trace = _settle_noise(search, sd, best)
+    best, noise, trace = _settle_noise(search, noise, best)
     return _assemble(
         problem,
         layout,
         data,
-        sd,
+        noise,
         best,
         before,
         points,
@@ -102,72 +103,100 @@ def fit(
     )
 
 
-def _evaluation(layout: Layout, data: Data, sd: Any, z: Array) -> Evaluation:
+def _evaluation(layout: Layout, data: Data, noise: Noise, z: Array) -> Evaluation:
     """`evaluate` as NumPy arrays, for what is not compiled."""
-    return jax.device_get(evaluate(layout, data, sd, z))
+    return jax.device_get(evaluate(layout, data, noise, z))
 
 
-def _first_noise(flights: Sequence[Flight]) -> Any:
+def _first_noise(flights: Sequence[Flight]) -> Noise:
     """The noise to begin with, by flight and output: as stated, else guessed."""
     dtype = np.dtype(jnp.result_type(float))
-    return tuple(
+    sd = tuple(
         {
             name: np.asarray(flight.sd.get(name) or noise_guess(y), dtype)
             for name, y in flight.outputs.items()
         }
         for flight in flights
     )
+    return Noise(sd, np.zeros((), dtype))
 
 
-def _noise_by_name(problem: Problem, sd: Any) -> dict[str, float]:
+def _noise_by_name(problem: Problem, noise: Noise) -> dict[str, float]:
     return {
         f"{label}/{n}": float(s)
-        for label, by_name in zip(labels(problem.training), sd, strict=True)
+        for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
         for n, s in by_name.items()
     }
 
 
 def _settle_noise(
-    search: starting.Search, sd: Any, best: Optimum
-) -> tuple[Optimum, Any, tuple[tuple[int, float], ...]]:
-    """Alternate between the optimum and the residual sd until both stay (relaxation of R)."""
+    search: starting.Search, noise: Noise, best: Optimum
+) -> tuple[Optimum, Noise, tuple[tuple[int, float], ...]]:
+    """Alternate between the optimum and the noise until both stay (relaxation of R)."""
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(8):
-        raw = _evaluation(search.layout, search.data, sd, best.z).raw
-        new = _residual_sd(search.layout, search.data, raw)
+        e = _evaluation(search.layout, search.data, noise, best.z)
+        z, new = _updated_noise(search.layout, search.data, e, noise, best.z)
         change = max(
-            abs(float(np.log(n[k] / s[k]))) for n, s in zip(new, sd, strict=True) for k in s
-        )
+            abs(float(np.log(n[k] / s[k])))
+            for n, s in zip(new.sd, noise.sd, strict=True)
+            for k in s
+        ) + abs(float(new.level - noise.level))
         if not np.isfinite(change):
             break
-        sd = new
+        best, noise = best._replace(z=z), new
         if change < 1e-3 or not bool(best.converged):
             break
-        [best] = search.run(sd, best.z[None, :])
+        [best] = search.run(noise, best.z[None, :])
         trace.append((int(best.steps), float(best.cost)))
-    return best, sd, tuple(trace)
+    return best, noise, tuple(trace)
 
 
-def _residual_sd(layout: Layout, data: Data, raw: Any) -> Any:
-    """Residual sd by flight and output, with the degrees of freedom taken off in proportion."""
-    n = residuals_count(layout, data)
+def _updated_noise(
+    layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Array
+) -> tuple[Array, Noise]:
+    """The noise that the residuals show, degrees of freedom taken off in proportion.
+
+    With filter error all noise changes by one factor, that of the disturbance in z included, so
+    that the optimum stays where it is.
+    """
+    n = residuals_count(data)
     freedom = n / max(n - layout.size, 1)
+    if not layout.filtered:
+        new = tuple(
+            {k: _residual_sd(r, flight.outputs[k], freedom) for k, r in by_name.items()}
+            for by_name, flight in zip(e.raw, data.flights, strict=True)
+        )
+        return z, Noise(new, noise.level)
+    squares, logs = _innovation_sums(e, noise)
+    factor = np.sqrt(squares / n * freedom)
+    if "sigma_w" in layout.noise:
+        at = len(layout.named) + layout.noise.index("sigma_w")
+        z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
+    sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
+    return z, Noise(sd, np.asarray(logs / n, noise.level.dtype))
 
-    def sd(r: np.ndarray, y: Any) -> np.ndarray:
-        floor = 1e-12 * np.sqrt(np.mean(np.square(np.asarray(y)))) + 1e-300
-        return np.asarray(max(np.sqrt(np.mean(np.square(r)) * freedom), floor), r.dtype)
 
-    return tuple(
-        {k: sd(r, flight.outputs[k]) for k, r in by_name.items()}
-        for by_name, flight in zip(raw, data.flights, strict=True)
-    )
+def _innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
+    """Sums over all measurements of e^2/s and of log(s/sd^2)."""
+    squares, logs = 0.0, 0.0
+    for one, sd in zip(e.innovations, noise.sd, strict=True):
+        for n, s in one.variance.items():
+            squares += float(np.nansum(one.error[n] ** 2 / s))
+            logs += float(np.nansum(np.log(s / sd[n] ** 2)))
+    return squares, logs
+
+
+def _residual_sd(r: np.ndarray, y: Any, freedom: float) -> np.ndarray:
+    floor = 1e-12 * np.sqrt(np.nanmean(np.square(np.asarray(y)))) + 1e-300
+    return np.asarray(max(np.sqrt(np.nanmean(np.square(r)) * freedom), floor), r.dtype)
 
 
 def _assemble(
     problem: Problem,
     layout: Layout,
     data: Data,
-    sd: Any,
+    noise: Noise,
     best: Optimum,
     before: Verdict,
     points: Array,
@@ -176,7 +205,7 @@ def _assemble(
     seed: int,
     timing: dict[str, float],
 ) -> Fit:
-    e = _evaluation(layout, data, sd, best.z)
+    e = _evaluation(layout, data, noise, best.z)
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e) if usable else before
     status: Status = "converged"
@@ -194,16 +223,16 @@ def _assemble(
     named = estimates_of(problem, layout, e, verdict, quantile)
     signals = _signals(e.raw, problem.training)
     held = tuple(f for f in problem.flights if f.hold_out)
-    validation = _validation(problem, sd, best.z, layout, held) if held else ()
+    validation = _validation(problem, best.z, layout, held) if held else ()
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
     nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile)
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
-    notes = [*notes, *stated_noise_notes(problem, sd), *bound_notes(estimates)]
+    notes = [*notes, *stated_noise_notes(problem, noise.sd), *bound_notes(estimates)]
     return Fit(
         model=problem.model.name,
-        method="output-error",
+        method=problem.method,
         status=status,
         n_samples=n,
         estimates=estimates,
@@ -211,13 +240,11 @@ def _assemble(
         params=naming.replace(problem.vehicle, **values),
         verdict_before=before,
         verdict=verdict,
-        noise=_noise_by_name(problem, sd),
+        noise=_noise_by_name(problem, noise),
         signals=(*signals, *validation),
         metrics=_pooled(signals),
         validation=_pooled(validation),
-        whiteness={
-            f"{s.flight}/{n}": whiteness(s.residual(n)) for s in signals for n in s.measured
-        },
+        whiteness=_whiteness(signals, e),
         starts=starting.table(layout, data, points, runs),
         steps=sum(s for s, _ in trace),
         trace=trace,
@@ -225,6 +252,17 @@ def _assemble(
         seed=seed,
         timing=timing,
     )
+
+
+def _whiteness(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
+    """Of the innovations where there are some, else of the residuals."""
+    if not e.innovations:
+        return {f"{s.flight}/{n}": whiteness(s.residual(n)) for s in signals for n in s.measured}
+    return {
+        f"{s.flight}/{n}": whiteness(error[np.isfinite(error)])
+        for s, one in zip(signals, e.innovations, strict=True)
+        for n, error in ((n, v / np.sqrt(one.variance[n])) for n, v in one.error.items())
+    }
 
 
 def _signals(raw: Any, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
@@ -243,11 +281,12 @@ def _signals(raw: Any, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
 
 
 def _validation(
-    problem: Problem, sd: Any, z: Array, layout: Layout, held: tuple[Flight, ...]
+    problem: Problem, z: Array, layout: Layout, held: tuple[Flight, ...]
 ) -> tuple[Signals, ...]:
     """Flights held out, predicted with the estimates; only their initial state and bias are
     adjusted, by linear least squares."""
-    other, data = layout_of(problem, held), data_of(problem, held)
+    other = layout_of(problem, held, simulated=True)
+    data = data_of(problem, held, simulated=True)
     q = len(layout.named)
     full = jnp.concatenate([z[:q], jnp.zeros(other.size - q, z.dtype)])
     noise = _first_noise(held)

@@ -60,7 +60,7 @@ def _split(
     """Data rows of the Jacobian: named unknowns in relative coordinates, and the nuisances."""
     J = np.asarray(e.J, dtype=np.float64)
     q, p = len(layout.named), len(layout.free)
-    weak = layout.size - q
+    weak = layout.size - layout.weak
     data_rows = np.r_[0 : J.shape[0] - p - weak, J.shape[0] - weak : J.shape[0]]
     references = references_of(problem, layout, unknowns)
     slopes = np.asarray(e.slopes, dtype=np.float64)

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from heli_jax.identification.residual import Data, Layout, evaluate
+from heli_jax.identification.residual import Data, Layout, Noise, evaluate
 
 
 class Optimum(NamedTuple):
@@ -91,18 +92,18 @@ def _scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> _Scaling:
 def optimise(
     layout: Layout,
     data: Data,
-    sd: tuple[dict[str, Any], ...],
+    noise: Noise,
     z0: Float[Array, " q"],
     max_steps: int = 200,
 ) -> Optimum:
     """The least-squares optimum from z0; compiled once per layout and shapes."""
-    first = evaluate(layout, data, sd, z0)
+    first = evaluate(layout, data, noise, z0)
     units = _scaling(first.r, first.J)
 
     # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
     # decomposition of [J r]: as many rows as unknowns, and one. The optimiser sees these rows.
     def triangle(xi: Array) -> tuple[Array, Array]:
-        e = evaluate(layout, data, sd, z0 + units.unit * xi)
+        e = evaluate(layout, data, noise, z0 + units.unit * xi)
         columns = jnp.concatenate([e.J * units.unit[None, :], e.r[:, None]], axis=1) / units.level
         R = jnp.linalg.qr(columns, mode="r")
         return R[:, -1], R[:, :-1]
@@ -130,13 +131,18 @@ def optimise(
         options={"jac": "fwd"},
     )
     z = z0 + units.unit * solution.value
-    count = residuals_count(layout, data)
+    seen = [jnp.isfinite(y) for flight in data.flights for y in flight.outputs.values()]
+    count = jnp.sum(jnp.concatenate(seen)).astype(z.dtype)
     cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / count
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
     converged = (solution.result == optx.RESULTS.successful) & fine
     return Optimum(z, cost, solution.stats["num_steps"], converged)
 
 
-def residuals_count(layout: Layout, data: Data) -> int:
+def residuals_count(data: Data) -> int:
     """How many measured numbers there are."""
-    return sum(y.shape[0] for flight in data.flights for y in flight.outputs.values())
+    return sum(
+        int(np.isfinite(np.asarray(y)).sum())
+        for flight in data.flights
+        for y in flight.outputs.values()
+    )

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ class Nuisance(NamedTuple):
     input_gain: bool = False
 
 
+Method = Literal["output-error", "filter-error"]
+
 MAX_TIME_SHIFT = 0.5
 """Bound on an estimated time shift to either side [s]."""
 
@@ -70,10 +72,16 @@ class Problem:
     substeps: int = 4
     gain_units: Mapping[str, str] = field(default_factory=dict)
     """the unit that an input's gain carries, where the log's unit is a plain number"""
+    method: Method = "output-error"
+    """output-error compares with a simulation; filter-error with one-step predictions of a
+    Kalman filter, for models with a disturbance (`with_disturbance`)"""
+    fixed_noise: tuple[str, ...] = ()
+    """what filter error takes from `vehicle` instead of estimating it: `tau_w`"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flights", tuple(self.flights))
         object.__setattr__(self, "free", dict(self.free))
+        _check_method(self)
         if not self.free:
             raise ValueError("nothing is free: name at least one parameter to estimate")
         for name, one in self.free.items():
@@ -86,6 +94,19 @@ class Problem:
         _check_model(self)
 
     @property
+    def noise(self) -> dict[str, Free]:
+        """The parameters of the disturbance that filter error estimates, with their starts."""
+        if self.method == "output-error":
+            return {}
+        size = max(float(np.std(y)) for f in self.training for y in f.outputs.values())
+        found = {"sigma_w": Free(size or 1.0), "tau_w": Free(1.0)}
+        for name in found:
+            value = float(getattr(self.vehicle, name))
+            if math.isfinite(value) and value > 0:
+                found[name] = Free(value)
+        return {n: f for n, f in found.items() if n not in self.fixed_noise}
+
+    @property
     def training(self) -> tuple[Flight, ...]:
         """The flights that are fitted."""
         return tuple(f for f in self.flights if not f.hold_out)
@@ -96,6 +117,23 @@ class Problem:
             self.vehicle,
             **{n: jnp.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
         )
+
+
+def _check_method(problem: Problem) -> None:
+    model = problem.model
+    if problem.method == "output-error":
+        return
+    have = naming.names(model.Params)
+    if model.noise is None or "sigma_w" not in have or "tau_w" not in have:
+        raise ValueError(
+            f"method filter-error: model {model.name} has no disturbance, wanted is a model made "
+            "with with_disturbance (in a configuration: a `disturbance`)"
+        )
+    if not model.linear:
+        raise ValueError(f"method filter-error: model {model.name} is not linear, wanted is one")
+    for name in ("sigma_w", "tau_w"):
+        if name in problem.free:
+            raise ValueError(f"free.{name}: filter-error estimates it by itself, leave it out")
 
 
 def _check_free(name: str, one: Free, model: Model) -> None:

@@ -5,7 +5,6 @@ For flight f and output j the residual is (measured - bias - simulated) / sd; pr
 input gains, the time shift, then for each flight the initial state and the biases.
 """
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -19,7 +18,8 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import coordinates
-from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
+from heli_jax.identification.kalman import Innovations, innovations
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 _BLOCK = 32
@@ -65,6 +65,10 @@ class Layout(eqx.Module):
     initial_state: bool = eqx.field(static=True)
     bias: bool = eqx.field(static=True)
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    noise: tuple[str, ...] = eqx.field(static=True)
+    """parameters of the disturbance, estimated beside the others by filter error"""
+    filtered: bool = eqx.field(static=True)
+    """whether the residuals are a Kalman filter's innovations"""
     solver: str | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
@@ -77,17 +81,40 @@ class Layout(eqx.Module):
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
 
     @property
+    def states(self) -> tuple[str, ...]:
+        """The states whose initial values are unknowns: all that are not random there."""
+        if not self.initial_state:
+            return ()
+        random = self.model.spread_names
+        return tuple(n for n in naming.names(self.model.State) if n not in random)
+
+    @property
+    def weak(self) -> int:
+        """Where in z the initial states and biases begin."""
+        return len(self.named) + len(self.noise)
+
+    @property
     def size(self) -> int:
         """The number of unknowns."""
-        states = len(naming.names(self.model.State)) if self.initial_state else 0
-        each = [states + (len(o) if self.bias else 0) for o in self.outputs]
-        return len(self.named) + sum(each)
+        each = [len(self.states) + (len(o) if self.bias else 0) for o in self.outputs]
+        return self.weak + sum(each)
+
+
+class Noise(NamedTuple):
+    """What the residuals are measured by."""
+
+    sd: tuple[dict[str, Any], ...]
+    """of the measurement noise, by flight and output"""
+    level: Any
+    """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
+    the concentrated likelihood is scaled, so that its rows have variance 1"""
 
 
 class Unknowns(NamedTuple):
     """The vector z taken apart, in the units of the model."""
 
     params: dict[str, Any]
+    noise: dict[str, Any]
     gains: dict[str, Any]
     shift: Any
     states: tuple[Any, ...]
@@ -95,11 +122,19 @@ class Unknowns(NamedTuple):
     biases: tuple[dict[str, Any], ...]
 
 
-def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
+def layout_of(
+    problem: Problem,
+    flights: tuple[Flight, ...],
+    *,
+    bounded: bool = False,
+    simulated: bool = False,
+) -> Layout:
     """The static side of a problem over the given flights.
 
-    `bounded` keeps the free parameters within their bounds by logit coordinates.
+    `bounded` keeps the free parameters within their bounds by logit coordinates; `simulated`
+    compares with a simulation whatever the problem's method.
     """
+    filtering = problem.method == "filter-error" and not simulated
     how = coordinates.kind if bounded else coordinates.plain_kind
     nuisance = problem.nuisance
     exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
@@ -112,14 +147,16 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         initial_state=nuisance.initial_state,
         bias=nuisance.bias,
         outputs=tuple(tuple(f.outputs) for f in flights),
+        noise=tuple(problem.noise) if filtering else (),
+        filtered=filtering,
         solver=problem.solver,
         substeps=problem.substeps,
         block=_BLOCK if exact else 1,
     )
 
 
-def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
-    """The numbers of a problem over the given flights."""
+def data_of(problem: Problem, flights: tuple[Flight, ...], *, simulated: bool = False) -> Data:
+    """The numbers of a problem over the given flights; `simulated` as in `layout_of`."""
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [coordinates.limits(f) for f in frees]
@@ -137,7 +174,10 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
         flights=tuple(_flight_data(problem, f, dtype) for f in flights),
     )
     numbers = jax.device_put(numbers)
-    return _with_state_scales(problem, flights, numbers) if nuisance.initial_state else numbers
+    if not nuisance.initial_state:
+        return numbers
+    layout = layout_of(problem, flights, simulated=simulated)
+    return _with_state_scales(problem, layout, numbers)
 
 
 def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:
@@ -161,16 +201,15 @@ def _size(values: Any) -> float:
     return rms if np.isfinite(rms) and rms > 0 else 1.0
 
 
-def _with_state_scales(problem: Problem, flights: tuple[Flight, ...], data: Data) -> Data:
+def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     """Ten times what each state does in a run from the start values: a weak prior's sd.
 
     The run is brought to the size of the measured outputs first, since a gain may be unknown.
     """
-    layout = layout_of(problem, flights)
-    z = start_vector(layout, data, problem.free)
+    z = start_vector(layout, data, problem)
     one = np.ones((), z.dtype)
     sd = tuple(dict.fromkeys(flight.outputs, one) for flight in data.flights)
-    e = jax.device_get(evaluate(layout, data, sd, z))
+    e = jax.device_get(evaluate(layout, data, Noise(sd, np.zeros((), z.dtype)), z))
     scaled = []
     for flight, raw, rms in zip(data.flights, e.raw, e.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
@@ -193,62 +232,72 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     if layout.shift:
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
+    noise = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.noise)}
+    at = layout.weak
     states, biases = [], []
-    state_names = naming.names(layout.model.State)
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):
         state = None
         if layout.initial_state:
-            values = {n: z[at + i] * flight.state_scale[n] for i, n in enumerate(state_names)}
-            state, at = layout.model.State(**values), at + len(state_names)
+            zero = jnp.zeros_like(z[0])
+            values = dict.fromkeys(naming.names(layout.model.State), zero)
+            values |= {n: z[at + i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
+            state, at = layout.model.State(**values), at + len(layout.states)
         bias = {n: jnp.zeros_like(z[0]) for n in outputs}
         if layout.bias:
             bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
             at += len(outputs)
         states.append(state)
         biases.append(bias)
-    return Unknowns(params, gains, shift, tuple(states), tuple(biases))
+    return Unknowns(params, noise, gains, shift, tuple(states), tuple(biases))
 
 
-def start_vector(layout: Layout, data: Data, free: Mapping[str, Free]) -> Float[Array, " q"]:
+def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
     """z at the start values: gains 1, no shift, the model's own initial state, no bias."""
     z = [
         coordinates.to_coordinate(
-            how, jnp.asarray(free[n].start, data.low.dtype), data.sign[i], data.low[i], data.high[i]
+            how, jnp.asarray(f.start, data.low.dtype), data.sign[i], data.low[i], data.high[i]
         )
-        for i, (n, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
+        for i, (f, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
     ]
     one, zero = jnp.ones((), data.low.dtype), jnp.zeros((), data.low.dtype)
-    rest = layout.size - len(z) - len(layout.gains)
-    z = jnp.stack([*z, *[one] * len(layout.gains), *[zero] * rest])
+    z += [one] * len(layout.gains) + [zero] * layout.shift
+    z += [jnp.asarray(np.log(problem.noise[n].start), data.low.dtype) for n in layout.noise]
+    z = jnp.stack([*z, *[zero] * (layout.size - len(z))])
     if layout.initial_state:
-        z = _initial_states(layout, data, free, z)
+        z = _initial_states(layout, data, problem, z)
     return z
 
 
-def _initial_states(layout: Layout, data: Data, free: Mapping[str, Free], z: Array) -> Array:
-    at = len(layout.named)
-    values = {n: jnp.asarray(f.start, z.dtype) for n, f in free.items()}
+def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
+    at = layout.weak
+    values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):
         params = layout.model.Params(**{**data.base, **values, **flight.known})
         state = naming.asdict(layout.model.initial_state(params))
-        for i, (name, value) in enumerate(state.items()):
-            z = z.at[at + i].set(value / flight.state_scale[name])
-        at += len(state) + (len(outputs) if layout.bias else 0)
+        for i, name in enumerate(layout.states):
+            z = z.at[at + i].set(state[name] / flight.state_scale[name])
+        at += len(layout.states) + (len(outputs) if layout.bias else 0)
     return z
+
+
+def _run(layout: Layout, data: Data, u: Unknowns, flight: FlightData) -> tuple[Any, Any]:
+    """Parameters and inputs of one flight at the unknowns."""
+    params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
+    inputs = naming.asdict(flight.inputs)
+    inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
+    return params, layout.model.Inputs(**inputs)
 
 
 def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
     """The simulated flights (without bias)."""
     out = []
     for flight, state in zip(data.flights, u.states, strict=True):
-        params = layout.model.Params(**{**data.base, **u.params, **flight.known})
-        inputs = naming.asdict(flight.inputs)
-        inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
+        params, inputs = _run(layout, data, u, flight)
         out.append(
             simulate(
                 layout.model,
                 params,
-                layout.model.Inputs(**inputs),
+                inputs,
                 dt=flight.dt,
                 initial_state=state,
                 solver=layout.solver,
@@ -261,6 +310,47 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
     return tuple(out)
 
 
+def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Innovations, ...]:
+    """The innovations of every flight."""
+    out = []
+    for flight, state, bias, sd in zip(data.flights, u.states, u.biases, noise.sd, strict=True):
+        params, inputs = _run(layout, data, u, flight)
+        measured = {n: y - bias[n] for n, y in flight.outputs.items()}
+        out.append(
+            innovations(
+                layout.model,
+                params,
+                inputs,
+                measured,
+                sd,
+                dt=flight.dt,
+                initial_state=state,
+                delay=u.shift,
+            )
+        )
+    return tuple(out)
+
+
+def _likelihood_rows(noise: Noise, found: tuple[Innovations, ...]) -> Array:
+    r"""$e_k/\sqrt{s_k}\,\exp(\tfrac12(\overline{\log s} - level))$: rows whose sum of squares
+    is the likelihood with the scale of all noise concentrated out; zero where nothing is measured.
+    """
+    pairs = [
+        (one.error[n], one.variance[n], sd[n])
+        for one, sd in zip(found, noise.sd, strict=True)
+        for n in one.error
+    ]
+    e = jnp.concatenate([e for e, _, _ in pairs])
+    s = jnp.concatenate([s for _, s, _ in pairs])
+    seen = jnp.isfinite(e)
+    safe = jnp.where(seen, s, 1.0)
+    scale = jnp.concatenate([jnp.broadcast_to(sd**2, e.shape) for e, _, sd in pairs])
+    logs = jnp.where(seen, jnp.log(safe / scale), 0.0)
+    mean = jnp.sum(logs) / jnp.sum(seen)
+    whitened = jnp.where(seen, e, 0.0) / jnp.sqrt(safe)
+    return whitened * jnp.exp(0.5 * (mean - noise.level))
+
+
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
     """(value - mean) / sd of the parameters' priors; zero where there is none."""
     u = unpack(layout, data, z)
@@ -270,12 +360,34 @@ def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array
 
 def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     """Weak priors of the initial states and biases: their coordinates are in units of its sd."""
-    return z[len(layout.named) :]
+    return z[layout.weak :]
 
 
-def _whitened(layout: Layout, data: Data, sd: Any, z: Array, raw: Any) -> Array:
-    rows = [r / s[n] for by_name, s in zip(raw, sd, strict=True) for n, r in by_name.items()]
-    return jnp.concatenate([*rows, prior_rows(layout, data, z), weak_rows(layout, z)])
+def _simulation_rows(noise: Noise, raw: Any) -> Array:
+    rows = [r / s[n] for by_name, s in zip(raw, noise.sd, strict=True) for n, r in by_name.items()]
+    return jnp.concatenate([jnp.where(jnp.isfinite(r), r, 0.0) for r in rows])
+
+
+def _rows(layout: Layout, data: Data, noise: Noise, z: Array, errors: Any) -> Array:
+    """All rows from the innovations, or from measured - bias - simulated."""
+    how = _likelihood_rows if layout.filtered else _simulation_rows
+    rows = how(noise, errors)
+    return jnp.concatenate([rows, prior_rows(layout, data, z), weak_rows(layout, z)])
+
+
+def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Array:
+    """The rows whose squares are summed, without their derivative."""
+    u = unpack(layout, data, z)
+    if layout.filtered:
+        return _rows(layout, data, noise, z, filtered(layout, data, noise, u))
+    return _rows(layout, data, noise, z, _raw(data, u, predict(layout, data, u)))
+
+
+def _raw(data: Data, u: Unknowns, runs: tuple[Trajectory, ...]) -> tuple[dict[str, Any], ...]:
+    return tuple(
+        {n: y - bias[n] - getattr(run.outputs, n) for n, y in flight.outputs.items()}
+        for flight, run, bias in zip(data.flights, runs, u.biases, strict=True)
+    )
 
 
 class Evaluation(NamedTuple):
@@ -284,7 +396,9 @@ class Evaluation(NamedTuple):
     raw: tuple[dict[str, Any], ...]
     """measured - bias - simulated, SI, by flight and output"""
     state_rms: tuple[dict[str, Any], ...]
-    """root mean square of each state, by flight"""
+    """root mean square of each simulated state, by flight"""
+    innovations: tuple[Innovations, ...]
+    """by flight; none with output error"""
     r: Any
     """(n,) whitened residuals with prior rows"""
     J: Any
@@ -296,33 +410,34 @@ class Evaluation(NamedTuple):
 
 
 @eqx.filter_jit
-def evaluate(
-    layout: Layout, data: Data, sd: tuple[dict[str, Any], ...], z: Float[Array, " q"]
-) -> Evaluation:
+def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
     """Residuals, their Jacobian in forward mode, and the named unknowns, in one pass.
 
-    The residual: measured - bias - simulated over sd for all flights and outputs, then the
-    priors' rows (value - mean) / sd, then the weak priors' rows.
+    The residual: measured - bias - simulated over sd for all flights and outputs (output error),
+    or the whitened innovations (filter error), then the priors' rows (value - mean) / sd, then
+    the weak priors' rows.
     """
+
+    def simulated(u: Unknowns) -> tuple[Any, Any]:
+        runs = predict(layout, data, u)
+        return _raw(data, u, runs), tuple(_rms(run.states) for run in runs)
 
     def rows(z: Array) -> tuple[Array, Any]:
         u = unpack(layout, data, z)
-        runs = predict(layout, data, u)
-        raw = tuple(
-            {n: y - bias[n] - getattr(run.outputs, n) for n, y in flight.outputs.items()}
-            for flight, run, bias in zip(data.flights, runs, u.biases, strict=True)
-        )
-        rms = tuple(
-            {n: jnp.sqrt(jnp.mean(jnp.square(v))) for n, v in naming.asdict(run.states).items()}
-            for run in runs
-        )
-        r = _whitened(layout, data, sd, z, raw)
-        return r, (raw, rms, r)
+        aux = filtered(layout, data, noise, u) if layout.filtered else simulated(u)
+        r = _rows(layout, data, noise, z, aux if layout.filtered else aux[0])
+        return r, (r, aux)
 
     def named(z: Array) -> Array:
         u = unpack(layout, data, z)
         shift = () if u.shift is None else (u.shift,)
         return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
 
-    J, (raw, rms, r) = jax.jacfwd(rows, has_aux=True)(z)
-    return Evaluation(raw, rms, r, J, named(z), jnp.diagonal(jax.jacfwd(named)(z)))
+    J, (r, aux) = jax.jacfwd(rows, has_aux=True)(z)
+    slopes = jnp.diagonal(jax.jacfwd(named)(z))
+    raw, rms = simulated(unpack(layout, data, z)) if layout.filtered else aux
+    return Evaluation(raw, rms, aux if layout.filtered else (), r, J, named(z), slopes)
+
+
+def _rms(states: Any) -> dict[str, Any]:
+    return {n: jnp.sqrt(jnp.mean(jnp.square(v))) for n, v in naming.asdict(states).items()}

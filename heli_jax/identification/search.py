@@ -1,7 +1,6 @@
 """Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,15 @@ from heli_jax.identification.optimise import (
     residuals_count,
 )
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
-from heli_jax.identification.residual import Data, Layout, layout_of, predict, unpack
+from heli_jax.identification.residual import (
+    Data,
+    Layout,
+    Noise,
+    layout_of,
+    predict,
+    rows_of,
+    unpack,
+)
 from heli_jax.identification.result import StartRow
 
 Progress = Callable[[str], None]
@@ -25,16 +32,17 @@ Progress = Callable[[str], None]
 _SHIFTS = 41
 
 
-def first_guess(layout: Layout, data: Data, sd: Any, z0: Float[Array, " q"]) -> Float[Array, " q"]:
-    """z0 with the time shift from a coarse search and a single gain by linear least squares.
-
-    Without either among the unknowns z0 comes back as it is.
-    """
+def first_guess(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
+    linear least squares; what is not among the unknowns stays."""
+    z0 = _noise_guess(layout, data, noise, z0) if layout.noise else z0
     if not (layout.shift or len(layout.gains) == 1):
         return z0
     grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
     coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
-    costs, gains = _scan(layout, data, sd, z0, jnp.asarray(coordinate, z0.dtype))
+    costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
     costs = np.where(np.isfinite(costs), costs, np.inf)
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
@@ -47,8 +55,31 @@ def first_guess(layout: Layout, data: Data, sd: Any, z0: Float[Array, " q"]) -> 
     return z0
 
 
+def _noise_guess(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
+    """sigma_w and tau_w of the greatest likelihood on a coarse grid about the start."""
+    at = len(layout.named)
+    steps = {
+        "sigma_w": np.log(10.0) * np.arange(-3.0, 2.5),
+        "tau_w": np.log(10.0) * np.arange(-1, 2),
+    }
+    grid = np.stack(np.meshgrid(*(steps[n] for n in layout.noise), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(layout.noise))
+    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
+    points[:, at : at + len(layout.noise)] += grid
+    costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    return jnp.asarray(points[best], z0.dtype)
+
+
 @eqx.filter_jit
-def _scan(layout: Layout, data: Data, sd: Any, z0: Array, shifts: Array) -> tuple[Array, Array]:
+def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
+    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
+
+
+@eqx.filter_jit
+def _scan(
+    layout: Layout, data: Data, noise: Noise, z0: Array, shifts: Array
+) -> tuple[Array, Array]:
     """Cost and best single gain for each time shift, with means taken off both signals."""
     q = len(layout.free)
 
@@ -56,7 +87,7 @@ def _scan(layout: Layout, data: Data, sd: Any, z0: Array, shifts: Array) -> tupl
         z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
         runs = predict(layout, data, unpack(layout, data, z))
         ys, ms = [], []
-        for flight, run, s in zip(data.flights, runs, sd, strict=True):
+        for flight, run, s in zip(data.flights, runs, noise.sd, strict=True):
             for n, y in flight.outputs.items():
                 m = getattr(run.outputs, n)
                 ys.append((y - jnp.mean(y)) / s[n])
@@ -117,38 +148,40 @@ class Search:
         self.bounded = layout_of(problem, problem.training, bounded=True)
 
     def run(
-        self, sd: Any, points: Float[Array, "s q"], tell: Progress | None = None
+        self, noise: Noise, points: Float[Array, "s q"], tell: Progress | None = None
     ) -> list[Optimum]:
         """An optimum for each start, all in the coordinates of `layout`."""
-        runs = [self._worth(run, sd) for run in self._run(self.layout, sd, points, tell)]
+        runs = [self._worth(run, noise) for run in self._run(self.layout, noise, points, tell)]
         if self.bounded.kinds == self.layout.kinds:
             return runs
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
             starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
-            for i, run in zip(left, self._run(self.bounded, sd, starts, tell), strict=True):
+            for i, run in zip(left, self._run(self.bounded, noise, starts, tell), strict=True):
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
         return runs
 
-    def _run(self, layout: Layout, sd: Any, points: Array, tell: Progress | None) -> list[Optimum]:
+    def _run(
+        self, layout: Layout, noise: Noise, points: Array, tell: Progress | None
+    ) -> list[Optimum]:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i in range(points.shape[0]):
-            found = optimise(layout, self.data, sd, points[i], self.max_steps)
+            found = optimise(layout, self.data, noise, points[i], self.max_steps)
             runs.append(jax.device_get(found)._replace(z=found.z))
             if tell is not None and points.shape[0] > 1:
                 tell(f"{i + 1} of {points.shape[0]} starts done")
         return runs
 
-    def _worth(self, run: Optimum, sd: Any) -> Optimum:
+    def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
         power = [
             float(np.sum(np.square(np.asarray(y) / np.asarray(s[n]))))
-            for flight, s in zip(self.data.flights, sd, strict=True)
+            for flight, s in zip(self.data.flights, noise.sd, strict=True)
             for n, y in flight.outputs.items()
         ]
-        nothing = sum(power) / residuals_count(self.layout, self.data)
+        nothing = sum(power) / residuals_count(self.data)
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
 
     def _inside(self, z: Array) -> bool:

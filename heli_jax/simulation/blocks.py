@@ -21,8 +21,8 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
     """
     assert held.discrete is not None
-    A = _matrix(held.discrete.Ad)
-    B, U = _columns(held)
+    A = matrix(held.discrete.Ad)
+    B, U = columns(held)
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
     U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
@@ -48,21 +48,22 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(x0), [one(i) for i in range(size)])
 
 
-def _matrix(rows: Any) -> Array:
+def matrix(rows: Any) -> Array:
+    """An array of nested tuples of scalars."""
     return jnp.stack([jnp.stack(list(row)) for row in rows])
 
 
-def _columns(held: Held) -> tuple[Array, Array]:
+def columns(held: Held) -> tuple[Array, Array]:
     """B (n, r) and what it multiplies (N, r): the inputs now, then those still held before."""
     assert held.discrete is not None
     now = jax.tree.leaves(held.inputs)
     n = now[0].shape[0]
-    B = _matrix(held.discrete.Bd)
+    B = matrix(held.discrete.Bd)
     if held.delay is None:
         return B, jnp.stack(now, axis=1)
     k = jnp.arange(n) - held.delay[0]
     both = [*jax.tree.leaves(at(held.inputs, k)), *jax.tree.leaves(at(held.inputs, k - 1))]
-    return jnp.concatenate([B, _matrix(held.discrete.Bp)], axis=1), jnp.stack(both, axis=1)
+    return jnp.concatenate([B, matrix(held.discrete.Bp)], axis=1), jnp.stack(both, axis=1)
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:

@@ -31,17 +31,17 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     eye = jnp.eye(M.shape[0], dtype=M.dtype)
     # Loops rather than unrolled sums: they run as fast and compile in half the time.
     degrees = jnp.arange(_DEGREE, 0, -1, dtype=M.dtype)
-    E, _ = jax.lax.scan(lambda E, k: (eye + _product(X, E) / k, None), eye, degrees)
+    E, _ = jax.lax.scan(lambda E, k: (eye + product(X, E) / k, None), eye, degrees)
 
     def square(i: Array, E: Array) -> Array:
-        return jax.lax.cond(i < s, lambda E: _product(E, E), lambda E: E, E)
+        return jax.lax.cond(i < s, lambda E: product(E, E), lambda E: E, E)
 
     E = jax.lax.fori_loop(0, _SQUARINGS, square, E)
     E = jnp.where(s <= _SQUARINGS, E, jnp.nan)
     return E * (d[:, None] / d[None, :])
 
 
-def _product(X: Float[Array, "n n"], Y: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def product(X: Float[Array, "n n"], Y: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """X Y; for small n as a sum of outer products, which takes a batch of them 5 times faster."""
     n = X.shape[0]
     if n > _SMALL:

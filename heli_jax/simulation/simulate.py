@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.blocks import blockwise
+from heli_jax.simulation.blocks import blockwise, columns, matrix
 from heli_jax.simulation.discretize import discretize, process_noise, square_root
 from heli_jax.simulation.solvers import (
     RK4,
@@ -223,6 +223,18 @@ def _per_sample(
     return PerSample(method, substeps), Held(params, inputs, dt, parts, None), term
 
 
+def held_columns(
+    model: Model, params: Any, inputs: Any, dt: Any, delay: Any
+) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
+    """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k."""
+    _, held, _ = _per_sample(model, params, inputs, dt, "exact", 1, delay)
+    assert held.discrete is not None
+    B, U = columns(held)
+    n = U.shape[0]
+    acting = inputs if delay is None else _acting(inputs, dt, delay, n)
+    return matrix(held.discrete.Ad), U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
+
+
 def _require_blocks(method: Any, block: int) -> None:
     if not isinstance(method, Exact):
         raise ValueError("block is for solver='exact' only")
@@ -329,8 +341,11 @@ def _adaptive(
 def _outputs(model: Model, params: Any, states: Any, inputs: Any, dt: Any, delay: Any) -> Any:
     """The outputs at the samples, with the input that acts there."""
     if delay is not None:
-        n = jax.tree.leaves(inputs)[0].shape[0]
-        whole, rest = _split(delay, dt)
-        k = jnp.arange(n) - whole - (rest > 0).astype(int)
-        inputs = at(inputs, k)
+        inputs = _acting(inputs, dt, delay, jax.tree.leaves(inputs)[0].shape[0])
     return jax.vmap(lambda x, u: model.output(params, x, u))(states, inputs)
+
+
+def _acting(inputs: Any, dt: Any, delay: Any, n: int) -> Any:
+    """The inputs that act at the n samples when they come late."""
+    whole, rest = _split(delay, dt)
+    return at(inputs, jnp.arange(n) - whole - (rest > 0).astype(int))
