@@ -41,7 +41,7 @@ from heli_jax import (
 )
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.optimise import optimise
-from heli_jax.identification.residual import data_of, layout_of, start_vector
+from heli_jax.identification.residual import Noise, data_of, layout_of, start_vector
 from heli_jax.naming import replace
 
 jax.config.update("jax_enable_x64", True)
@@ -111,9 +111,10 @@ def fit_against_scipy(flight: Flight) -> tuple[tuple[float, ...], tuple[float, .
         return scipy.optimize.least_squares(residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10)
 
     layout, data = layout_of(problem, (flight,)), data_of(problem, (flight,))
-    z, sd = start_vector(layout, data, free), ({"roll": np.asarray(2e-3)},)
-    assert np.allclose(np.exp(optimise(layout, data, sd, z).z), np.exp(theirs.x), rtol=1e-3)
-    optimum = ratios(lambda: optimise(layout, data, sd, z).z, scipys, runs=60)
+    z = start_vector(layout, data, problem)
+    noise = Noise(({"roll": np.asarray(2e-3)},), np.zeros(()))
+    assert np.allclose(np.exp(optimise(layout, data, noise, z).z), np.exp(theirs.x), rtol=1e-3)
+    optimum = ratios(lambda: optimise(layout, data, noise, z).z, scipys, runs=60)
     return optimum, ratios(lambda: fit(problem), scipys, runs=15)
 
 

@@ -145,11 +145,18 @@ def _settle_noise(
         if not np.isfinite(change):
             break
         best, noise = best._replace(z=z), new
-        if change < 1e-3 or not bool(best.converged):
+        if change < 1e-3 or not bool(best.converged) or not _scale_matters(search):
             break
         [best] = search.run(noise, best.z[None, :])
         trace.append((int(best.steps), float(best.cost)))
     return best, noise, tuple(trace)
+
+
+def _scale_matters(search: starting.Search) -> bool:
+    """Whether the optimum moves with the scale of the noise: not where filter error has it
+    concentrated out and no prior is weighed against it."""
+    priors = any(f.prior for f in search.problem.free.values())
+    return priors or not search.layout.filtered
 
 
 def _updated_noise(
