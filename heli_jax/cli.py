@@ -124,8 +124,8 @@ def _fit(options: argparse.Namespace) -> int:
         _say("recursive least squares")
         started = time.perf_counter()
         rls = baseline(
-            problem.model,
-            problem.vehicle,
+            experiment.model,
+            experiment.vehicle.params,
             problem.training[0],
             order=experiment.config.rls.order,
             forgetting=experiment.config.rls.forgetting,

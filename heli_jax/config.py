@@ -4,14 +4,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from heli_jax import models, naming, units
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
-from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
+from heli_jax.identification.problem import Free, Method, Nuisance, Prior, Problem
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import parse_value, read_mapping
 
@@ -75,7 +77,7 @@ class NuisanceConfig(_Strict):
 
 
 class FitConfig(_Strict):
-    method: Literal["output-error"] = "output-error"
+    method: Method = "output-error"
     free: dict[str, FreeConfig]
     nuisance: NuisanceConfig = NuisanceConfig()
     starts: Annotated[int, Field(ge=1, le=10_000)] = 1
@@ -89,12 +91,22 @@ class RLSConfig(_Strict):
 
 
 class DisturbanceConfig(_Strict):
-    """A random acceleration on one axis, for simulation."""
+    """A random acceleration on one axis: simulation draws it, filter error estimates it."""
 
     axis: Literal["roll", "pitch", "yaw"]
     poles: Literal[1, 2] = 1
-    sigma_w: Positive
-    tau_w: Positive
+    sigma_w: Positive | None = None
+    """standard deviation [rad/s^2]: needed to simulate, a start for filter error"""
+    tau_w: Positive | None = None
+    """correlation time [s]: needed to simulate, a start for filter error"""
+    fixed: list[Literal["tau_w"]] = []
+    """what filter error takes as it stands here"""
+
+    @model_validator(mode="after")
+    def _fixed_given(self) -> "DisturbanceConfig":
+        if "tau_w" in self.fixed and self.tau_w is None:
+            raise ValueError("tau_w is fixed but not given, wanted is its value")
+        return self
 
 
 class StickConfig(_Strict):
@@ -288,19 +300,52 @@ def problem(experiment: Experiment) -> Problem:
         name: Free(f.start, f.lower, f.upper, Prior(f.prior.mean, f.prior.sd) if f.prior else None)
         for name, f in config.fit.free.items()
     }
+    model, params, fixed = experiment.model, experiment.vehicle.params, ()
+    if config.fit.method == "filter-error":
+        if config.disturbance is None:
+            raise InputError(
+                f"{path}: fit.method: filter-error needs a disturbance, wanted is "
+                "disturbance: {axis: roll, poles: 1}"
+            )
+        model, params = disturbed(experiment)
+        fixed = tuple(config.disturbance.fixed)
     try:
         return Problem(
-            experiment.model,
-            experiment.vehicle.params,
+            model,
+            params,
             flights,
             free,
             nuisance,
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
+            method=config.fit.method,
+            fixed_noise=fixed,
         )
     except ValueError as e:
         raise InputError(
             f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}"
         ) from e
+
+
+def disturbed(experiment: Experiment) -> tuple[Model, Any]:
+    """The model with the configuration's disturbance, and its parameters.
+
+    Raises:
+        InputError: the model has no such axis.
+    """
+    model, params, wanted = (
+        experiment.model,
+        experiment.vehicle.params,
+        experiment.config.disturbance,
+    )
+    if wanted is None:
+        return model, params
+    try:
+        model = with_disturbance(model, wanted.axis, wanted.poles)
+    except ValueError as e:
+        raise InputError(f"{experiment.path}: disturbance: {e}") from e
+    given = {"sigma_w": wanted.sigma_w, "tau_w": wanted.tau_w}
+    extra = {n: jnp.asarray(v) for n, v in given.items() if v is not None}
+    return model, model.Params(**{**naming.asdict(params), **extra})
 
 
 def read_flights(

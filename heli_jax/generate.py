@@ -7,9 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming, units
-from heli_jax.config import Experiment, SimulateConfig, StickConfig, read_flights, signals
-from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.dynamics.model import Model
+from heli_jax.config import (
+    Experiment,
+    SimulateConfig,
+    StickConfig,
+    disturbed,
+    read_flights,
+    signals,
+)
 from heli_jax.errors import InputError, nearest
 from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate
@@ -35,7 +40,10 @@ def generate(experiment: Experiment) -> Table:
     where = f"{experiment.path}: simulate"
     rng = np.random.default_rng(wanted.seed)
     n = round(wanted.duration * wanted.rate)
-    model, params = _disturbed(experiment)
+    drawn = experiment.config.disturbance
+    if drawn is not None and (drawn.sigma_w is None or drawn.tau_w is None):
+        raise InputError(f"{experiment.path}: disturbance: simulate needs its sigma_w and tau_w")
+    model, params = disturbed(experiment)
     driven = _inputs(experiment, wanted, n, rng, where)
     key = jax.random.key(wanted.seed) if experiment.config.disturbance else None
     run = jax.jit(lambda p, u: simulate(model, p, u, dt=1.0 / wanted.rate, key=key))(
@@ -72,19 +80,6 @@ def follow(experiment: Experiment) -> Table:
         label = np.array([flight.name] * flight.n_samples)
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
     return Table({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
-
-
-def _disturbed(experiment: Experiment) -> tuple[Model, Any]:
-    model, params = experiment.model, experiment.vehicle.params
-    wanted = experiment.config.disturbance
-    if wanted is None:
-        return model, params
-    try:
-        disturbed = with_disturbance(model, wanted.axis, wanted.poles)
-    except ValueError as e:
-        raise InputError(f"{experiment.path}: disturbance: {e}") from e
-    extra = {"sigma_w": jnp.asarray(wanted.sigma_w), "tau_w": jnp.asarray(wanted.tau_w)}
-    return disturbed, disturbed.Params(**{**naming.asdict(params), **extra})
 
 
 def _inputs(

@@ -331,24 +331,19 @@ def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Inn
     return tuple(out)
 
 
-def _likelihood_rows(noise: Noise, found: tuple[Innovations, ...]) -> Array:
+def _likelihood_rows(data: Data, noise: Noise, found: tuple[Innovations, ...]) -> Array:
     r"""$e_k/\sqrt{s_k}\,\exp(\tfrac12(\overline{\log s} - level))$: rows whose sum of squares
     is the likelihood with the scale of all noise concentrated out; zero where nothing is measured.
     """
-    pairs = [
-        (one.error[n], one.variance[n], sd[n])
-        for one, sd in zip(found, noise.sd, strict=True)
-        for n in one.error
-    ]
-    e = jnp.concatenate([e for e, _, _ in pairs])
-    s = jnp.concatenate([s for _, s, _ in pairs])
-    seen = jnp.isfinite(e)
-    safe = jnp.where(seen, s, 1.0)
-    scale = jnp.concatenate([jnp.broadcast_to(sd**2, e.shape) for e, _, sd in pairs])
-    logs = jnp.where(seen, jnp.log(safe / scale), 0.0)
-    mean = jnp.sum(logs) / jnp.sum(seen)
-    whitened = jnp.where(seen, e, 0.0) / jnp.sqrt(safe)
-    return whitened * jnp.exp(0.5 * (mean - noise.level))
+    whitened, logs, count = [], 0.0, 0.0
+    for flight, one, sd in zip(data.flights, found, noise.sd, strict=True):
+        for n, y in flight.outputs.items():
+            seen = jnp.isfinite(y)
+            s = jnp.where(seen, one.variance[n], 1.0)
+            whitened.append(jnp.where(seen, one.error[n], 0.0) / jnp.sqrt(s))
+            logs += jnp.sum(jnp.where(seen, jnp.log(s / sd[n] ** 2), 0.0))
+            count += jnp.sum(seen.astype(y.dtype))
+    return jnp.concatenate(whitened) * jnp.exp(0.5 * (logs / count - noise.level))
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
@@ -363,15 +358,20 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     return z[layout.weak :]
 
 
-def _simulation_rows(noise: Noise, raw: Any) -> Array:
-    rows = [r / s[n] for by_name, s in zip(raw, noise.sd, strict=True) for n, r in by_name.items()]
-    return jnp.concatenate([jnp.where(jnp.isfinite(r), r, 0.0) for r in rows])
+def _simulation_rows(data: Data, noise: Noise, raw: Any) -> Array:
+    return jnp.concatenate(
+        [
+            jnp.where(jnp.isfinite(y), by_name[n], 0.0) / sd[n]
+            for flight, by_name, sd in zip(data.flights, raw, noise.sd, strict=True)
+            for n, y in flight.outputs.items()
+        ]
+    )
 
 
 def _rows(layout: Layout, data: Data, noise: Noise, z: Array, errors: Any) -> Array:
     """All rows from the innovations, or from measured - bias - simulated."""
     how = _likelihood_rows if layout.filtered else _simulation_rows
-    rows = how(noise, errors)
+    rows = how(data, noise, errors)
     return jnp.concatenate([rows, prior_rows(layout, data, z), weak_rows(layout, z)])
 
 
