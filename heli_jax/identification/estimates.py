@@ -92,6 +92,15 @@ def stated_noise_notes(problem: Problem, sd: Any) -> list[str]:
     return notes
 
 
+def deviations(J: np.ndarray) -> np.ndarray:
+    """Standard deviations (q,) of all coordinates from whitened rows (n, q); 0 without effect."""
+    J = np.asarray(J, dtype=np.float64)
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    inverse = np.linalg.pinv(J / norms, rcond=1e-10)
+    return np.sqrt(np.sum(inverse**2, axis=1)) / norms
+
+
 def flight_nuisances(
     problem: Problem, layout: Layout, data: Data, z: Array, e: Evaluation, quantile: float
 ) -> dict[str, Estimate]:
@@ -99,11 +108,7 @@ def flight_nuisances(
     q = len(layout.named)
     if layout.size == q:
         return {}
-    J = np.asarray(e.J, dtype=np.float64)
-    norms = np.linalg.norm(J, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    inverse = np.linalg.pinv(J / norms, rcond=1e-10)
-    sds = np.sqrt(np.sum(inverse**2, axis=1)) / norms
+    sds = deviations(e.J)
     out, starts = {}, problem.noise
     for i, name in enumerate(layout.noise):
         value, relative = float(np.exp(z[q + i])), float(sds[q + i])

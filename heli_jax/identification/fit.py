@@ -16,6 +16,7 @@ from heli_jax.identification import excitation
 from heli_jax.identification import search as starting
 from heli_jax.identification.estimates import (
     bound_notes,
+    deviations,
     estimates_of,
     flight_nuisances,
     labels,
@@ -84,10 +85,17 @@ def fit(
     before = verdict_of(problem, layout, _evaluation(layout, data, noise, z0))
     tell(f"fitting {', '.join(layout.named)}")
     points = starting.draw(layout, problem, z0, starts, seed)
-    search = starting.Search(problem, layout, data, max_steps)
+    # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
+    # and goes on only where there is one.
+    short = min(max_steps, _FIRST_STEPS) if layout.noise else max_steps
+    search = starting.Search(problem, layout, data, short)
     runs = search.run(noise, points, tell)
     best = min(runs, key=starting.rank)
     best, noise, trace = _settle_noise(search, noise, best)
+    ratio = None
+    search.max_steps = max_steps
+    if "sigma_w" in layout.noise:
+        best, noise, ratio = _disturbance_or_none(search, noise, best)
     return _assemble(
         problem,
         layout,
@@ -98,6 +106,7 @@ def fit(
         points,
         runs,
         trace,
+        ratio,
         seed,
         {"fit": time.perf_counter() - begin},
     )
@@ -150,6 +159,46 @@ def _settle_noise(
         [best] = search.run(noise, best.z[None, :])
         trace.append((int(best.steps), float(best.cost)))
     return best, noise, tuple(trace)
+
+
+_FIRST_STEPS = 40
+_NO_DISTURBANCE = 2.71
+"""twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
+a boundary, where half of the chi-squared with one degree of freedom holds (Self and Liang, 1987)"""
+_SURE = 0.4
+"""sd of log sigma_w below which nobody need ask whether there is a disturbance"""
+
+
+def _disturbance_or_none(
+    search: starting.Search, noise: Noise, best: Optimum
+) -> tuple[Optimum, Noise, float | None]:
+    """The optimum with the disturbance where it is significant, else without one.
+
+    Where sigma_w goes to zero, tau_w means nothing and the optimiser has no end to come to; the
+    same residuals with sigma_w all but zero are those of output error.
+    """
+    layout = search.layout
+    e = _evaluation(layout, search.data, noise, best.z)
+    at = len(layout.named) + layout.noise.index("sigma_w")
+    if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
+        return best, noise, None
+    smallest = min(float(s) for one in noise.sd for s in one.values())
+    [none] = search.run(noise, best.z.at[at].set(np.log(smallest) - 30.0)[None, :])
+    if not bool(none.converged):
+        return best, noise, None
+    ratio = residuals_count(search.data) * float(np.log(none.cost / _cost(search.data, e)))
+    if np.isfinite(ratio) and ratio >= _NO_DISTURBANCE:
+        if not bool(best.converged):
+            [best] = search.run(noise, best.z[None, :])
+            best, noise, _ = _settle_noise(search, noise, best)
+        return best, noise, ratio
+    none, noise, _ = _settle_noise(search, noise, none)
+    return none, noise, ratio
+
+
+def _cost(data: Data, e: Evaluation) -> float:
+    """The cost that `optimise` gives, at any point."""
+    return float(np.sum(e.r**2)) / residuals_count(data)
 
 
 def _scale_matters(search: starting.Search) -> bool:
@@ -209,6 +258,7 @@ def _assemble(
     points: Array,
     runs: list[Optimum],
     trace: tuple[tuple[int, float], ...],
+    ratio: float | None,
     seed: int,
     timing: dict[str, float],
 ) -> Fit:
@@ -234,6 +284,19 @@ def _assemble(
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
     nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile)
+    if ratio is not None and ratio < _NO_DISTURBANCE:
+        notes.append(
+            "No disturbance shows in the record (twice the log-likelihood gained by one is "
+            f"{ratio:.2g}): output error suffices, and these are its numbers."
+        )
+        for name in layout.noise:
+            nuisance[name] = nuisance[name]._replace(
+                value=0.0 if name == "sigma_w" else nuisance[name].value,
+                sd=None,
+                lower95=None,
+                upper95=None,
+                at_bound=name == "sigma_w",
+            )
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     notes = [*notes, *stated_noise_notes(problem, noise.sd), *bound_notes(estimates)]

@@ -66,9 +66,11 @@ def _split(
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)
     # A parameter of negative sign falls as its logarithm rises; the size is what counts.
-    return J[data_rows][:, :q] * np.abs(factor) * np.sign(slopes) * _signs(unknowns), J[data_rows][
-        :, q:
-    ]
+    sensitivity = J[data_rows][:, :q] * np.abs(factor) * np.sign(slopes) * _signs(unknowns)
+    nuisances = J[data_rows][:, q:]
+    # A nuisance without effect, such as the memory of a disturbance that is not there, has no
+    # direction to be projected out.
+    return sensitivity, nuisances[:, np.linalg.norm(nuisances, axis=0) > 1e-6]
 
 
 def _signs(unknowns: tuple[Unknown, ...]) -> np.ndarray:

@@ -58,8 +58,15 @@ class _LevenbergMarquardt(optx.AbstractGaussNewton):
     search: Any
     verbose: Any
 
-    def __init__(self, rtol: Any, atol: Any):
-        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+    def __init__(self, rtol: Any, atol: Any, watched: Array):
+        self.rtol, self.atol = rtol, atol
+
+        def norm(x: Array) -> Array:
+            # Of the unknowns those watched; of the rows the last, the part of the residuals that
+            # no step can take away.
+            return optx.max_norm(jnp.where(watched, x, 0.0) if x.shape == watched.shape else x[-1])
+
+        self.norm = norm
         self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
         self.search = _Search(
             high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
@@ -124,7 +131,8 @@ def optimise(
         fn,
         # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
         # and smaller gains drown in the rounding of the sum of squares.
-        _LevenbergMarquardt(rtol=1e-9, atol=1e-3 / (_COLUMN * units.level)),
+        # A disturbance that is hardly there may wander on where it changes nothing else.
+        _LevenbergMarquardt(1e-9, 1e-3 / (_COLUMN * units.level), _watched(layout)),
         jnp.zeros_like(z0),
         max_steps=max_steps,
         throw=False,
@@ -137,6 +145,12 @@ def optimise(
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
     converged = (solution.result == optx.RESULTS.successful) & fine
     return Optimum(z, cost, solution.stats["num_steps"], converged)
+
+
+def _watched(layout: Layout) -> Array:
+    """The unknowns whose steps say whether the optimiser has arrived."""
+    at = jnp.arange(layout.size)
+    return (at < len(layout.named)) | (at >= layout.weak)
 
 
 def residuals_count(data: Data) -> int:

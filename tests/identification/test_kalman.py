@@ -1,0 +1,133 @@
+"""The filter against a dense Gaussian likelihood built with scipy, which knows no filter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+
+from heli_jax import models
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.identification.kalman import innovations
+from heli_jax.naming import asdict, names, replace
+
+N, DT = 40, 0.02
+SD = {"roll": 2e-3, "roll_rate": 0.03}
+
+
+def case(bench30, poles, **values):
+    model = with_disturbance(models.roll_on_stand, "roll", poles)
+    given = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 0.7, **values}
+    params = model.Params(
+        **{**asdict(bench30), **{n: jnp.asarray(float(v)) for n, v in given.items()}}
+    )
+    rng = np.random.default_rng(5)
+    u = 3e-6 * np.repeat(rng.uniform(-1, 1, N // 8), 8)
+    y = {n: 5 * sd * rng.standard_normal(N) for n, sd in SD.items()}
+    return model, params, u, y
+
+
+def dense(model, params, u, y, x0):
+    """log p(all measurements): mean and covariance by brute force."""
+    A, B, C, D = (np.asarray(m) for m in jacobians(model, params))
+    n = A.shape[0]
+    held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * DT)
+    Ad, Bd = held[:n, :n], held[:n, n:]
+    G = np.diag([float(g) for g in asdict(model.noise(params)).values()])
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    Q = sum(
+        0.5 * DT * w * F @ G @ G @ F.T
+        for w, F in (
+            (w, scipy.linalg.expm(A * 0.5 * DT * (s + 1)))
+            for s, w in zip(nodes, weights, strict=True)
+        )
+    )
+    random = [k for k in names(model.State) if k.startswith("w")]
+    P = np.diag([float(params.sigma_w) ** 2 if k in random else 0.0 for k in names(model.State)])
+    x, means, S = np.array(x0), [], [[None] * N for _ in range(N)]
+    covariances = []
+    for k in range(N):
+        means.append(C @ x + D @ [u[k]])
+        covariances.append(P)
+        x, P = Ad @ x + Bd @ [u[k]], Ad @ P @ Ad.T + Q
+    for i in range(N):
+        for j in range(i, N):
+            S[j][i] = np.linalg.matrix_power(Ad, j - i) @ covariances[i]
+            S[i][j] = S[j][i].T
+    full = np.block([[C @ S[i][j] @ C.T for j in range(N)] for i in range(N)])
+    order = names(model.Outputs)
+    full += np.kron(np.eye(N), np.diag([SD[n] ** 2 for n in order]))
+    stacked = np.stack([y[n] for n in order], axis=1).ravel()
+    seen = np.isfinite(stacked)
+    return scipy.stats.multivariate_normal(np.ravel(means)[seen], full[np.ix_(seen, seen)]).logpdf(
+        stacked[seen]
+    )
+
+
+def likelihood(model, params, u, y, x0, **how):
+    found = innovations(
+        model,
+        params,
+        model.Inputs(x_roll=jnp.asarray(u)),
+        {n: jnp.asarray(v) for n, v in y.items()},
+        SD,
+        dt=DT,
+        initial_state=model.State(*jnp.asarray(x0)),
+        **how,
+    )
+    total = 0.0
+    for n, e in found.error.items():
+        seen = jnp.isfinite(e)
+        s = jnp.where(seen, found.variance[n], 1.0)
+        term = jnp.log(2 * jnp.pi * s) + jnp.where(seen, e, 0.0) ** 2 / s
+        total -= 0.5 * jnp.sum(jnp.where(seen, term, 0.0))
+    return total
+
+
+@pytest.mark.parametrize("poles", [1, 2])
+@pytest.mark.parametrize("missing", [False, True], ids=["whole", "with missing samples"])
+def test_log_likelihood_is_that_of_the_dense_gaussian(bench30, poles, missing):
+    model, params, u, y = case(bench30, poles)
+    if missing:
+        y["roll"][[0, 7, 8]] = np.nan
+        y["roll_rate"][8:20] = np.nan
+    x0 = [0.01, -0.2, 1e-5, 1e-3, *[0.0] * poles]
+    wanted = dense(model, params, u, y, x0)
+    assert float(likelihood(model, params, u, y, x0)) == pytest.approx(wanted, rel=1e-8)
+
+
+@pytest.mark.parametrize("name", ["Ixx", "If", "sigma_w", "tau_w"])
+def test_gradient_is_that_of_finite_differences(bench30, name):
+    model, params, u, y = case(bench30, 1)
+    x0 = [0.01, -0.2, 1e-5, 1e-3, 0.0]
+
+    def at(z):
+        return likelihood(model, replace(params, **{name: jnp.exp(z)}), u, y, x0)
+
+    z = float(np.log(float(getattr(params, name))))
+    h = 1e-5
+    wanted = (float(at(jnp.asarray(z + h))) - float(at(jnp.asarray(z - h)))) / (2 * h)
+    assert float(jax.jacfwd(at)(jnp.asarray(z))) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_without_a_disturbance_the_innovations_are_the_simulation_error(bench30):
+    from heli_jax import simulate
+
+    model, params, u, y = case(bench30, 1, sigma_w=0.0)
+    x0 = model.initial_state(params)
+    inputs = model.Inputs(x_roll=jnp.asarray(u))
+    found = innovations(model, params, inputs, {"roll": jnp.asarray(y["roll"])}, SD, dt=DT)
+    run = simulate(model, params, inputs, dt=DT, initial_state=x0)
+    np.testing.assert_allclose(found.error["roll"], y["roll"] - run.outputs.roll, atol=1e-14)
+    np.testing.assert_allclose(found.variance["roll"], SD["roll"] ** 2, rtol=1e-12)
+
+
+def test_a_late_input_acts_late(bench30):
+    model, params, u, y = case(bench30, 1)
+    x0 = [0.0] * 5
+    late = np.concatenate([np.full(3, u[0]), u[:-3]])
+    a = likelihood(model, params, u, y, x0, delay=jnp.asarray(3 * DT))
+    b = likelihood(model, params, late, y, x0)
+    assert float(a) == pytest.approx(float(b), rel=1e-9)
