@@ -54,7 +54,7 @@ def print_fit(fit: Fit, baseline: Baseline | None, out: Path) -> None:
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
     rows = [_row(name, e) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
-    _table(head if fit.white else (*head[:3], "95 % (too narrow)", *head[4:]), rows)
+    _table((*head[:3], fit.interval, *head[4:]), rows)
     for c in fit.verdict.combinations:
         print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
     for name, m in fit.metrics.items():

@@ -15,14 +15,21 @@ from heli_jax.identification.result import Estimate
 
 
 def estimates_of(
-    problem: Problem, layout: Layout, e: Evaluation, verdict: Verdict, quantile: float
+    problem: Problem,
+    layout: Layout,
+    e: Evaluation,
+    verdict: Verdict,
+    quantile: float,
+    wider: np.ndarray,
 ) -> dict[str, Estimate]:
+    """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns."""
     unknowns = unknowns_of(problem, layout, e)
     references = references_of(problem, layout, unknowns)
     out = {}
     for i, u in enumerate(unknowns):
         free = problem.free.get(u.name)
-        relative = float(np.sqrt(verdict.covariance[i, i]))
+        white = float(np.sqrt(verdict.covariance[i, i]))
+        relative = white * float(wider[i])
         sd, low, high = _interval95(u, relative, references[i], quantile)
         lost = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
@@ -35,6 +42,7 @@ def estimates_of(
             start=start,
             prior_share=verdict.prior_share[u.name],
             at_bound=_at_bound(problem, u.name, u.value),
+            sd_white=None if lost else float(white * references[i]),
         )
     return out
 
@@ -102,13 +110,19 @@ def deviations(J: np.ndarray) -> np.ndarray:
 
 
 def flight_nuisances(
-    problem: Problem, layout: Layout, data: Data, z: Array, e: Evaluation, quantile: float
+    problem: Problem,
+    layout: Layout,
+    data: Data,
+    z: Array,
+    e: Evaluation,
+    quantile: float,
+    wider: np.ndarray,
 ) -> dict[str, Estimate]:
     """The disturbance, then initial states and biases with the weak priors they carry."""
     q = len(layout.named)
     if layout.size == q:
         return {}
-    sds = deviations(e.J)
+    sds = deviations(e.J) * wider
     out, starts = {}, problem.noise
     for i, name in enumerate(layout.noise):
         value, relative = float(np.exp(z[q + i])), float(sds[q + i])
@@ -131,7 +145,7 @@ def flight_nuisances(
             ]
         for name, scale, unit in parts:
             value, sd = float(z[at] * scale), float(sds[at] * scale)
-            share = min(1.0, float(sds[at]) ** 2)
+            share = min(1.0, float(sds[at] / wider[at]) ** 2)
             limits = (value - quantile * sd, value + quantile * sd)
             out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
             at += 1

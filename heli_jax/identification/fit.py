@@ -14,6 +14,7 @@ from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import excitation
 from heli_jax.identification import search as starting
+from heli_jax.identification.coloured import inflation
 from heli_jax.identification.estimates import (
     bound_notes,
     deviations,
@@ -277,13 +278,16 @@ def _assemble(
         status = "not-identifiable"
     n = sum(y.size for f in problem.training for y in f.outputs.values())
     quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
-    named = estimates_of(problem, layout, e, verdict, quantile)
     signals = _signals(e.raw, problem.training)
+    white = _whiteness(signals, e)
+    coloured = usable and not layout.filtered and not all(w.white for w in white.values())
+    wider = inflation(layout, data, e) if coloured else np.ones(layout.size)
+    named = estimates_of(problem, layout, e, verdict, quantile, wider)
     held = tuple(f for f in problem.flights if f.hold_out)
     validation = _validation(problem, best.z, layout, held) if held else ()
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
-    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile)
+    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile, wider)
     if ratio is not None and ratio < _NO_DISTURBANCE:
         notes.append(
             "No disturbance shows in the record (twice the log-likelihood gained by one is "
@@ -314,7 +318,8 @@ def _assemble(
         signals=(*signals, *validation),
         metrics=_pooled(signals),
         validation=_pooled(validation),
-        whiteness=_whiteness(signals, e),
+        whiteness=white,
+        coloured=coloured,
         starts=starting.table(layout, data, points, runs),
         steps=sum(s for s, _ in trace),
         trace=trace,

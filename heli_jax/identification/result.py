@@ -22,6 +22,8 @@ class Estimate(NamedTuple):
     start: float
     prior_share: float
     at_bound: bool
+    sd_white: float | None = None
+    """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
 
 
 class Signals(NamedTuple):
@@ -89,8 +91,22 @@ class Fit:
     trace: tuple[tuple[int, float], ...]
     """(steps, cost) of every round of the optimiser"""
     notes: tuple[str, ...]
+    coloured: bool = False
+    """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
+        return not self.white and not self.coloured
+
+    @property
+    def interval(self) -> str:
+        """What to call the intervals."""
+        if self.coloured:
+            return "95 % (coloured residuals)"
+        return "95 % (too narrow)" if self.narrow else "95 % interval"
 
     @property
     def white(self) -> bool:

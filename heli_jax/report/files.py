@@ -47,6 +47,7 @@ def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str,
             "noise_sd": fit.noise,
             "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
             "validation": {n: m._asdict() for n, m in fit.validation.items()},
+            "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
             "baseline_rls": _baseline(baseline),
             "starts": [row._asdict() for row in fit.starts],
@@ -66,11 +67,19 @@ def whiteness_note(fit: Fit) -> str:
     if not coloured:
         return ""
     worst = max((fit.whiteness[n] for n in coloured), key=lambda w: abs(w.lag1))
+    what = "innovations" if fit.method == "filter-error" else "residuals"
+    if fit.coloured:
+        consequence = (
+            "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
+            "residuals' memory (Bartlett window). They are honest about a poor estimate: "
+            "filter-error makes a better one."
+        )
+    else:
+        consequence = "The intervals count every sample as news and are too narrow."
     return (
-        f"The residuals of {', '.join(coloured)} are not white (autocorrelation {worst.lag1:+.2f} "
+        f"The {what} of {', '.join(coloured)} are not white (autocorrelation {worst.lag1:+.2f} "
         f"at one sample, {worst.outside:.0%} of the lags outside the 99 % band): a disturbance or "
-        "dynamics that the model lacks is in them. The intervals count every sample as news and "
-        "are too narrow."
+        f"dynamics that the model lacks is in them. {consequence}"
     )
 
 

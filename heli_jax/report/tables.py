@@ -54,7 +54,8 @@ def headline(fit: Fit) -> Headline:
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {_listed(names)}"
     doubts = [
-        ("the intervals are too narrow", not fit.white),
+        ("the intervals are too narrow", fit.narrow),
+        ("the residuals are not white", fit.coloured),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
@@ -85,9 +86,15 @@ def model_remark(problem: Problem) -> str:
 
 def parameters(fit: Fit) -> Table:
     """The free parameters; where the data do not determine one, that is said in place of it."""
-    interval = "95 % interval" if fit.white else "95 % interval (too narrow)"
-    head = ("parameter", "estimate", "sd", "sd / value", interval, "unit", "start", "prior share")
-    return Table((*head, "at bound"), [_estimate(n, e) for n, e in fit.estimates.items()])
+    head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
+    rows = [_estimate(n, e) for n, e in fit.estimates.items()]
+    if fit.coloured:
+        rows = [
+            (*row, NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0])
+            for row, e in zip(rows, fit.estimates.values(), strict=True)
+        ]
+        return Table((*head, "prior share", "at bound", "sd if white"), rows)
+    return Table((*head, "prior share", "at bound"), rows)
 
 
 def _estimate(name: str, e: Estimate) -> tuple[str, ...]:

@@ -119,7 +119,7 @@ def test_coloured_residuals_are_announced_before_the_numbers(sound, tmp_path):
     coloured = {name: Whiteness(False, 1e-9, 100, 0.4, 0.9)}
     text = words(page(sound, tmp_path, whiteness=coloured)[0])
     assert "! converged: the data determine Ixx and If, but the intervals are too narrow" in text
-    assert text.index("The residuals are not white") < text.index("95 % interval (too narrow)")
+    assert text.index("The residuals are not white") < text.index("95 % (too narrow)")
 
 
 def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):

@@ -1,0 +1,183 @@
+"""Filter error, output error and RLS on many disturbed bench runs: which numbers can be believed?
+
+    .venv/bin/python experiments/monte_carlo.py [RUNS] [FOLDER]
+
+The disturbed bench: the 30-class machine on its stand (kappa free, zeta known), 6000 samples at
+50 Hz, 2 mrad of measurement noise, random steps, and a disturbance whose response is as large as
+the driven one. FOLDER (runs/monte-carlo) keeps one line a run, so that a run that was stopped
+goes on where it was; table.md and monte_carlo.svg are made of all of them.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from heli_jax import Flight, Free, Problem, fit, load_vehicle, models, simulate
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.identification.baseline import baseline
+from heli_jax.naming import asdict, names, replace
+from heli_jax.simulation.inputs import random_steps
+
+jax.config.update("jax_enable_x64", True)
+N, DT, NOISE, SIGMA_W, TAU_W = 6000, 0.02, 2e-3, 1.04, 1.0
+FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
+MODEL = with_disturbance(models.roll_on_stand, "roll")
+METHODS = ("filter error", "output error, white", "output error, coloured", "RLS")
+
+
+def truth() -> Any:
+    vehicle = load_vehicle(Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml")
+    noise = {"sigma_w": jnp.asarray(SIGMA_W), "tau_w": jnp.asarray(TAU_W)}
+    return MODEL.Params(**asdict(vehicle), **noise)
+
+
+@jax.jit
+def response(params: Any, u: jax.Array, key: jax.Array) -> jax.Array:
+    return simulate(MODEL, params, MODEL.Inputs(x_roll=u), dt=DT, key=key).outputs.roll
+
+
+def record(params: Any, seed: int) -> Flight:
+    rng = np.random.default_rng(seed)
+    u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
+    roll = np.asarray(response(params, jnp.asarray(u), jax.random.key(seed)))
+    y = roll + NOISE * rng.standard_normal(N)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
+
+
+def one_run(params: Any, seed: int) -> dict[str, Any]:
+    """What every method says of one record: value, sd and seconds; None where it has none."""
+    flight = record(params, seed)
+    start = replace(params, sigma_w=jnp.asarray(0.0), tau_w=jnp.asarray(0.3))
+    out: dict[str, Any] = {"seed": seed}
+    for method in ("filter-error", "output-error"):
+        begin = time.perf_counter()
+        found = fit(Problem(MODEL, start, [flight], FREE, method=method))
+        seconds = time.perf_counter() - begin
+        for name in METHODS:
+            if not name.startswith(method.replace("-", " ")):
+                continue
+            sds = {n: e.sd_white if "white" in name else e.sd for n, e in found.estimates.items()}
+            out[name] = {
+                "status": found.status,
+                "steps": found.steps,
+                "seconds": seconds,
+                "values": {n: e.value for n, e in found.estimates.items()},
+                "sd": sds,
+            }
+    begin = time.perf_counter()
+    ratios = baseline(models.roll_on_stand, undisturbed(params), flight).combinations
+    values = {n: float(params.a) / ratios[f"a/{n}"] for n in ("Ixx", "If") if f"a/{n}" in ratios}
+    usable = all(np.isfinite(v) and v > 0 for v in values.values()) and len(values) == 2
+    out["RLS"] = {
+        "status": "converged" if usable else "no physical parameters",
+        "steps": 0,
+        "seconds": time.perf_counter() - begin,
+        "values": values,
+        "sd": dict.fromkeys(values),
+    }
+    return out
+
+
+def undisturbed(params: Any) -> Any:
+    """The parameters of the model without its disturbance."""
+    plain = models.roll_on_stand.Params
+    return plain(**{n: getattr(params, n) for n in names(plain)})
+
+
+def rows(runs: list[dict[str, Any]], params: Any) -> list[dict[str, Any]]:
+    table = []
+    for method in METHODS:
+        done = [r[method] for r in runs if r[method]["status"] == "converged"]
+        for name in FREE:
+            values = np.array([d["values"][name] for d in done if name in d["values"]])
+            if values.size == 0:
+                continue
+            true = float(getattr(params, name))
+            sds = np.array([d["sd"][name] or np.nan for d in done if name in d["values"]])
+            # Log-normal intervals, as `fit` gives them.
+            inside = np.abs(np.log(np.maximum(values / true, 1e-300))) < 1.96 * sds / values
+            spread = values.std(ddof=1)
+            table.append(
+                {
+                    "method": method,
+                    "parameter": name,
+                    "bias": (values.mean() - true) / true,
+                    "bias_in_sd": (values.mean() - true) / spread,
+                    "rmse": np.sqrt(np.mean((values / true - 1.0) ** 2)),
+                    "claimed_over_empirical": np.sqrt(np.mean(sds**2)) / spread,
+                    "coverage": inside.mean() if np.isfinite(sds).all() else np.nan,
+                    "failures": len(runs) - len(done),
+                    "steps_99": np.percentile([d["steps"] for d in done], 99),
+                    "seconds": np.median([d["seconds"] for d in done]),
+                }
+            )
+    return table
+
+
+def markdown(table: list[dict[str, Any]], count: int) -> str:
+    head = (
+        "| method | parameter | bias | bias/sd | RMSE | claimed/empirical sd | coverage of 95 % "
+        "| failures | steps (99 %) | time [s] |"
+    )
+    lines = [f"{count} runs of {N} samples, disturbance as large as the response.", "", head]
+    lines.append("|" + "---|" * 10)
+    for r in table:
+        coverage = "none claimed" if np.isnan(r["coverage"]) else f"{100 * r['coverage']:.1f} %"
+        ratio = r["claimed_over_empirical"]
+        claimed = "" if np.isnan(ratio) else f"{ratio:.2f}"
+        lines.append(
+            f"| {r['method']} | {r['parameter']} | {100 * r['bias']:+.2f} % | "
+            f"{r['bias_in_sd']:+.2f} | {100 * r['rmse']:.1f} % | {claimed} | {coverage} | "
+            f"{r['failures']} | {r['steps_99']:.0f} | {r['seconds']:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def figure(runs: list[dict[str, Any]], params: Any, path: Path) -> None:
+    made = Figure(figsize=(7.4, 3.2), layout="constrained")
+    for ax, name in zip(made.subplots(1, len(FREE)), FREE, strict=True):
+        for i, method in enumerate(METHODS):
+            done = [r[method] for r in runs if r[method]["status"] == "converged"]
+            values = [d["values"].get(name, np.nan) for d in done]
+            x = np.array(values) / float(getattr(params, name))
+            ax.plot(x, i + np.linspace(-0.3, 0.3, x.size), ".", ms=3, alpha=0.6)
+        ax.axvline(1.0, color="black", lw=0.8)
+        ax.set_yticks(range(len(METHODS)), METHODS if name == "Ixx" else [""] * len(METHODS))
+        ax.set_xscale("log")
+        ax.set_xlabel(f"{name}, estimate over truth")
+    made.savefig(path)
+
+
+def main(count: int, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "runs.jsonl"
+    kept = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+    runs = {r["seed"]: r for r in (json.loads(line) for line in kept)}
+    params = truth()
+    for seed in range(count):
+        if seed in runs:
+            continue
+        runs[seed] = one_run(params, seed)
+        with log.open("a", encoding="utf-8") as f:
+            f.write(json.dumps(runs[seed]) + "\n")
+        if seed % 10 == 9:
+            print(f"{seed + 1} of {count} runs", file=sys.stderr, flush=True)
+    chosen = [runs[s] for s in range(count)]
+    text = markdown(rows(chosen, params), count)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    figure(chosen, params, folder / "monte_carlo.svg")
+    print(text, end="")
+
+
+if __name__ == "__main__":
+    main(
+        int(sys.argv[1]) if len(sys.argv) > 1 else 200,
+        Path(sys.argv[2] if len(sys.argv) > 2 else "runs/monte-carlo"),
+    )
