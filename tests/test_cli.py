@@ -104,6 +104,24 @@ def test_too_few_steps_end_with_exit_code_4(bench):
     assert json.loads((out / "fit.json").read_text())["status"] == "not-converged"
 
 
+def test_filter_error_by_configuration(bench, capsys):
+    out = bench.parent / "run"
+    how = ["--set", "fit.method=filter-error", "--set", "fit.free.a.start=5.5"]
+    assert main(["fit", str(bench), *how, "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "sigma_w" in shown
+    content = json.loads((out / "fit.json").read_text())
+    assert content["method"] == "filter-error"
+    assert {"sigma_w", "tau_w"} <= set(content["nuisance"])
+    assert content["residuals"]["white"]
+    assert "a/Ixx" in content["baseline_rls"]["combinations"]
+
+
+def test_simulation_needs_the_size_of_the_disturbance(bench, capsys):
+    edited(bench, lambda c: c.update(disturbance={"axis": "roll"}))
+    refused(capsys, ["simulate", bench, "--out", bench.parent / "b.csv"], "sigma_w and tau_w")
+
+
 def test_info_tells_rate_and_signals(bench, capsys):
     assert main(["info", str(bench.parent / "bench.csv")]) == 0
     shown = capsys.readouterr().out
@@ -185,6 +203,32 @@ WRONG = {
         lambda c: c["flights"][0].update(window=[0, 0.1]), ["bench.csv", "samples"],
     ),
     "method": (lambda c: c["fit"].update(method="guess"), ["fit.method", "output-error"]),
+    "filter without disturbance": (
+        lambda c: (c.pop("disturbance"), c["fit"].update(method="filter-error")),
+        ["fit.method", "needs a disturbance"],
+    ),
+    "disturbance on no axis": (
+        lambda c: (
+            c["disturbance"].update(axis="pitch"), c["fit"].update(method="filter-error"),
+        ),
+        ["disturbance", "no axis 'pitch'", "roll"],
+    ),
+    "negative disturbance": (
+        lambda c: c["disturbance"].update(sigma_w=-1.0), ["disturbance.sigma_w", "-1"],
+    ),
+    "disturbance without memory": (
+        lambda c: c["disturbance"].update(tau_w=0.0), ["disturbance.tau_w", "0"],
+    ),
+    "fixed but not given": (
+        lambda c: c.update(disturbance={"axis": "roll", "fixed": ["tau_w"]}),
+        ["disturbance", "tau_w is fixed but not given"],
+    ),
+    "noise parameter free": (
+        lambda c: (
+            c["fit"]["free"].update(tau_w={"start": 1.0}), c["fit"].update(method="filter-error"),
+        ),
+        ["free.tau_w", "leave it out"],
+    ),
     "forgetting": (lambda c: c.update(rls={"forgetting": 1.5}), ["rls.forgetting", "1.5"]),
 }  # fmt: skip
 BENCH_30 = yaml.safe_load((ROOT / "configs" / "vehicles" / "bench-30.yaml").read_text())
