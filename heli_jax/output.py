@@ -58,7 +58,9 @@ def print_fit(fit: Fit, baseline: Baseline | None, out: Path) -> None:
     for c in fit.verdict.combinations:
         print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
     for name, m in fit.metrics.items():
-        print(f"{name}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
+        print(
+            f"{name}, simulated: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}"
+        )
     for name, m in fit.validation.items():
         print(f"{name}, held out: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %")
     if baseline is not None:

@@ -279,6 +279,10 @@ def _assemble(
     n = sum(y.size for f in problem.training for y in f.outputs.values())
     quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
     signals = _signals(e.raw, problem.training)
+    if e.innovations:
+        signals = tuple(
+            s._replace(innovations=one.error) for s, one in zip(signals, e.innovations, strict=True)
+        )
     white = _whiteness(signals, e)
     coloured = usable and not layout.filtered and not all(w.white for w in white.values())
     wider = inflation(layout, data, e) if coloured else np.ones(layout.size)

@@ -36,10 +36,16 @@ class Signals(NamedTuple):
     measured: dict[str, np.ndarray]
     simulated: dict[str, np.ndarray]
     """with the estimated bias"""
+    innovations: dict[str, np.ndarray] | None = None
+    """filter error: measured - predicted from all samples before, SI"""
 
     def residual(self, output: str) -> np.ndarray:
         """measured - simulated"""
         return self.measured[output] - self.simulated[output]
+
+    def error(self, output: str) -> np.ndarray:
+        """What the fit makes white: the innovations with filter error, else the residual."""
+        return self.residual(output) if self.innovations is None else self.innovations[output]
 
 
 class StartRow(NamedTuple):

@@ -84,24 +84,26 @@ def response(
 
 def _agreement(signals: Signals, output: str) -> str:
     m = metrics(signals.measured[output], signals.simulated[output])
-    how = "held out, predicted" if signals.hold_out else "fitted"
+    how = "held out, simulated" if signals.hold_out else "simulated"
     vaf = f", VAF {percent(m.vaf)}" if np.isfinite(m.vaf) else ""
     return f"{output}, {signals.flight}: {how}{vaf}"
 
 
 def residual_correlation(signals: Signals, output: str, *, figure: Figure | None = None) -> Panels:
-    """Autocorrelation of the residual and its correlation with each input, with 99 % bands."""
-    residual, dt = signals.residual(output), _dt(signals)
+    """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
+    input, with 99 % bands."""
+    residual, dt = signals.error(output), _dt(signals)
     n, lags = residual.size, lags_for(residual.size)
     names = list(signals.inputs)
     axes = _panels(figure, 2.4 + 1.6 * len(names), [1.2, *[1.0] * len(names)], sharex=False)
     w = whiteness(residual)
     found = "white" if w.white else "not white"
+    what = "Residual" if signals.innovations is None else "Innovations"
     r = autocorrelation(residual, lags)[1:]
     _stems(axes[0], dt * np.arange(1, lags + 1), r, BAND99 / np.sqrt(n))
     axes[0].set_xlim(0.0, dt * (lags + 0.5))
     axes[0].set_ylabel("autocorrelation")
-    axes[0].set_title(f"Residual of {output}, {signals.flight}: {found}", loc="left")
+    axes[0].set_title(f"{what} of {output}, {signals.flight}: {found}", loc="left")
     first = f"{w.lag1:+.2f}".replace("-", "−")
     subtitle(
         axes[0],

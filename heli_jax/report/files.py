@@ -187,8 +187,8 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
         names += [
             f"{n}_{what}"
             for n in s.measured
-            for what in ("measured", "simulated", "residual")
-            if f"{n}_{what}" not in names
+            for what in ("measured", "simulated", "residual", "innovation")
+            if (what != "innovation" or s.innovations is not None) and f"{n}_{what}" not in names
         ]
     parts = []
     for s in signals:
@@ -197,5 +197,7 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
             here[f"{output}_measured"] = measured
             here[f"{output}_simulated"] = s.simulated[output]
             here[f"{output}_residual"] = s.residual(output)
+            if s.innovations is not None:
+                here[f"{output}_innovation"] = s.innovations[output]
         parts.append(here)
     write_table(path, stacked(parts, names))
