@@ -5,6 +5,7 @@ Roll and pitch share the functions; they differ in the inertia and in the names 
 README on where the paper and physics part.
 """
 
+import dataclasses
 import functools
 from typing import Annotated, Any, NamedTuple
 
@@ -154,17 +155,7 @@ def on_stand(model: Model) -> Model:
             rates = naming.replace(rates, **{axis.rate: slowed})
         return rates
 
-    return Model(
-        f"{model.name}-on-stand",
-        vector_field,
-        model.output,
-        model.Params,
-        model.State,
-        model.Inputs,
-        model.Outputs,
-        linear=model.linear,
-        start=model.start,
-    )
+    return dataclasses.replace(model, name=f"{model.name}-on-stand", vector_field=vector_field)
 
 
 class TransferFunction(NamedTuple):

@@ -66,7 +66,7 @@ def fit(
     max_steps: int = 200,
     progress: starting.Progress | None = None,
 ) -> Fit:
-    """Estimate the free parameters by output error: minimise the simulation error.
+    """Estimate the free parameters by the problem's method: output error or filter error.
 
     Args:
         starts: how many points to start from; the first is the given one, the others are drawn
@@ -76,7 +76,8 @@ def fit(
 
     Returns:
         A Fit whose `status` says whether it converged and whether the data determine what was
-        asked. White-noise (Cramér-Rao) intervals; `white` says whether they may be believed.
+        asked. Cramér-Rao intervals; those of output error allow for residuals that are not white
+        (`coloured`), and `narrow` says where nothing does.
     """
     begin = time.perf_counter()
     tell = progress or (lambda _: None)
@@ -180,7 +181,7 @@ def _disturbance_or_none(
     """
     layout = search.layout
     e = _evaluation(layout, search.data, noise, best.z)
-    at = len(layout.named) + layout.noise.index("sigma_w")
+    at = layout.noise_at("sigma_w")
     if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
         return best, noise, None
     smallest = min(float(s) for one in noise.sd for s in one.values())
@@ -228,7 +229,7 @@ def _updated_noise(
     squares, logs = _innovation_sums(e, noise)
     factor = np.sqrt(squares / n * freedom)
     if "sigma_w" in layout.noise:
-        at = len(layout.named) + layout.noise.index("sigma_w")
+        at = layout.noise_at("sigma_w")
         z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
     sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
     return z, Noise(sd, np.asarray(logs / n, noise.level.dtype))
@@ -269,14 +270,12 @@ def _assemble(
     status: Status = "converged"
     if not bool(best.converged) or not usable:
         status = "not-converged"
-    notes = [
-        *excitation.sampling(
-            problem, {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
-        ),
-    ]
+    notes = excitation.sampling(
+        problem, {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    )
     if usable and not verdict.identifiable:
         status = "not-identifiable"
-    n = sum(y.size for f in problem.training for y in f.outputs.values())
+    n = residuals_count(data)
     quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
     signals = _signals(e.raw, problem.training)
     if e.innovations:

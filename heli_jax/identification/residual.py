@@ -93,6 +93,10 @@ class Layout(eqx.Module):
         """Where in z the initial states and biases begin."""
         return len(self.named) + len(self.noise)
 
+    def noise_at(self, name: str) -> int:
+        """Where in z a parameter of the disturbance stands."""
+        return len(self.named) + self.noise.index(name)
+
     @property
     def size(self) -> int:
         """The number of unknowns."""

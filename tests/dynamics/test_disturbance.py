@@ -8,6 +8,8 @@ import scipy.linalg
 
 from heli_jax import models, naming, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.roll import on_stand
+from heli_jax.simulation.discretize import process_noise
 from tests.dynamics.paper import BENCH, matrices
 
 DT, N, SIGMA, TAU = 0.02, 100_000, 1.04, 0.1
@@ -115,3 +117,15 @@ def test_pitch_has_its_own_axis(bench30):
 def test_what_cannot_be_disturbed(axis, poles, said):
     with pytest.raises(ValueError, match=said):
         with_disturbance(models.roll, axis, poles)
+
+
+def test_a_stand_keeps_the_disturbance(bench30):
+    one = on_stand(with_disturbance(models.roll, "roll"))
+    other = with_disturbance(models.roll_on_stand, "roll")
+    params = one.Params(
+        **naming.asdict(bench30), sigma_w=jnp.asarray(SIGMA), tau_w=jnp.asarray(TAU)
+    )
+    np.testing.assert_allclose(
+        process_noise(one, params, DT), process_noise(other, params, DT), rtol=1e-12
+    )
+    assert one.spread_names == other.spread_names == ("w1_roll",)
