@@ -123,13 +123,16 @@ def _fit(options: argparse.Namespace) -> int:
     if experiment.config.rls is not None:
         _say("recursive least squares")
         started = time.perf_counter()
-        rls = baseline(
-            experiment.model,
-            experiment.vehicle.params,
-            problem.training[0],
-            order=experiment.config.rls.order,
-            forgetting=experiment.config.rls.forgetting,
-        )
+        try:
+            rls = baseline(
+                experiment.model,
+                experiment.vehicle.params,
+                problem.training[0],
+                order=experiment.config.rls.order,
+                forgetting=experiment.config.rls.forgetting,
+            )
+        except ValueError as e:
+            _say(f"no baseline: {e}")
         found.timing["rls"] = time.perf_counter() - started
     from heli_jax import output
 

@@ -99,13 +99,14 @@ class DisturbanceConfig(_Strict):
     """standard deviation [rad/s^2]: needed to simulate, a start for filter error"""
     tau_w: Positive | None = None
     """correlation time [s]: needed to simulate, a start for filter error"""
-    fixed: list[Literal["tau_w"]] = []
-    """what filter error takes as it stands here"""
+    fixed: list[Literal["sigma_w", "tau_w", "sigma_y"]] = []
+    """what filter error takes as it stands here; sigma_y: the noise that the outputs state (sd)"""
 
     @model_validator(mode="after")
     def _fixed_given(self) -> "DisturbanceConfig":
-        if "tau_w" in self.fixed and self.tau_w is None:
-            raise ValueError("tau_w is fixed but not given, wanted is its value")
+        for name in ("sigma_w", "tau_w"):
+            if name in self.fixed and getattr(self, name) is None:
+                raise ValueError(f"{name} is fixed but not given, wanted is its value")
         return self
 
 

@@ -41,7 +41,7 @@ class Flight:
     Attributes:
         dt: time between samples [s].
         inputs: samples (N,) by the model's name; each holds until the next sample.
-        outputs: samples (N,) by the model's name.
+        outputs: samples (N,) by the model's name; NaN where one is missing.
         t0: time in the log of the first sample [s].
         sd: standard deviation of the measurement noise by output, only where it was stated.
         known: parameters that differ in this run, SI.
@@ -49,7 +49,8 @@ class Flight:
 
     Raises:
         ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
-            not finite; `sd` names no output or is not positive; `known` is not finite.
+            not finite (outputs may be NaN); `sd` names no output or is not positive; `known` is
+            not finite.
     """
 
     dt: float
@@ -68,7 +69,8 @@ class Flight:
         if not math.isfinite(self.t0):
             raise ValueError(f"t0 is {self.t0}, wanted is a finite number of seconds")
         for kind in ("inputs", "outputs"):
-            signals = {name: _samples(name, x) for name, x in getattr(self, kind).items()}
+            gaps = kind == "outputs"
+            signals = {name: _samples(name, x, gaps) for name, x in getattr(self, kind).items()}
             object.__setattr__(self, kind, signals)
         lengths = {name: x.size for name, x in (*self.inputs.items(), *self.outputs.items())}
         if not lengths:
@@ -105,11 +107,11 @@ class Flight:
         return self.dt * (self.n_samples - 1)
 
 
-def _samples(name: str, values: np.ndarray) -> np.ndarray:
+def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
     samples = np.array(values, dtype=np.float64)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"{name!r} has shape {samples.shape}, wanted is (N,) with N >= 1")
-    bad = np.flatnonzero(~np.isfinite(samples))
+    bad = np.flatnonzero(np.isinf(samples) if gaps else ~np.isfinite(samples))
     if bad.size:
         raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, wanted are numbers")
     samples.setflags(write=False)

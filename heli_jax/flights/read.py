@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
-from heli_jax.flights.table import Table, column, open_table, wrong
+from heli_jax.flights.table import Table, column, open_table, shown, wrong
 
 _FEWEST = 8
 _MOST_UPSAMPLING = 100
@@ -69,7 +69,7 @@ def read_flight(
         known=dict(request.known),
         hold_out=hold_out,
         name=name,
-        source=Source(table.path, table.sha256, notes + more),
+        source=Source(table.path, table.sha256, (*notes, *_missing(request, signals), *more)),
     )
     if moving_inputs:
         require_moving_inputs(flight)
@@ -163,13 +163,25 @@ def _to_si(
     for (key, kind), signal in request.signals.items():
         with np.errstate(over="ignore"):
             values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
-        bad = np.flatnonzero(~np.isfinite(values))
+        # An output may be missing here and there; a stick is somewhere all the time.
+        bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:
             row = rows.start + int(bad[0])
             found = f"found {table.found(signal.name, row)}, wanted is a finite number"
             raise wrong(table.path, found, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples
+
+
+def _missing(request: Request, signals: _Samples) -> list[str]:
+    """A note for every output with missing samples."""
+    found = []
+    for (key, kind), values in signals.items():
+        count = int(np.isnan(values).sum())
+        if count:
+            name = request.signals[key, kind].name
+            found.append(f"{count} of {values.size} samples of {shown(name)} are missing")
+    return found
 
 
 def _check_step(table: Table, name: str, seconds: np.ndarray, start: int) -> None:

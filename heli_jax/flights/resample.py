@@ -57,4 +57,6 @@ def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> n
     i = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, seconds.size - 2)
     part = np.clip((times - seconds[i]) / (seconds[i + 1] - seconds[i]), 0.0, 1.0)
     # A weighted mean: the difference of two huge values would overflow.
-    return values[i] * (1.0 - part) + values[i + 1] * part
+    between = values[i] * (1.0 - part) + values[i + 1] * part
+    # A missing (NaN) neighbour costs nothing at the stamp itself.
+    return np.where(part == 0.0, values[i], np.where(part == 1.0, values[i + 1], between))

@@ -59,10 +59,19 @@ def baseline(
 
     Both signals are scaled to unit rms, so that P(0) = 1e12 I means the same whatever the units;
     Theta is scaled back. The first samples, whose past was not recorded, only serve as past.
+
+    Raises:
+        ValueError: too few samples in a row.
     """
     output = _output(model, flight)
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
-    u, y = flight.inputs[input_], flight.outputs[output]
+    part = _longest_whole(flight.outputs[output])
+    if part.stop - part.start < 10 * order:
+        raise ValueError(
+            f"the longest stretch of {output} without a missing sample has {part.stop - part.start}"
+            f", wanted for order {order} are {10 * order}"
+        )
+    u, y = flight.inputs[input_][part], flight.outputs[output][part]
     u_scale, y_scale = _rms(u), _rms(y)
     run = rls(
         jnp.asarray(u / u_scale),
@@ -82,6 +91,7 @@ def baseline(
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     agreement = _metrics(y, simulated)
     sentences = [
+        *_gaps(flight, output, part),
         *_stability(poles),
         *([note] if note else []),
         *doubts,
@@ -104,13 +114,33 @@ def baseline(
         exact=exact,
         note=note,
         combinations=combinations,
-        times=flight.times,
+        times=flight.times[part],
         measured=y,
         simulated=simulated,
         metrics=agreement,
         trusted=not sentences,
         sentences=tuple(sentences),
     )
+
+
+def _longest_whole(y: np.ndarray) -> slice:
+    """The longest stretch without a missing sample."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], np.isnan(y), [True]]).astype(int)))
+    if not edges.size:
+        return slice(0, 0)
+    starts, ends = edges[::2], edges[1::2]
+    best = int(np.argmax(ends - starts))
+    return slice(int(starts[best]), int(ends[best]))
+
+
+def _gaps(flight: Flight, output: str, part: slice) -> list[str]:
+    y = flight.outputs[output]
+    if not np.isnan(y).any():
+        return []
+    return [
+        f"It needs every sample: {int(np.isnan(y).sum())} of {output} are missing, so it saw only "
+        f"the {part.stop - part.start} samples from {part.start * flight.dt:.4g} s on."
+    ]
 
 
 def _rms(signal: np.ndarray) -> float:

@@ -1,7 +1,5 @@
 """Estimates with standard deviations and intervals, from an optimum and its verdict."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Array
 
@@ -9,8 +7,9 @@ from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.identifiability import Unknown, Verdict
 from heli_jax.identification.judgement import references_of, unknowns_of
+from heli_jax.identification.layout import Data, Layout
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
-from heli_jax.identification.residual import Data, Evaluation, Layout
+from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Estimate
 
 
@@ -87,11 +86,12 @@ def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     ]
 
 
-def stated_noise_notes(problem: Problem, sd: Any) -> list[str]:
+def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
+    """Where the noise found, by 'flight/output', is not the stated one."""
     notes = []
-    for flight, label, by_name in zip(problem.training, labels(problem.training), sd, strict=True):
+    for flight, label in zip(problem.training, labels(problem.training), strict=True):
         for name, stated in flight.sd.items():
-            ratio = float(by_name[name]) / stated
+            ratio = sds[f"{label}/{name}"] / stated
             if not 0.5 < ratio < 2.0:
                 notes.append(
                     f"{label}: the residual of {name} has {ratio:.2g} times the stated noise; the "

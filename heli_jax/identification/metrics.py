@@ -20,7 +20,9 @@ class Metrics(NamedTuple):
 
 
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
-    """Agreement of two signals (N,)."""
+    """Agreement of two signals (N,) where something is measured (not NaN)."""
+    seen = ~np.isnan(measured)
+    measured, simulated = measured[seen], simulated[seen]
     residual = measured - simulated
     spread = np.linalg.norm(measured - measured.mean())
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
@@ -49,8 +51,8 @@ class Whiteness(NamedTuple):
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Autocorrelation (lags + 1,) from lag 0, by the biased estimate."""
-    r = residual - residual.mean()
+    """Autocorrelation (lags + 1,) from lag 0, by the biased estimate; NaN counts as the mean."""
+    r = _centred(residual)
     n = r.size
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(r, size)) ** 2
@@ -60,7 +62,7 @@ def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
 
 def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
     """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags."""
-    a, b = u - u.mean(), residual - residual.mean()
+    a, b = _centred(u), _centred(residual)
     n = a.size
     size = 1 << (2 * n - 1).bit_length()
     c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
@@ -69,14 +71,19 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
     return both / scale if scale > 0 else np.zeros(2 * lags + 1)
 
 
+def _centred(signal: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
+
+
 def lags_for(n: int) -> int:
     """How many lags a record of n samples bears: a quarter of it, at most 500."""
     return max(1, min(n // 4, 500))
 
 
 def whiteness(residual: np.ndarray) -> Whiteness:
-    """The Ljung-Box test at 1 % on residuals (N,)."""
-    n, lags = residual.size, lags_for(residual.size)
+    """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured."""
+    n = int(np.count_nonzero(~np.isnan(residual)))
+    lags = lags_for(n)
     r = autocorrelation(residual, lags)[1:]
     statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, lags + 1)))
     # Few lags see a short memory that many lags would drown; both must agree with white noise.
@@ -91,12 +98,15 @@ def whiteness(residual: np.ndarray) -> Whiteness:
 
 
 def noise_guess(signal: np.ndarray) -> float:
-    """White measurement noise sd of a smooth signal, from its third differences.
+    """White measurement noise sd of a smooth signal, from its third differences; NaN is skipped.
 
     Third differences of white noise have variance 20 sd^2; what is smooth all but vanishes in
     them. Robust against the corners of a response (median of absolute values).
     """
     d = np.diff(signal, 3)
+    d, signal = d[np.isfinite(d)], signal[np.isfinite(signal)]
+    if not d.size:
+        d = signal - np.median(signal)
     guess = float(np.median(np.abs(d)) / 0.6744897501960817 / np.sqrt(20.0))
     floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
     return max(guess, floor, 1e-300)

@@ -10,7 +10,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from heli_jax.identification.residual import Data, Layout, Noise, evaluate
+from heli_jax.identification.layout import Data, Layout, Noise
+from heli_jax.identification.residual import evaluate
 
 
 class Optimum(NamedTuple):

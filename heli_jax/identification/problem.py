@@ -48,6 +48,8 @@ class Nuisance(NamedTuple):
 
 Method = Literal["output-error", "filter-error"]
 
+_FIXABLE = ("sigma_w", "tau_w", "sigma_y")
+
 MAX_TIME_SHIFT = 0.5
 """Bound on an estimated time shift to either side [s]."""
 
@@ -76,7 +78,8 @@ class Problem:
     """output-error compares with a simulation; filter-error with one-step predictions of a
     Kalman filter, for models with a disturbance (`with_disturbance`)"""
     fixed_noise: tuple[str, ...] = ()
-    """what filter error takes from `vehicle` instead of estimating it: `tau_w`"""
+    """what filter error takes as given instead of estimating it: `sigma_w` and `tau_w` from
+    `vehicle`, `sigma_y` (the measurement noise) from the flights' `sd`"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flights", tuple(self.flights))
@@ -98,7 +101,7 @@ class Problem:
         """The parameters of the disturbance that filter error estimates, with their starts."""
         if self.method == "output-error":
             return {}
-        size = max(float(np.std(y)) for f in self.training for y in f.outputs.values())
+        size = max(float(np.nanstd(y)) for f in self.training for y in f.outputs.values())
         found = {"sigma_w": Free(size or 1.0), "tau_w": Free(1.0)}
         for name in found:
             value = float(getattr(self.vehicle, name))
@@ -129,11 +132,14 @@ def _check_method(problem: Problem) -> None:
             f"method filter-error: model {model.name} has no disturbance, wanted is a model made "
             "with with_disturbance (in a configuration: a `disturbance`)"
         )
-    if not model.linear:
-        raise ValueError(f"method filter-error: model {model.name} is not linear, wanted is one")
+    if not all(n in _FIXABLE for n in problem.fixed_noise):
+        raise ValueError(f"fixed_noise is {problem.fixed_noise}, wanted are some of {_FIXABLE}")
     for name in ("sigma_w", "tau_w"):
         if name in problem.free:
             raise ValueError(f"free.{name}: filter-error estimates it by itself, leave it out")
+        value = float(getattr(problem.vehicle, name))
+        if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
 
 
 def _check_free(name: str, one: Free, model: Model) -> None:
@@ -196,13 +202,14 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
         )
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
+    _check_measured(flight, problem, where)
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
             raise ValueError(
                 f"{where}, known.{name}: model {model.name} has no such parameter"
                 f"{nearest(name, naming.names(model.Params))}"
             )
-        if name in problem.free:
+        if name in problem.free or name in problem.noise:
             raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
         if not math.isfinite(value):
             raise ValueError(f"{where}, known.{name}: found {value}, wanted is a finite number")
@@ -214,6 +221,22 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
             f"{where} has {flight.n_samples} samples for {len(problem.free)} free parameters, "
             f"wanted are {3 * len(problem.free)} at least"
         )
+
+
+def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
+    for name, y in flight.outputs.items():
+        missing = float(np.mean(np.isnan(y)))
+        if missing > 0.5:
+            raise ValueError(
+                f"{where}: output {name!r} is missing in {100 * missing:.0f} % of its samples, "
+                "wanted is at most half"
+            )
+        stated = name in flight.sd or flight.hold_out
+        if problem.method == "filter-error" and "sigma_y" in problem.fixed_noise and not stated:
+            raise ValueError(
+                f"{where}: the noise of output {name!r} is fixed (sigma_y) but not stated, wanted "
+                "is its sd"
+            )
 
 
 def _check_model(problem: Problem) -> None:

@@ -39,6 +39,11 @@ class Signals(NamedTuple):
     innovations: dict[str, np.ndarray] | None = None
     """filter error: measured - predicted from all samples before, SI"""
 
+    def predicted(self, output: str) -> np.ndarray:
+        """One sample ahead, from all samples before (filter error)."""
+        assert self.innovations is not None
+        return self.measured[output] - self.innovations[output]
+
     def residual(self, output: str) -> np.ndarray:
         """measured - simulated"""
         return self.measured[output] - self.simulated[output]
@@ -86,11 +91,19 @@ class Fit:
     verdict: Verdict
     noise: dict[str, float]
     """residual sd for each flight and output: 'flight/output'"""
+    log_likelihood: float
+    """Gaussian, of the measured outputs in SI"""
+    unknowns: int
+    """all that was estimated: parameters, disturbance, noise, initial states, biases"""
     signals: tuple[Signals, ...]
     metrics: dict[str, Metrics]
-    """over the fitted flights, by output"""
+    """of the simulation, over the fitted flights, by output"""
     validation: dict[str, Metrics]
-    """over the flights held out, by output"""
+    """of the simulation, over the flights held out, by output"""
+    one_step: dict[str, Metrics]
+    """filter error: of the prediction one sample ahead, over the fitted flights, by output"""
+    one_step_validation: dict[str, Metrics]
+    """the same over the flights held out"""
     whiteness: dict[str, Whiteness]
     starts: tuple[StartRow, ...]
     steps: int
@@ -101,6 +114,16 @@ class Fit:
     """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def aic(self) -> float:
+        """Akaike's information criterion."""
+        return 2.0 * self.unknowns - 2.0 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """Schwarz' information criterion."""
+        return self.unknowns * float(np.log(self.n_samples)) - 2.0 * self.log_likelihood
 
     @property
     def narrow(self) -> bool:

@@ -9,21 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification import coordinates
-from heli_jax.identification.optimise import (
-    Optimum,
-    optimise,
-    residuals_count,
-)
+from heli_jax.identification.layout import Data, Layout, Noise, layout_of, unpack
+from heli_jax.identification.optimise import Optimum, optimise, residuals_count
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
-from heli_jax.identification.residual import (
-    Data,
-    Layout,
-    Noise,
-    layout_of,
-    predict,
-    rows_of,
-    unpack,
-)
+from heli_jax.identification.residual import predict, rows_of
 from heli_jax.identification.result import StartRow
 
 Progress = Callable[[str], None]
@@ -90,8 +79,9 @@ def _scan(
         for flight, run, s in zip(data.flights, runs, noise.sd, strict=True):
             for n, y in flight.outputs.items():
                 m = getattr(run.outputs, n)
-                ys.append((y - jnp.mean(y)) / s[n])
-                ms.append((m - jnp.mean(m)) / s[n])
+                seen = jnp.isfinite(y)
+                ys.append(_centred(y, seen) / s[n])
+                ms.append(_centred(m, seen) / s[n])
         y, m = jnp.concatenate(ys), jnp.concatenate(ms)
         gain = jnp.ones_like(y[0])
         if len(layout.gains) == 1:
@@ -100,6 +90,12 @@ def _scan(
         return jnp.mean(jnp.square(y - gain * m)), gain
 
     return jax.lax.map(at, shifts)
+
+
+def _centred(signal: Array, seen: Array) -> Array:
+    """Less its mean over the samples seen; zero elsewhere."""
+    share = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
+    return jnp.where(seen, signal - share, 0.0)
 
 
 def draw(
@@ -177,7 +173,7 @@ class Search:
     def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
         power = [
-            float(np.sum(np.square(np.asarray(y) / np.asarray(s[n]))))
+            float(np.nansum(np.square(np.asarray(y) / np.asarray(s[n]))))
             for flight, s in zip(self.data.flights, noise.sd, strict=True)
             for n, y in flight.outputs.items()
         ]

@@ -97,6 +97,8 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     """
     if not np.std(u) > 0:
         return "the input does not move"
+    if np.isnan(y).any():
+        return "samples are missing"
     needed = max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
     length = max(needed, min(2 ** int(np.log2(max(u.size / SEGMENTS, 1.0))), _LONGEST))
     segments = 1 + (u.size - length) // (length // 2)

@@ -98,14 +98,22 @@ def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete
 
 
 def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
-    """Covariance of the noise that the model's white-noise drive adds in one step (Van Loan)."""
+    """Covariance of the noise that a linear model's white-noise drive adds in one step."""
     A = jacobians(model, params).A
-    n = A.shape[0]
     if model.noise is None:
-        return jnp.zeros((n, n), A.dtype)
+        return jnp.zeros(A.shape, A.dtype)
     G = jnp.stack([jnp.asarray(g, A.dtype) for g in jax.tree.leaves(model.noise(params))])
+    return van_loan(A, G, dt)
+
+
+def van_loan(A: Float[Array, "n n"], g: Float[Array, " n"], dt: Any) -> Float[Array, "n n"]:
+    """Covariance after dt [s] of x' = A x + g w with white noise w of unit intensity, from zero.
+
+    Each state has its own w. Source: Van Loan (1978).
+    """
+    n = A.shape[0]
     M = jnp.zeros((2 * n, 2 * n), A.dtype)
-    M = M.at[:n, :n].set(-A).at[:n, n:].set(jnp.diag(G**2)).at[n:, n:].set(A.T)
+    M = M.at[:n, :n].set(-A).at[:n, n:].set(jnp.diag(g**2)).at[n:, n:].set(A.T)
     E = expm(M * jnp.asarray(dt, A.dtype))
     Q = E[n:, n:].T @ E[:n, n:]
     return 0.5 * (Q + Q.T)

@@ -199,7 +199,7 @@ def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.Abstra
     raise ValueError(f"unknown solver {solver!r}: use 'exact', 'rk4' or a diffrax solver")
 
 
-def _split(delay: Any, dt: Any) -> tuple[Any, Any]:
+def split_delay(delay: Any, dt: Any) -> tuple[Any, Any]:
     """A delay as whole samples and the rest as a fraction of a sample in [0, 1)."""
     samples = jnp.asarray(delay) / dt
     whole = jnp.floor(jax.lax.stop_gradient(samples))
@@ -211,7 +211,7 @@ def _per_sample(
 ) -> tuple[dfx.AbstractSolver, Held, dfx.ODETerm]:
     """The solver, its arguments and the term for time counted in samples."""
     method = _method(model, solver)
-    parts = None if delay is None else _split(delay, dt)
+    parts = None if delay is None else split_delay(delay, dt)
 
     term = _term(model)
     dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
@@ -231,7 +231,7 @@ def held_columns(
     assert held.discrete is not None
     B, U = columns(held)
     n = U.shape[0]
-    acting = inputs if delay is None else _acting(inputs, dt, delay, n)
+    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n)
     return matrix(held.discrete.Ad), U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
 
 
@@ -341,11 +341,11 @@ def _adaptive(
 def _outputs(model: Model, params: Any, states: Any, inputs: Any, dt: Any, delay: Any) -> Any:
     """The outputs at the samples, with the input that acts there."""
     if delay is not None:
-        inputs = _acting(inputs, dt, delay, jax.tree.leaves(inputs)[0].shape[0])
+        inputs = acting_inputs(inputs, dt, delay, jax.tree.leaves(inputs)[0].shape[0])
     return jax.vmap(lambda x, u: model.output(params, x, u))(states, inputs)
 
 
-def _acting(inputs: Any, dt: Any, delay: Any, n: int) -> Any:
+def acting_inputs(inputs: Any, dt: Any, delay: Any, n: int) -> Any:
     """The inputs that act at the n samples when they come late."""
-    whole, rest = _split(delay, dt)
+    whole, rest = split_delay(delay, dt)
     return at(inputs, jnp.arange(n) - whole - (rest > 0).astype(int))

@@ -33,7 +33,7 @@ BAD = {
     "shape": {"inputs": {"x_roll": np.zeros((4, 1))}},
     "no samples": {"inputs": {"x_roll": np.zeros(0)}},
     "nan input": {"inputs": {"x_roll": np.array([0.0, np.nan, 0.0, 0.0])}},
-    "nan output": {"outputs": {"roll": np.array([0.0, np.nan, 0.0, 0.0])}},
+    "infinite output": {"outputs": {"roll": np.array([0.0, np.inf, 0.0, 0.0])}},
     "no signals": {"inputs": {}, "outputs": {}},
     "sd of an input": {"sd": {"x_roll": 1.0}},
     "sd": {"sd": {"roll": 0.0}},

@@ -221,8 +221,9 @@ def write_parquet(path: Path, **changed) -> Path:
 
 BAD_PARQUET = {
     "text": ({"phi": ["a"] * 20}, ["'phi'", "string"]),
-    "null": ({"phi": [*range(9), None, *range(10)]}, ["row 10", "'phi'", "nothing"]),
-    "nan": ({"phi": [*range(9), math.nan, *range(10)]}, ["row 10", "'phi'", "nan"]),
+    "null": ({"stick": [*range(9), None, *range(10)]}, ["row 10", "'stick'", "nothing"]),
+    "nan": ({"stick": [*range(9), math.nan, *range(10)]}, ["row 10", "'stick'", "nan"]),
+    "inf": ({"phi": [*range(9), math.inf, *range(10)]}, ["row 10", "'phi'", "inf"]),
     "list": ({"phi": [[1.0]] * 20}, ["'phi'", "list"]),
     "time stands": ({"t": [*range(9), 8, *range(10, 20)]}, ["row 10", "'t'", "stands still"]),
 }

@@ -230,3 +230,19 @@ def test_no_damaged_parquet_breaks_the_reader(tmp_path_factory, place, byte):
     data[int(place * len(data))] = byte
     path.write_bytes(data)
     only_input_errors(path)
+
+
+def test_missing_outputs_are_read_and_told(tmp_path):
+    text = lines()
+    for row, empty in ((3, ""), (7, "nan")):
+        text[row + 1] = ",".join([*text[row + 1].split(",")[:2], empty])
+    path = tmp_path / "bench.csv"
+    path.write_text("\n".join(text))
+    flight = read_flight(path, **ASKED)
+    assert np.array_equal(np.flatnonzero(np.isnan(flight.outputs["roll"])), [3, 7])
+    assert flight.source is not None
+    assert flight.source.notes == ("2 of 12 samples of 'phi' are missing",)
+    # On another clock what lies beside a missing sample is missing too, the rest stays.
+    fast = read_flight(path, **ASKED, rate=100).outputs["roll"]
+    assert np.array_equal(np.flatnonzero(np.isnan(fast)), [5, 6, 7, 13, 14, 15])
+    np.testing.assert_allclose(fast[[0, 4, 8, 22]], PHI[[0, 2, 4, 11]], rtol=1e-12)

@@ -1,5 +1,7 @@
 """Filter error on disturbed records, and where there is nothing to filter."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from heli_jax import Flight, Free, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
+from tests.dynamics.paper import BENCH, matrices
 
 DT, N = 0.02, 2000
 TRUTH = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 1.0}
@@ -82,3 +85,95 @@ def test_a_model_without_disturbance_is_refused(bench30):
     _, _, _, flight = made(bench30, 0)
     with pytest.raises(ValueError, match="has no disturbance"):
         Problem(models.roll_on_stand, bench30, [flight], FREE, method="filter-error")
+
+
+@pytest.mark.parametrize("fixed", [("sigma_y",), ("sigma_w", "tau_w")], ids=" ".join)
+def test_noise_may_be_fixed(bench30, fixed):
+    model, params, start, flight = made(bench30, 1)
+    start = replace(start, sigma_w=params.sigma_w, tau_w=params.tau_w)
+    flight = dataclasses.replace(flight, sd={"roll": 2e-3})
+    found = fit(Problem(model, start, [flight], FREE, method="filter-error", fixed_noise=fixed))
+    assert found.status == "converged"
+    assert found.nuisance.keys().isdisjoint(fixed)
+    assert all(abs(e) < 4 for e in errors(found, params).values())
+    free = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+    for name, one in found.estimates.items():
+        assert one.sd == pytest.approx(free.estimates[name].sd, rel=0.4)
+        assert one.value == pytest.approx(free.estimates[name].value, abs=one.sd)
+    assert 0.0 <= free.log_likelihood - found.log_likelihood < 8.0
+    if "sigma_y" in fixed:
+        assert found.noise == {"flight 1/roll": 2e-3}
+
+
+def test_missing_samples_cost_information_and_no_more(bench30):
+    model, params, start, flight = made(bench30, 1)
+    roll = flight.outputs["roll"].copy()
+    gone = np.random.default_rng(0).uniform(size=N) < 0.3
+    gone[400:600] = True
+    flight = dataclasses.replace(flight, outputs={"roll": np.where(gone, np.nan, roll)})
+    for method in ("filter-error", "output-error"):
+        found = fit(Problem(model, start, [flight], FREE, method=method))
+        assert found.status == "converged"
+        assert found.n_samples == np.count_nonzero(~gone)
+        assert all(abs(e) < 4 for e in errors(found, params).values())
+        simulated = found.signals[0].simulated["roll"]
+        assert np.isfinite(simulated).all()
+        assert np.isfinite(found.metrics["roll"].vaf)
+
+
+def test_outputs_of_different_quality_get_each_its_noise(bench30):
+    model, params, start, flight = made(bench30, 2)
+    rng = np.random.default_rng(7)
+    run = simulate(
+        model,
+        params,
+        model.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"])),
+        dt=DT,
+        key=jax.random.key(2),
+    )
+    rate = np.asarray(run.outputs.roll_rate) + 0.05 * rng.standard_normal(N)
+    both = Flight(dt=DT, inputs=flight.inputs, outputs={**flight.outputs, "roll_rate": rate})
+    found = fit(Problem(model, start, [both], FREE, method="filter-error"))
+    assert found.status == "converged"
+    assert found.noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.1)
+    assert found.noise["flight 1/roll_rate"] == pytest.approx(0.05, rel=0.05)
+    assert all(abs(e) < 4 for e in errors(found, params).values())
+
+
+def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
+    """Truth by Euler-Maruyama in NumPy; the stand's spring is a sine."""
+    n, fine = 1500, 40
+    A, B, *_ = (np.asarray(m) for m in matrices(BENCH, True))
+    A = A.copy()
+    A[1, 0] = 0.0
+    rng = np.random.default_rng(11)
+    u = 3e-6 * random_steps(n, DT, rng, (0.2, 1.5))
+    h = DT / fine
+    x, w, y = np.zeros(4), 0.0, np.empty(n)
+    kicks = rng.standard_normal((n, fine)) * 1.04 * np.sqrt(2.0 * h)
+    for k in range(n):
+        y[k] = x[0]
+        for j in range(fine):
+            rates = A @ x + B[:, 0] * u[k]
+            rates[1] += w - 4.0 * np.sin(6.0 * x[0]) / 6.0
+            x, w = x + h * rates, w - h * w + kicks[k, j]
+    y += 2e-3 * rng.standard_normal(n)
+    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
+
+    def field(p, s, u):
+        rates = models.roll_on_stand.vector_field(p, s, u)
+        return replace(rates, dphi=rates.dphi - p.kappa * (jnp.sin(6.0 * s.phi) / 6.0 - s.phi))
+
+    spring = dataclasses.replace(
+        models.roll_on_stand, name="sine spring", vector_field=field, linear=False
+    )
+    model = with_disturbance(spring, "roll")
+    _, params, start, _ = made(bench30, 0)
+    problem = Problem(
+        model, start, [flight], {"Ixx": Free(0.03), "kappa": Free(3.0)}, method="filter-error",
+        substeps=2,
+    )  # fmt: skip
+    found = fit(problem)
+    assert found.status == "converged"
+    assert found.white
+    assert all(abs(e) < 4 for e in errors(found, params).values())

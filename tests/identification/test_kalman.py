@@ -1,5 +1,7 @@
 """The filter against a dense Gaussian likelihood built with scipy, which knows no filter."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,3 +133,21 @@ def test_a_late_input_acts_late(bench30):
     a = likelihood(model, params, u, y, x0, delay=jnp.asarray(3 * DT))
     b = likelihood(model, params, late, y, x0)
     assert float(a) == pytest.approx(float(b), rel=1e-9)
+
+
+@pytest.mark.parametrize("poles", [1, 2])
+@pytest.mark.parametrize("delay", [None, 0.033], ids=["at once", "late"])
+def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30, poles, delay):
+    model, params, u, y = case(bench30, poles)
+    y["roll"][[0, 7, 8]] = np.nan
+    delay = None if delay is None else jnp.asarray(delay)
+
+    def run(model):
+        inputs = model.Inputs(x_roll=jnp.asarray(u))
+        measured = {n: jnp.asarray(v) for n, v in y.items()}
+        return innovations(model, params, inputs, measured, SD, dt=DT, delay=delay)
+
+    exact, extended = run(model), run(dataclasses.replace(model, linear=False))
+    for n, sd in SD.items():
+        np.testing.assert_allclose(extended.error[n], exact.error[n], rtol=1e-10, atol=1e-10 * sd)
+        np.testing.assert_allclose(extended.variance[n], exact.variance[n], rtol=1e-10)

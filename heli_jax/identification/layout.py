@@ -1,0 +1,221 @@
+"""The unknowns of a problem: one vector z, what stands where in it, and the numbers beside it.
+
+z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, then
+for each flight the initial state and the biases.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.flights.flight import Flight
+from heli_jax.identification import coordinates
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+
+_BLOCK = 32
+
+
+class FlightData(NamedTuple):
+    """One flight as arrays: what a trace may see of it."""
+
+    dt: Any
+    inputs: Any
+    """the model's Inputs, arrays (N,)"""
+    outputs: dict[str, Any]
+    """measured, arrays (N,)"""
+    known: dict[str, Any]
+    state_scale: dict[str, Any]
+    """sd of the weak prior on the initial state"""
+    bias_scale: dict[str, Any]
+    """sd of the weak prior on the bias"""
+
+
+class Data(NamedTuple):
+    """All numbers of a problem."""
+
+    base: Any
+    """the vehicle's parameters by name"""
+    sign: Any
+    low: Any
+    high: Any
+    prior_mean: Any
+    prior_sd: Any
+    """inf where a parameter has no prior"""
+    flights: tuple[FlightData, ...]
+
+
+class Layout(eqx.Module):
+    """The static side of a problem: what the unknowns are, in which order."""
+
+    model: Model
+    free: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    gains: tuple[str, ...] = eqx.field(static=True)
+    shift: bool = eqx.field(static=True)
+    initial_state: bool = eqx.field(static=True)
+    bias: bool = eqx.field(static=True)
+    outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    noise: tuple[str, ...] = eqx.field(static=True)
+    """parameters of the disturbance, estimated beside the others by filter error"""
+    scaled: tuple[str, ...] = eqx.field(static=True)
+    """filter error: outputs whose noise has an unknown factor of its own"""
+    filtered: bool = eqx.field(static=True)
+    """whether the residuals are a Kalman filter's innovations"""
+    concentrated: bool = eqx.field(static=True)
+    """filter error: whether a common factor of all noise is taken out of the likelihood"""
+    solver: str | None = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+    """samples per step of the exact recurrence"""
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The unknowns that the verdict speaks of: parameters, gains, the shift."""
+        gains = tuple(f"gain {name}" for name in self.gains)
+        return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The states whose initial values are unknowns: all that are not random there."""
+        if not self.initial_state:
+            return ()
+        random = self.model.spread_names
+        return tuple(n for n in naming.names(self.model.State) if n not in random)
+
+    @property
+    def weak(self) -> int:
+        """Where in z the initial states and biases begin."""
+        return len(self.named) + len(self.noise) + len(self.scaled)
+
+    def noise_at(self, name: str) -> int:
+        """Where in z a parameter of the disturbance stands."""
+        return len(self.named) + self.noise.index(name)
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        each = [len(self.states) + (len(o) if self.bias else 0) for o in self.outputs]
+        return self.weak + sum(each)
+
+
+class Noise(NamedTuple):
+    """What the residuals are measured by."""
+
+    sd: tuple[dict[str, Any], ...]
+    """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
+    level: Any
+    """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
+    the likelihood is laid out in rows, so that they have variance 1"""
+
+
+class Unknowns(NamedTuple):
+    """The vector z taken apart, in the units of the model."""
+
+    params: dict[str, Any]
+    noise: dict[str, Any]
+    scales: dict[str, Any]
+    """factors of the measurement noise by output"""
+    gains: dict[str, Any]
+    shift: Any
+    states: tuple[Any, ...]
+    """one State or None a flight"""
+    biases: tuple[dict[str, Any], ...]
+
+
+def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
+    """The static side of a problem over the given flights.
+
+    `bounded` keeps the free parameters within their bounds by logit coordinates.
+    """
+    filtering = problem.method == "filter-error"
+    how = coordinates.kind if bounded else coordinates.plain_kind
+    nuisance = problem.nuisance
+    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
+    measured = tuple(dict.fromkeys(n for f in problem.training for n in f.outputs))
+    unknown = filtering and "sigma_y" not in problem.fixed_noise
+    concentrated = unknown and "sigma_w" not in problem.fixed_noise
+    return Layout(
+        model=problem.model,
+        free=tuple(problem.free),
+        kinds=tuple(how(f) for f in problem.free.values()),
+        gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
+        shift=nuisance.time_shift,
+        initial_state=nuisance.initial_state,
+        bias=nuisance.bias,
+        outputs=tuple(tuple(f.outputs) for f in flights),
+        noise=tuple(problem.noise),
+        scaled=measured[concentrated:] if unknown else (),
+        filtered=filtering,
+        concentrated=concentrated,
+        solver=problem.solver,
+        substeps=problem.substeps,
+        block=_BLOCK if exact else 1,
+    )
+
+
+def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
+    """Names for the entries of z."""
+    q = len(layout.free)
+    params = {
+        name: coordinates.to_value(how, z[i], data.sign[i], data.low[i], data.high[i])
+        for i, (name, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
+    }
+    gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
+    at = q + len(layout.gains)
+    shift = None
+    if layout.shift:
+        shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
+        at += 1
+    noise = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.noise)}
+    at += len(layout.noise)
+    scales = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.scaled)}
+    at = layout.weak
+    states, biases = [], []
+    for flight, outputs in zip(data.flights, layout.outputs, strict=True):
+        state = None
+        if layout.initial_state:
+            zero = jnp.zeros_like(z[0])
+            values = dict.fromkeys(naming.names(layout.model.State), zero)
+            values |= {n: z[at + i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
+            state, at = layout.model.State(**values), at + len(layout.states)
+        bias = {n: jnp.zeros_like(z[0]) for n in outputs}
+        if layout.bias:
+            bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
+            at += len(outputs)
+        states.append(state)
+        biases.append(bias)
+    return Unknowns(params, noise, scales, gains, shift, tuple(states), tuple(biases))
+
+
+def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
+    """z at the start values: gains 1, no shift, the model's own initial state, no bias."""
+    z = [
+        coordinates.to_coordinate(
+            how, jnp.asarray(f.start, data.low.dtype), data.sign[i], data.low[i], data.high[i]
+        )
+        for i, (f, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
+    ]
+    one, zero = jnp.ones((), data.low.dtype), jnp.zeros((), data.low.dtype)
+    z += [one] * len(layout.gains) + [zero] * layout.shift
+    z += [jnp.asarray(np.log(problem.noise[n].start), data.low.dtype) for n in layout.noise]
+    z = jnp.stack([*z, *[zero] * (layout.size - len(z))])
+    if layout.initial_state:
+        z = _initial_states(layout, data, problem, z)
+    return z
+
+
+def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
+    at = layout.weak
+    values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
+    for flight, outputs in zip(data.flights, layout.outputs, strict=True):
+        params = layout.model.Params(**{**data.base, **values, **flight.known})
+        state = naming.asdict(layout.model.initial_state(params))
+        for i, name in enumerate(layout.states):
+            z = z.at[at + i].set(state[name] / flight.state_scale[name])
+        at += len(layout.states) + (len(outputs) if layout.bias else 0)
+    return z

@@ -1,0 +1,214 @@
+"""How large the noise is, and whether there is a disturbance: what surrounds the optimiser."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimates import deviations
+from heli_jax.identification.layout import Data, Layout, Noise
+from heli_jax.identification.metrics import noise_guess
+from heli_jax.identification.optimise import Optimum, residuals_count
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.residual import Evaluation, evaluate
+from heli_jax.identification.search import Search
+
+NO_DISTURBANCE = 2.71
+"""twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
+a boundary, where half of the chi-squared with one degree of freedom holds (Self and Liang, 1987)"""
+_SURE = 0.4
+"""sd of log sigma_w below which nobody need ask whether there is a disturbance"""
+_NONE = 30.0
+"""so far below the log of the smallest noise there is no disturbance"""
+
+
+class Settled(NamedTuple):
+    """An optimum together with the noise that it shows."""
+
+    best: Optimum
+    noise: Noise
+    trace: tuple[tuple[int, float], ...]
+    """(steps, cost) of every round of the optimiser"""
+    ratio: float | None = None
+    """twice the log-likelihood that a disturbance gained, where that was asked"""
+
+
+def evaluation(layout: Layout, data: Data, noise: Noise, z: Array) -> Evaluation:
+    """`evaluate` as NumPy arrays, for what is not compiled."""
+    return jax.device_get(evaluate(layout, data, noise, z))
+
+
+def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
+    """The noise to begin with, by flight and output: as stated, else guessed.
+
+    Filter error has one noise an output: what is not stated is guessed from all flights.
+    """
+    dtype = np.dtype(jnp.result_type(float))
+    guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
+    if problem.method == "filter-error":
+        outputs = {n for guess in guesses for n in guess}
+        pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
+        guesses = [{n: pooled[n] for n in guess} for guess in guesses]
+    sd = tuple(
+        {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in flight.outputs}
+        for flight, guess in zip(flights, guesses, strict=True)
+    )
+    return Noise(sd, np.zeros((), dtype))
+
+
+def levelled(data: Data, e: Evaluation, noise: Noise) -> Noise:
+    """The noise with the level that the innovations of filter error show."""
+    if not e.innovations:
+        return noise
+    level = innovation_sums(e, noise)[1] / residuals_count(data)
+    fine = level if np.isfinite(level) else 0.0
+    return noise._replace(level=np.asarray(fine, noise.level.dtype))
+
+
+def settle(search: Search, noise: Noise, best: Optimum) -> Settled:
+    """Alternate between the optimum and the noise until both stay (relaxation of R)."""
+    trace = [(int(best.steps), float(best.cost))]
+    for _ in range(8):
+        e = evaluation(search.layout, search.data, noise, best.z)
+        z, new = _updated(search.layout, search.data, e, noise, best.z)
+        fall = float(noise.level - new.level)
+        change = abs(fall) + max(
+            abs(float(np.log(n[k] / s[k])))
+            for n, s in zip(new.sd, noise.sd, strict=True)
+            for k in s
+        )
+        if not np.isfinite(change):
+            break
+        best, noise = best._replace(z=z), new
+        if change < 1e-3 or not bool(best.converged) or not _noise_matters(search, fall):
+            break
+        [best] = search.run(noise, best.z[None, :])
+        trace.append((int(best.steps), float(best.cost)))
+    return Settled(best, noise, tuple(trace))
+
+
+def _noise_matters(search: Search, fall: float) -> bool:
+    """Whether the optimum moves with the noise.
+
+    With filter error only where priors are weighed against a scale that is concentrated out, or
+    where the noise fell (in the log of the variance) past what the likelihood's row can show.
+    """
+    layout = search.layout
+    if not layout.filtered:
+        return True
+    if layout.concentrated:
+        return any(f.prior for f in search.problem.free.values())
+    return fall > 0.9
+
+
+def disturbance_or_none(search: Search, found: Settled) -> Settled:
+    """The optimum with the disturbance where it is significant, else without one.
+
+    Where sigma_w goes to zero, tau_w means nothing and the optimiser has no end to come to; the
+    same residuals with sigma_w all but zero are those of output error.
+    """
+    layout, data, best, noise = search.layout, search.data, found.best, found.noise
+    e = evaluation(layout, data, noise, best.z)
+    at = layout.noise_at("sigma_w")
+    if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
+        return found
+    none = without_disturbance(search, found)
+    if not bool(none.best.converged):
+        return found
+    ratio = 2.0 * (
+        log_likelihood(layout, data, noise, e)
+        - log_likelihood(
+            layout, data, none.noise, evaluation(layout, data, none.noise, none.best.z)
+        )
+    )
+    if not np.isfinite(ratio) or ratio < NO_DISTURBANCE:
+        return none._replace(trace=found.trace, ratio=ratio)
+    if not bool(best.converged):
+        [best] = search.run(noise, best.z[None, :])
+        found = settle(search, noise, best)._replace(trace=found.trace)
+    return found._replace(ratio=ratio)
+
+
+def without_disturbance(search: Search, found: Settled) -> Settled:
+    """The optimum with a sigma_w that is all but zero."""
+    at = search.layout.noise_at("sigma_w")
+    smallest = min(float(s) for one in found.noise.sd for s in one.values())
+    z = found.best.z.at[at].set(np.log(smallest) - _NONE)
+    [none] = search.run(found.noise, z[None, :])
+    return settle(search, found.noise, none)
+
+
+def _updated(
+    layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Array
+) -> tuple[Array, Noise]:
+    """The noise that the residuals show, degrees of freedom taken off in proportion.
+
+    With filter error all noise changes by one factor, that of the disturbance in z included, so
+    that the optimum stays where it is.
+    """
+    n = residuals_count(data)
+    freedom = n / max(n - layout.size, 1)
+    if not layout.filtered:
+        new = tuple(
+            {k: _residual_sd(r, flight.outputs[k], freedom) for k, r in by_name.items()}
+            for by_name, flight in zip(e.raw, data.flights, strict=True)
+        )
+        return z, Noise(new, noise.level)
+    squares, logs = innovation_sums(e, noise)
+    level = np.asarray(logs / n, noise.level.dtype)
+    if not layout.concentrated:
+        return z, noise._replace(level=level)
+    factor = np.sqrt(squares / n * freedom)
+    if "sigma_w" in layout.noise:
+        at = layout.noise_at("sigma_w")
+        z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
+    sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
+    return z, Noise(sd, level)
+
+
+def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
+    """Sums over all measurements of e^2/s and of log(s/sd^2)."""
+    squares, logs = 0.0, 0.0
+    for one, sd in zip(e.innovations, noise.sd, strict=True):
+        for n, s in one.variance.items():
+            squares += float(np.nansum(one.error[n] ** 2 / s))
+            logs += float(np.nansum(np.log(s / sd[n] ** 2)))
+    return squares, logs
+
+
+def _residual_sd(r: np.ndarray, y: Any, freedom: float) -> np.ndarray:
+    y = np.asarray(y)
+    r, y = r[np.isfinite(y)], y[np.isfinite(y)]
+    floor = 1e-12 * np.sqrt(np.mean(np.square(y))) + 1e-300
+    return np.asarray(max(np.sqrt(np.mean(np.square(r)) * freedom), floor), r.dtype)
+
+
+def log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
+    """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that is
+    not given."""
+    if not layout.filtered:
+        found = [
+            r[np.isfinite(np.asarray(flight.outputs[k]))]
+            for by_name, flight in zip(e.raw, data.flights, strict=True)
+            for k, r in by_name.items()
+        ]
+        return sum(-0.5 * r.size * float(np.log(2.0 * np.pi * np.mean(r**2)) + 1.0) for r in found)
+    n = residuals_count(data)
+    squares, logs = innovation_sums(e, noise)
+    for flight, sd in zip(data.flights, noise.sd, strict=True):
+        for k, y in flight.outputs.items():
+            logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
+    if layout.concentrated:
+        return -0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs)
+    return -0.5 * (squares + n * np.log(2.0 * np.pi) + logs)
+
+
+def noise_unknowns(layout: Layout) -> int:
+    """How many standard deviations of measurement noise are estimated beside z."""
+    if layout.filtered:
+        return int(layout.concentrated)
+    return sum(len(o) for o in layout.outputs)

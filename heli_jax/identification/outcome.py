@@ -1,0 +1,234 @@
+"""From an optimum to a Fit: estimates, verdict, signals, metrics, whiteness, notes."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification import excitation
+from heli_jax.identification.coloured import inflation
+from heli_jax.identification.data import data_of
+from heli_jax.identification.estimates import (
+    bound_notes,
+    estimates_of,
+    flight_nuisances,
+    labels,
+    stated_noise_notes,
+)
+from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.judgement import verdict_of
+from heli_jax.identification.layout import Layout, Noise, layout_of, unpack
+from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
+from heli_jax.identification.noise import (
+    NO_DISTURBANCE,
+    Settled,
+    evaluation,
+    first_noise,
+    log_likelihood,
+    noise_unknowns,
+)
+from heli_jax.identification.optimise import Optimum, residuals_count
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.residual import Evaluation
+from heli_jax.identification.result import Estimate, Fit, Signals, Status
+from heli_jax.identification.search import Search, table
+
+
+class Ran(NamedTuple):
+    """How the optimiser was run."""
+
+    before: Verdict
+    points: Array
+    runs: list[Optimum]
+    seed: int
+    timing: dict[str, float]
+
+
+def noise_by_name(
+    problem: Problem, layout: Layout, noise: Noise, scales: dict[str, Any]
+) -> dict[str, float]:
+    """sd of the measurement noise as 'flight/output'."""
+    return {
+        f"{label}/{n}": float(s) * float(scales.get(n, 1.0))
+        for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
+        for n, s in by_name.items()
+    }
+
+
+def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fit:
+    """All that a fit says, from where the optimiser ended."""
+    layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
+    e = evaluation(layout, data, noise, best.z)
+    usable = bool(np.all(np.isfinite(e.J)))
+    verdict = verdict_of(problem, layout, e) if usable else ran.before
+    n = residuals_count(data)
+    quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
+    signals = signals_of(e, problem.training)
+    white = _whiteness(signals, e)
+    coloured = usable and not layout.filtered and not all(w.white for w in white.values())
+    wider = inflation(layout, data, e) if coloured else np.ones(layout.size)
+    named = estimates_of(problem, layout, e, verdict, quantile, wider)
+    estimates = {k: named[k] for k in layout.free}
+    nuisance = {k: v for k, v in named.items() if k not in layout.free}
+    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile, wider)
+    none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
+    if none:
+        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
+    held = tuple(f for f in problem.flights if f.hold_out)
+    validation = _validation(problem, layout, best.z, noise, held) if held else ()
+    sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
+    dtype = jnp.result_type(float)
+    values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
+    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    notes = [
+        *excitation.sampling(problem, reached),
+        *_disturbance_notes(settled.ratio if none else None),
+        *_filter_notes(layout, noise, e, sds),
+        *stated_noise_notes(problem, sds),
+        *bound_notes(estimates),
+    ]
+    return Fit(
+        model=problem.model.name,
+        method=problem.method,
+        status=_status(best, usable, verdict),
+        n_samples=n,
+        estimates=estimates,
+        nuisance=nuisance,
+        params=naming.replace(problem.vehicle, **values),
+        verdict_before=ran.before,
+        verdict=verdict,
+        noise=sds,
+        log_likelihood=log_likelihood(layout, data, noise, e),
+        unknowns=layout.size + noise_unknowns(layout) - (len(layout.noise) if none else 0),
+        signals=(*signals, *validation),
+        metrics=_pooled(signals),
+        validation=_pooled(validation),
+        one_step=_pooled(signals, one_step=True),
+        one_step_validation=_pooled(validation, one_step=True),
+        whiteness=white,
+        coloured=coloured,
+        starts=table(layout, data, ran.points, ran.runs),
+        steps=sum(s for s, _ in settled.trace),
+        trace=settled.trace,
+        notes=tuple(notes),
+        seed=ran.seed,
+        timing=ran.timing,
+    )
+
+
+def _status(best: Optimum, usable: bool, verdict: Verdict) -> Status:
+    if not bool(best.converged) or not usable:
+        return "not-converged"
+    return "converged" if verdict.identifiable else "not-identifiable"
+
+
+def _absent(name: str, one: Estimate) -> Estimate:
+    """The estimate of a disturbance parameter where no disturbance shows."""
+    gone = name == "sigma_w"
+    value = 0.0 if gone else one.value
+    return one._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
+
+
+def _disturbance_notes(ratio: float | None) -> list[str]:
+    if ratio is None:
+        return []
+    return [
+        "No disturbance shows in the record (twice the log-likelihood gained by one is "
+        f"{ratio:.2g}): output error suffices, and these are its numbers."
+    ]
+
+
+_TOLERANCE = 1e-6
+
+
+def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, sds: dict[str, float]) -> list[str]:
+    """A filter whose variances are no variances any more has lost its digits."""
+    if not layout.filtered:
+        return []
+    smallest = min(
+        float(np.min(v, initial=np.inf, where=np.isfinite(v))) for v in _variances(e, sds)
+    )
+    broken = any(not np.isfinite(v).any() for v in _variances(e, sds))
+    if not broken and smallest > 1.0 - _TOLERANCE:
+        return []
+    return [
+        "The Kalman filter is ill-conditioned here (the variance of an innovation is below that of "
+        "the measurement noise alone): its numbers cannot be relied on. State the noise (sd) of "
+        "the outputs and fix it (disturbance.fixed: [sigma_y]), or fix tau_w."
+    ]
+
+
+def _variances(e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
+    """Of the innovations over the measurement noise's, by flight and output."""
+    given = (s for one in e.innovations for s in one.variance.values())
+    return [np.asarray(s) / sd**2 for s, sd in zip(given, sds.values(), strict=True)]
+
+
+def _whiteness(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
+    """Of the innovations where there are some, else of the residuals."""
+    if not e.innovations:
+        return {f"{s.flight}/{n}": whiteness(s.residual(n)) for s in signals for n in s.measured}
+    return {
+        f"{s.flight}/{n}": whiteness(error / np.sqrt(one.variance[n]))
+        for s, one in zip(signals, e.innovations, strict=True)
+        for n, error in one.error.items()
+    }
+
+
+def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
+    """Measured and simulated signals; what is simulated carries the bias."""
+    errors = [one.error for one in e.innovations] or [None] * len(flights)
+    return tuple(
+        Signals(
+            label,
+            f.hold_out,
+            f.times,
+            dict(f.inputs),
+            dict(f.outputs),
+            {n: np.asarray(v) for n, v in by_name.items()},
+            error,
+        )
+        for label, f, by_name, error in zip(
+            labels(flights), flights, e.simulated, errors, strict=True
+        )
+    )
+
+
+def _validation(
+    problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
+) -> tuple[Signals, ...]:
+    """Flights held out, predicted with the estimates; only their initial state and bias are
+    adjusted, by linear least squares."""
+    other, data = layout_of(problem, held), data_of(problem, held)
+    full = jnp.concatenate([z[: layout.weak], jnp.zeros(other.size - layout.weak, z.dtype)])
+    theirs = first_noise(problem, held)
+    if layout.filtered:
+        known = {n: s for one in noise.sd for n, s in one.items()}
+        sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
+        theirs = theirs._replace(sd=sd)
+    if other.size > layout.weak:
+        e = evaluation(other, data, theirs, full)
+        columns = np.asarray(e.J)[:, layout.weak :]
+        step, *_ = np.linalg.lstsq(columns, -np.asarray(e.r), rcond=1e-10)
+        full = full.at[layout.weak :].add(jnp.asarray(step, z.dtype))
+    return signals_of(evaluation(other, data, theirs, full), held)
+
+
+def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
+    """Metrics by output over all the flights that have it; of one-step predictions none without
+    innovations."""
+    if one_step:
+        signals = tuple(s for s in signals if s.innovations is not None)
+    outputs = sorted({n for s in signals for n in s.measured})
+    pooled = {}
+    for n in outputs:
+        have = [s for s in signals if n in s.measured]
+        measured = np.concatenate([s.measured[n] for s in have])
+        model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
+        pooled[n] = metrics(measured, model)
+    return pooled
