@@ -138,7 +138,7 @@ def _fit(options: argparse.Namespace) -> int:
 
     _say("writing the report")
     output.write_fit(out, experiment, problem, found, rls, begin)
-    output.print_fit(found, rls, out)
+    output.print_fit(problem, found, rls, out)
     return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
 
 

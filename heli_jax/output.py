@@ -15,8 +15,10 @@ from heli_jax.flights import write as tables
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
 from heli_jax.report import files
+from heli_jax.report.card import card, summary
 
 
 def write_fit(
@@ -45,7 +47,7 @@ def write_fit(
         files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline))
 
 
-def print_fit(fit: Fit, baseline: Baseline | None, out: Path) -> None:
+def print_fit(problem: Problem, fit: Fit, baseline: Baseline | None, out: Path) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     print(f"{fit.status}: {fit.verdict.text}")
     note = files.whiteness_note(fit)
@@ -58,14 +60,21 @@ def print_fit(fit: Fit, baseline: Baseline | None, out: Path) -> None:
     for c in fit.verdict.combinations:
         print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
     for name, m in fit.metrics.items():
-        print(
-            f"{name}, simulated: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}"
-        )
+        _print_agreement(f"{name}, simulated", m)
+    for name, m in fit.one_step.items():
+        _print_agreement(f"{name}, one step ahead", m)
     for name, m in fit.validation.items():
-        print(f"{name}, held out: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %")
+        _print_agreement(f"{name}, held out, simulated", m)
+    for name, m in fit.one_step_validation.items():
+        _print_agreement(f"{name}, held out, one step ahead", m)
+    print(f"acceptance card: {summary(card(problem, fit))}")
     if baseline is not None:
         _print_baseline(baseline)
     print(f"report: {out / 'report.html'}")
+
+
+def _print_agreement(what: str, m: Metrics) -> None:
+    print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:

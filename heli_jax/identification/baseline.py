@@ -13,7 +13,7 @@ from heli_jax.analysis.lti import d2c
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import ratios_from_denominator
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.metrics import Metrics, metrics, whiteness
+from heli_jax.identification.metrics import NO_METRICS, Metrics, metrics, whiteness
 from heli_jax.identification.rls import rls, transfer_function
 from heli_jax.vehicle import Helicopter
 
@@ -167,7 +167,7 @@ def _output(model: Model, flight: Flight) -> str:
 
 def _metrics(y: np.ndarray, simulated: np.ndarray) -> Metrics:
     if not np.isfinite(simulated).all() or np.abs(simulated).max() > 1e6 * np.abs(y).max():
-        return Metrics(math.nan, math.nan, math.nan, math.nan)
+        return NO_METRICS
     return metrics(y, simulated)
 
 

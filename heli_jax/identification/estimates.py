@@ -24,6 +24,8 @@ def estimates_of(
     """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns."""
     unknowns = unknowns_of(problem, layout, e)
     references = references_of(problem, layout, unknowns)
+    norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
+    alone = np.divide(1.0, norms * deviations(e.J), where=norms > 0, out=np.ones_like(norms))
     out = {}
     for i, u in enumerate(unknowns):
         free = problem.free.get(u.name)
@@ -42,6 +44,7 @@ def estimates_of(
             prior_share=verdict.prior_share[u.name],
             at_bound=_at_bound(problem, u.name, u.value),
             sd_white=None if lost else float(white * references[i]),
+            sd_alone=None if lost else float(white * references[i] * min(1.0, alone[i])),
         )
     return out
 

@@ -7,7 +7,9 @@ measurement noise white and independent between outputs; outputs of one sample a
 another, so nothing is inverted. A measurement that is NaN is skipped.
 """
 
-from collections.abc import Callable
+import functools
+import operator
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +22,9 @@ from heli_jax.dynamics.model import Model, spread_of
 from heli_jax.simulation.discretize import expm, process_noise, product, van_loan
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
+
+_SMALL = 8
+"""States up to which the filter of a linear model is written out in rows"""
 
 
 class Innovations(NamedTuple):
@@ -65,15 +70,107 @@ def innovations(
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
     y = jnp.stack(list(measured.values()), axis=1)
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
-    make = _linear if model.linear else _local
-    filter_ = make(model, params, inputs, rows, dt, delay, substeps)
+    if model.linear:
+        system = _linear(model, params, inputs, rows, dt, delay)
+        e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(system, x, P, y, R)
+    else:
+        filter_ = _local(model, params, inputs, rows, dt, delay, substeps)
+        e, s = _run(filter_, x, P, y, R)
+    return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
+
+
+class _Linear(NamedTuple):
+    """x[k+1] = Ad x[k] + drive[k] + noise, y[k] = C x[k] + feed[k] + noise."""
+
+    Ad: Float[Array, "n n"]
+    Q: Float[Array, "n n"]
+    C: Float[Array, "p n"]
+    drive: Float[Array, "N n"]
+    feed: Float[Array, "N p"]
+
+
+def _linear(model: Model, params: Any, inputs: Any, rows: Array, dt: Any, delay: Any) -> _Linear:
+    _, _, C, D = jacobians(model, params)
+    Ad, drive, acting = held_columns(model, params, inputs, dt, delay)
+    return _Linear(Ad, process_noise(model, params, dt), C[rows], drive, acting @ D[rows].T)
+
+
+def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
+    """The filter on rows and scalars: two to three times as fast as on small matrices.
+
+    Written out in scalars alone it is faster once more, and takes twice as long to compile.
+    """
+    n, p = x0.shape[0], y.shape[1]
+    # Behind barriers every number is computed once: XLA would compute each for every use.
+    once = jax.lax.optimization_barrier
+    a, columns, Q, c, r = once(
+        (
+            [[system.Ad[i, j] for j in range(n)] for i in range(n)],
+            list(system.Ad.T),
+            list(system.Q),
+            [[system.C[k, j] for j in range(n)] for k in range(p)],
+            list(R),
+        )
+    )
+
+    def step(carry: tuple[Array, Any], sample: tuple[Any, Array]) -> tuple[Any, Any]:
+        x, P = carry
+        y, w = sample
+        errors, variances = [], []
+        for k in range(p):
+            h = _sum(P[i] * c[k][i] for i in range(n))
+            s = _sum(h[i] * c[k][i] for i in range(n)) + r[k]
+            seen = jnp.isfinite(y[k])
+            e = jnp.where(seen, y[k], 0.0) - _sum(x[i] * c[k][i] for i in range(n))
+            g = jnp.where(seen, 1.0 / s, 0.0)
+            h, s, e, g = once((h, s, e, g))
+            x, scaled = x + h * (g * e), g * h
+            P = [P[i] - h[i] * scaled for i in range(n)]
+            x, P = once((x, P))
+            errors.append(jnp.where(seen, e, jnp.nan))
+            variances.append(jnp.where(seen, s, jnp.nan))
+        x = _sum(columns[i] * x[i] for i in range(n)) + w
+        M = once([_sum(P[k] * a[i][k] for k in range(n)) for i in range(n)])
+        P = [_sum(columns[k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)]
+        return (x, P), (errors, variances)
+
+    samples = (list((y - system.feed).T), system.drive)
+    _, (e, s) = jax.lax.scan(step, (x0, list(P0)), samples)
+    return jnp.stack(e, axis=1), jnp.stack(s, axis=1)
+
+
+def _sum(terms: Iterable[Any]) -> Any:
+    return functools.reduce(operator.add, terms)
+
+
+def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
+    def move(x: Array, P: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
+        return x, product(product(system.Ad, P), system.Ad.T) + system.Q
+
+    samples = (system.drive, system.feed)
+    return _run(_Filter(samples, lambda x, now: (system.C, now[1]), move), x0, P0, y, R)
+
+
+class _Filter(NamedTuple):
+    """What a step of the filter needs of a model; `samples` is a pytree of arrays (N, ...)."""
+
+    samples: Any
+    measure: Callable[[Array, Any], tuple[Array, Array]]
+    """(state, sample) -> C (p, n) and what C x leaves of the predicted outputs (p,)"""
+    move: Callable[[Array, Array, Any], tuple[Array, Array]]
+    """(state, its covariance, sample) -> both at the next sample"""
+
+
+def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
+    """Errors and variances (N, p)."""
 
     def step(carry: tuple[Array, Array], sample: tuple[Array, Any]) -> tuple[Any, Any]:
         x, P = carry
         y, now = sample
         C, rest = filter_.measure(x, now)
         errors, variances = [], []
-        for j in range(len(names)):
+        for j in range(y.shape[0]):
             c = C[j]
             p = jnp.sum(P * c[None, :], axis=1)
             s = jnp.sum(c * p) + R[j]
@@ -88,32 +185,7 @@ def innovations(
         return (x, 0.5 * (P + P.T)), (jnp.stack(errors), jnp.stack(variances))
 
     _, (e, s) = jax.lax.scan(step, (x, P), (y, filter_.samples))
-    return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
-
-
-class _Filter(NamedTuple):
-    """What a step of the filter needs of a model; `samples` is a pytree of arrays (N, ...)."""
-
-    samples: Any
-    measure: Callable[[Array, Any], tuple[Array, Array]]
-    """(state, sample) -> C (p, n) and what C x leaves of the predicted outputs (p,)"""
-    move: Callable[[Array, Array, Any], tuple[Array, Array]]
-    """(state, its covariance, sample) -> both at the next sample"""
-
-
-def _linear(
-    model: Model, params: Any, inputs: Any, rows: Array, dt: Any, delay: Any, substeps: int
-) -> _Filter:
-    _, _, C, D = jacobians(model, params)
-    C, D = C[rows], D[rows]
-    Ad, drive, acting = held_columns(model, params, inputs, dt, delay)
-    Q = process_noise(model, params, dt)
-
-    def move(x: Array, P: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        x = jnp.sum(Ad * x[None, :], axis=1) + now[0]
-        return x, product(product(Ad, P), Ad.T) + Q
-
-    return _Filter((drive, acting @ D.T), lambda x, now: (C, now[1]), move)
+    return e, s
 
 
 def _local(

@@ -17,6 +17,15 @@ class Metrics(NamedTuple):
     """in the output's SI unit"""
     tic: float
     """Theil inequality coefficient, 0 (equal) to 1"""
+    bias: float
+    """part of the mean squared error that a wrong mean makes (Theil's bias proportion)"""
+    variance: float
+    """part that a wrong size of the motion makes (his variance proportion)"""
+    covariance: float
+    """the rest: what does not move together; the three make 1"""
+
+
+NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
@@ -26,7 +35,10 @@ def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     residual = measured - simulated
     spread = np.linalg.norm(measured - measured.mean())
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
-    rmse = float(np.sqrt(np.mean(residual**2)))
+    mse = float(np.mean(residual**2))
+    rmse = mse**0.5
+    bias = (measured.mean() - simulated.mean()) ** 2 / mse if mse > 0 else float("nan")
+    variance = (measured.std() - simulated.std()) ** 2 / mse if mse > 0 else float("nan")
     return Metrics(
         vaf=float(1.0 - np.var(residual) / np.var(measured)) if spread > 0 else float("nan"),
         nrmse_fit_percent=(
@@ -34,6 +46,9 @@ def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
         ),
         rmse=rmse,
         tic=float(rmse / rms) if rms > 0 else float("nan"),
+        bias=float(bias),
+        variance=float(variance),
+        covariance=float(1.0 - bias - variance),
     )
 
 

@@ -96,7 +96,6 @@ def _scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> _Scaling:
     return _Scaling(jnp.where(usable, _COLUMN * level / jnp.where(usable, norms, 1.0), 0.0), level)
 
 
-@eqx.filter_jit
 def optimise(
     layout: Layout,
     data: Data,
@@ -106,8 +105,18 @@ def optimise(
 ) -> Optimum:
     """The least-squares optimum from z0; compiled once per layout and shapes."""
     first = evaluate(layout, data, noise, z0)
-    units = _scaling(first.r, first.J)
+    return _optimise(layout, data, noise, z0, _scaling(first.r, first.J), max_steps)
 
+
+@eqx.filter_jit
+def _optimise(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    z0: Float[Array, " q"],
+    units: _Scaling,
+    max_steps: int,
+) -> Optimum:
     # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
     # decomposition of [J r]: as many rows as unknowns, and one. The optimiser sees these rows.
     def triangle(xi: Array) -> tuple[Array, Array]:

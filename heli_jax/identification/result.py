@@ -24,6 +24,8 @@ class Estimate(NamedTuple):
     at_bound: bool
     sd_white: float | None = None
     """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
+    sd_alone: float | None = None
+    """the Cramer-Rao sd if all other unknowns were known (insensitivity)"""
 
 
 class Signals(NamedTuple):

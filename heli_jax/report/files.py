@@ -15,6 +15,7 @@ from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.problem import Problem
+from heli_jax.report.card import card
 
 _PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
 
@@ -47,6 +48,13 @@ def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str,
             "noise_sd": fit.noise,
             "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
             "validation": {n: m._asdict() for n, m in fit.validation.items()},
+            "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
+            "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
+            "acceptance": [g._asdict() for g in card(problem, fit)],
+            "log_likelihood": fit.log_likelihood,
+            "unknowns": fit.unknowns,
+            "aic": fit.aic,
+            "bic": fit.bic,
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
             "baseline_rls": _baseline(baseline),

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from matplotlib import mlab
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
@@ -29,6 +28,8 @@ class Empirical(NamedTuple):
     """rad/s"""
     H: np.ndarray
     coherence: np.ndarray
+    power: np.ndarray
+    """spectral density of the input"""
     segments: int
 
 
@@ -99,6 +100,8 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         return "the input does not move"
     if np.isnan(y).any():
         return "samples are missing"
+    from matplotlib import mlab  # not at the start: commands without a report need none of it
+
     needed = max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
     length = max(needed, min(2 ** int(np.log2(max(u.size / SEGMENTS, 1.0))), _LONGEST))
     segments = 1 + (u.size - length) // (length // 2)
@@ -111,7 +114,7 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     Syy, Suy = np.asarray(mlab.psd(y, **how)[0]), np.asarray(mlab.csd(u, y, **how)[0])
     useful = (f > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
     f, Suu, Syy, Suy = f[useful], Suu[useful], Syy[useful], Suy[useful]
-    return Empirical(2 * np.pi * f, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), segments)
+    return Empirical(2 * np.pi * f, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), Suu, segments)
 
 
 def phase(H: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from heli_jax import naming
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
-from heli_jax.report import figures, style, tables
+from heli_jax.report import card, figures, style, tables
 from heli_jax.report.files import versions
 from heli_jax.vehicle import Constant
 
@@ -118,6 +118,7 @@ def render(
     pictures: list[Picture],
 ) -> str:
     """The page as text."""
+    lines = card.card(problem, fit)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_HERE),
         autoescape=True,
@@ -137,6 +138,8 @@ def render(
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),
+        acceptance=tables.acceptance(lines),
+        summary=card.summary(lines),
         residuals=tables.residuals(fit, problem),
         verdict=tables.verdict(fit),
         starts=tables.starts(fit),

@@ -12,6 +12,7 @@ from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability import ILL_CONDITIONED, Verdict
 from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
+from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import whiteness_note
 from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.style import pretty
@@ -147,12 +148,24 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
     rows = []
     for output in dict.fromkeys([*fit.metrics, *fit.validation]):
         if output in fit.metrics:
-            rows.append(_agreement(output, "fit", fit.metrics[output]))
+            rows.append(_agreement(output, "fit, simulated", fit.metrics[output]))
+        if output in fit.one_step:
+            rows.append(_agreement(output, "fit, one step ahead", fit.one_step[output]))
         if output in fit.validation:
-            rows.append(_agreement(output, "held out, predicted", fit.validation[output]))
+            rows.append(_agreement(output, "held out, simulated", fit.validation[output]))
+        if output in fit.one_step_validation:
+            one_step = fit.one_step_validation[output]
+            rows.append(_agreement(output, "held out, one step ahead", one_step))
         if baseline is not None and baseline.output == output:
             rows.append(_agreement(output, f"RLS ({baseline.flight})", baseline.metrics))
     return Table(head, rows)
+
+
+def acceptance(lines: tuple[Gate, ...]) -> Table:
+    """The acceptance card: what, of what, value, gate, passed or failed, remark."""
+    words = {True: "✓ passed", False: "✗ failed", None: NOTHING}
+    rows = [(g.what, g.of, shown(g), g.gate or NOTHING, words[g.passed], g.remark) for g in lines]
+    return Table(("", "of", "value", "gate", "", "remark"), rows)
 
 
 def _agreement(output: str, of: str, m: Metrics) -> tuple[str, ...]:

@@ -1,0 +1,162 @@
+"""The acceptance card: the usual gates of rotorcraft identification, each passed or failed."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.identification.fit import Estimate, Fit
+from heli_jax.identification.identifiability import ILL_CONDITIONED
+from heli_jax.identification.metrics import Metrics
+from heli_jax.identification.problem import Problem
+from heli_jax.report import frequency
+
+CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, 0.6
+"""Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
+CORRELATION = 0.9
+"""Klein and Morelli, Aircraft System Identification (2006)"""
+THEIL, THEIL_PART = 0.3, 0.1
+"""Jategaonkar, Flight Vehicle System Identification (2006)"""
+VAF, NRMSE_FIT = 0.9, 70.0
+
+
+class Gate(NamedTuple):
+    """One line of the card."""
+
+    what: str
+    of: str
+    """the parameter, output or flight"""
+    value: float
+    """NaN where there is none"""
+    unit: str
+    gate: str
+    """in words; empty where nothing is asked"""
+    passed: bool | None
+    """None where the line informs and nothing is asked"""
+    remark: str = ""
+
+
+def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
+    """Every line: parameters, their relations, agreement, whiteness, excitation."""
+    lines: list[Gate] = []
+    for name, one in fit.estimates.items():
+        lines += _of_parameter(name, one)
+    lines += _of_relations(fit)
+    filtered = fit.method == "filter-error"
+    for name, m in fit.metrics.items():
+        lines += _of_agreement(name, m, "simulated", judged=not filtered)
+    for name, m in fit.one_step.items():
+        lines += _of_agreement(name, m, "one step ahead", judged=True)
+    for name, m in fit.validation.items():
+        lines += _of_agreement(name, m, "held out, simulated", judged=not filtered)
+    for name, m in fit.one_step_validation.items():
+        lines += _of_agreement(name, m, "held out, one step ahead", judged=True)
+    what = "innovations" if filtered else "residuals"
+    for name, w in fit.whiteness.items():
+        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
+        gate = Gate(
+            f"whiteness of {what} (p)", name, w.p_value, "", "at least 0.01", w.white, remark
+        )
+        lines.append(gate)
+    lines += _of_excitation(problem, fit)
+    return tuple(lines)
+
+
+def failed(lines: tuple[Gate, ...]) -> tuple[Gate, ...]:
+    """The gates that are not passed."""
+    return tuple(one for one in lines if one.passed is False)
+
+
+def summary(lines: tuple[Gate, ...]) -> str:
+    """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`."""
+    asked, lost = [one for one in lines if one.passed is not None], failed(lines)
+    text = f"{len(asked) - len(lost)} of {len(asked)} gates passed"
+    if lost:
+        text += "; failed: " + ", ".join(f"{one.what} of {one.of} ({shown(one)})" for one in lost)
+    return text
+
+
+def shown(one: Gate) -> str:
+    """The value as text."""
+    if math.isnan(one.value):
+        return "none"
+    text = f"{one.value:.3g}"
+    return f"{text} {one.unit}" if one.unit else text
+
+
+def _most(what: str, of: str, value: float, unit: str, most: float, remark: str = "") -> Gate:
+    gate = f"at most {most:g}{f' {unit}' if unit else ''}"
+    return Gate(what, of, value, unit, gate, bool(value <= most), remark)
+
+
+def _least(what: str, of: str, value: float, unit: str, least: float, remark: str = "") -> Gate:
+    gate = f"at least {least:g}{f' {unit}' if unit else ''}"
+    return Gate(what, of, value, unit, gate, bool(value >= least), remark)
+
+
+def _of_parameter(name: str, one: Estimate) -> list[Gate]:
+    def share(sd: float | None) -> float:
+        return 100.0 * abs(sd / one.value) if sd is not None and one.value else math.nan
+
+    remark = "" if one.sd is not None else "the data do not determine it"
+    wider = one.sd is not None and one.sd != one.sd_white
+    lines = [
+        _most(
+            "Cramér-Rao",
+            name,
+            share(one.sd),
+            "%",
+            CRAMER_RAO,
+            remark or ("allows for coloured residuals" if wider else ""),
+        ),
+        _most("insensitivity", name, share(one.sd_alone), "%", INSENSITIVITY, remark),
+    ]
+    if one.prior_share > 0.005:
+        said = "how much of what is known came from the prior"
+        lines.append(Gate("prior share", name, 100 * one.prior_share, "%", "", None, said))
+    return lines
+
+
+def _of_relations(fit: Fit) -> list[Gate]:
+    v = fit.verdict
+    lines = [_most("condition number", "all parameters", v.condition, "", ILL_CONDITIONED)]
+    if len(v.names) > 1:
+        size = np.abs(v.correlation - np.diag(np.diag(v.correlation)))
+        i, j = np.unravel_index(int(np.nanargmax(size)), size.shape)
+        of = f"{v.names[min(i, j)]}, {v.names[max(i, j)]}"
+        lines.append(_most("largest correlation", of, float(size[i, j]), "", CORRELATION))
+    return lines
+
+
+def _of_agreement(name: str, m: Metrics, how: str, *, judged: bool) -> list[Gate]:
+    of = f"{name}, {how}"
+    lines = [
+        _least("VAF", of, m.vaf, "", VAF),
+        _least("NRMSE fit", of, m.nrmse_fit_percent, "%", NRMSE_FIT),
+        _most("Theil coefficient", of, m.tic, "", THEIL),
+        _most("Theil bias part", of, m.bias, "", THEIL_PART),
+        _most("Theil variance part", of, m.variance, "", THEIL_PART),
+        Gate("Theil covariance part", of, m.covariance, "", "", None),
+    ]
+    if judged:
+        return lines
+    said = "not judged: a simulation does not know the disturbance"
+    return [one._replace(gate="", passed=None, remark=said) for one in lines]
+
+
+def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
+    lines = []
+    memory = frequency.memory(problem.model, fit.params)
+    for s in fit.signals:
+        for u in s.inputs:
+            for y in s.measured:
+                of = f"{u} to {y}, {s.flight}"
+                dt = float(s.times[1] - s.times[0])
+                found = frequency.empirical(s.inputs[u], s.measured[y], dt, memory)
+                if isinstance(found, str):
+                    lines.append(Gate("coherence", of, math.nan, "", "", None, found))
+                    continue
+                mean = float(np.average(found.coherence, weights=found.power))
+                said = f"weighted by the input's power, {found.segments} segments"
+                lines.append(_least("coherence", of, mean, "", COHERENCE, said))
+    return lines
