@@ -136,10 +136,39 @@ def _fit(options: argparse.Namespace) -> int:
         found.timing["rls"] = time.perf_counter() - started
     from heli_jax import output
 
+    further = _further(experiment, problem, found)
     _say("writing the report")
-    output.write_fit(out, experiment, problem, found, rls, begin)
-    output.print_fit(problem, found, rls, out)
+    output.write_fit(out, experiment, problem, found, rls, further, begin)
+    output.print_fit(problem, found, rls, further, out)
     return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
+
+
+def _further(experiment: Any, problem: Any, found: Any) -> Any:
+    """Model choice and further intervals, where the configuration asks for them."""
+    from heli_jax import config as configuration
+    from heli_jax.identification.choice import choose
+    from heli_jax.identification.intervals import intervals
+    from heli_jax.report.files import Further
+
+    wanted = experiment.config.fit
+    more, choice = None, None
+    asked = wanted.intervals
+    try:
+        if asked.profile or asked.bootstrap or asked.nuts:
+            more = intervals(
+                found,
+                profiles=asked.profile,
+                runs=asked.bootstrap,
+                draws=asked.nuts,
+                seed=wanted.seed,
+                progress=_say,
+            )
+        if wanted.compare:
+            rivals = configuration.rivals(experiment, problem)
+            choice = choose(rivals.problems, rivals.nested, progress=_say)
+    except ValueError as e:
+        raise InputError(f"{experiment.path}: fit: {e}") from e
+    return Further(choice, more)
 
 
 def _warn_reading(problem: Any) -> None:

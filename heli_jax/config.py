@@ -1,21 +1,25 @@
 """Experiment configurations: YAML, validated here, and the problems that they describe."""
 
+import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from heli_jax import models, naming, units
-from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
 from heli_jax.identification.problem import Free, Method, Nuisance, Prior, Problem
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import parse_value, read_mapping
+
+if TYPE_CHECKING:
+    from heli_jax.identification.choice import Alternatives
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -76,6 +80,17 @@ class NuisanceConfig(_Strict):
     input_gain: bool = False
 
 
+class IntervalsConfig(_Strict):
+    """Intervals beside the Gaussian one."""
+
+    profile: list[str] = []
+    """free parameters whose profile likelihood is wanted"""
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """made records to refit; 0 for none"""
+    nuts: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """draws of each of four chains (extra `bayes`); 0 for none"""
+
+
 class FitConfig(_Strict):
     method: Method = "output-error"
     free: dict[str, FreeConfig]
@@ -83,6 +98,9 @@ class FitConfig(_Strict):
     starts: Annotated[int, Field(ge=1, le=10_000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     max_steps: Annotated[int, Field(ge=1)] = 200
+    compare: bool = False
+    """whether to fit the alternatives too: no disturbance, one pole, two poles; without stand"""
+    intervals: IntervalsConfig = IntervalsConfig()
 
 
 class RLSConfig(_Strict):
@@ -295,6 +313,7 @@ def problem(experiment: Experiment) -> Problem:
         raise InputError(f"{path}: fit: missing, wanted is fit.free with a parameter to estimate")
     if not config.fit.free:
         raise InputError(f"{path}: fit.free: nothing is free, wanted is a parameter to estimate")
+    _check_intervals(config.fit, path)
     nuisance = Nuisance(**config.fit.nuisance.model_dump())
     flights = read_flights(experiment, gain=nuisance.input_gain)
     free = {
@@ -325,6 +344,46 @@ def problem(experiment: Experiment) -> Problem:
         raise InputError(
             f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}"
         ) from e
+
+
+def _check_intervals(wanted: FitConfig, path: Path) -> None:
+    """Refuse before the fit what could not be done after it."""
+    for name in wanted.intervals.profile:
+        if name not in wanted.free:
+            raise InputError(
+                f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, wanted.free)}"
+            )
+    if wanted.intervals.nuts and importlib.util.find_spec("blackjax") is None:
+        raise InputError(
+            f"{path}: fit.intervals.nuts: blackjax is not installed, wanted is the extra bayes: "
+            "pip install 'heli_jax[bayes]'"
+        )
+    if wanted.intervals.bootstrap and wanted.nuisance.time_shift:
+        raise InputError(
+            f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, wanted is "
+            "one of the two"
+        )
+
+
+def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
+    """The models that a configuration's `compare` puts beside the fitted one.
+
+    Raises:
+        InputError: no axis of the model can be disturbed.
+    """
+    from heli_jax.identification.choice import alternatives  # not before it is needed: slow
+
+    model, wanted = experiment.model, experiment.config.disturbance
+    axes = disturbable(model)
+    if not axes:
+        raise InputError(
+            f"{experiment.path}: fit.compare: model {model.name} has no axis to disturb, wanted is "
+            "one with roll, pitch or yaw"
+        )
+    axis = wanted.axis if wanted is not None else axes[0]
+    bare = {"roll-on-stand": "roll", "pitch-on-stand": "pitch"}.get(model.name)
+    stand = models.by_name(bare) if bare and "kappa" in fitted.free else None
+    return alternatives(fitted, model, axis, without_stand=stand)
 
 
 def disturbed(experiment: Experiment) -> tuple[Model, Any]:

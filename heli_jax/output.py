@@ -18,6 +18,7 @@ from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
 from heli_jax.report import files
+from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 
 
@@ -27,6 +28,7 @@ def write_fit(
     problem: Problem,
     fit: Fit,
     baseline: Baseline | None,
+    further: files.Further,
     begin: float,
 ) -> None:
     """The run directory: config.yaml, fit.json, signals.csv, report.html, figures/."""
@@ -41,13 +43,16 @@ def write_fit(
         files.write_signals(directory / "signals.csv", fit.signals)
         started = time.perf_counter()
         title = experiment.path.stem
-        write_report(directory, fit, problem, baseline, title, experiment.vehicle.constants)
+        constants = experiment.vehicle.constants
+        write_report(directory, fit, problem, baseline, title, constants, further)
         fit.timing["report"] = time.perf_counter() - started
         fit.timing["total"] = time.perf_counter() - begin
-        files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline))
+        files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline, further))
 
 
-def print_fit(problem: Problem, fit: Fit, baseline: Baseline | None, out: Path) -> None:
+def print_fit(
+    problem: Problem, fit: Fit, baseline: Baseline | None, further: files.Further, out: Path
+) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     print(f"{fit.status}: {fit.verdict.text}")
     note = files.whiteness_note(fit)
@@ -59,6 +64,11 @@ def print_fit(problem: Problem, fit: Fit, baseline: Baseline | None, out: Path) 
     _table((*head[:3], fit.interval, *head[4:]), rows)
     for c in fit.verdict.combinations:
         print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
+    if further.intervals is not None:
+        found = report_tables.intervals(further.intervals, fit)
+        _table(found.head, found.rows)
+        for sentence in further.intervals.sentences:
+            print(f"! {sentence}")
     for name, m in fit.metrics.items():
         _print_agreement(f"{name}, simulated", m)
     for name, m in fit.one_step.items():
@@ -68,6 +78,11 @@ def print_fit(problem: Problem, fit: Fit, baseline: Baseline | None, out: Path) 
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     print(f"acceptance card: {summary(card(problem, fit))}")
+    if further.choice is not None:
+        compared = report_tables.choice(further.choice)
+        _table(compared.head, compared.rows)
+        for sentence in further.choice.sentences:
+            print(sentence)
     if baseline is not None:
         _print_baseline(baseline)
     print(f"report: {out / 'report.html'}")

@@ -10,6 +10,11 @@ from heli_jax.naming import Scalar
 _RATES = {"roll": "dphi", "pitch": "dtheta", "yaw": "dpsi"}
 
 
+def disturbable(model: Model) -> list[str]:
+    """The axes of a model that can be disturbed."""
+    return [axis for axis, rate in _RATES.items() if rate in naming.names(model.State)]
+
+
 @functools.cache
 def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     r"""The model with an Ornstein-Uhlenbeck (Gauss-Markov) acceleration on one axis.
@@ -22,8 +27,8 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     Raises:
         ValueError: the model has no such axis, or `poles` is neither 1 nor 2.
     """
-    if axis not in _RATES or _RATES[axis] not in naming.names(model.State):
-        have = [a for a, rate in _RATES.items() if rate in naming.names(model.State)]
+    have = disturbable(model)
+    if axis not in have:
         raise ValueError(f"model {model.name} has no axis {axis!r} to disturb; it has {have}")
     if poles not in (1, 2):
         raise ValueError(f"poles is {poles}, wanted is 1 or 2")

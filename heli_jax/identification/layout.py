@@ -113,6 +113,15 @@ class Noise(NamedTuple):
     the likelihood is laid out in rows, so that they have variance 1"""
 
 
+class Reached(NamedTuple):
+    """Where a fit ended, for what goes on from there."""
+
+    layout: Layout
+    data: Data
+    noise: Noise
+    z: Any
+
+
 class Unknowns(NamedTuple):
     """The vector z taken apart, in the units of the model."""
 

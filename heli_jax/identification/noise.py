@@ -190,6 +190,10 @@ def _residual_sd(r: np.ndarray, y: Any, freedom: float) -> np.ndarray:
 def log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
     """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that is
     not given."""
+    return float(_log_likelihood(layout, data, noise, e))
+
+
+def _log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
     if not layout.filtered:
         found = [
             r[np.isfinite(np.asarray(flight.outputs[k]))]

@@ -1,5 +1,6 @@
 """Levenberg-Marquardt by optimistix on the one residual, from one start or many."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from heli_jax.identification.layout import Data, Layout, Noise
+from heli_jax.identification.layout import Data, Layout, Noise, Reached
 from heli_jax.identification.residual import evaluate
 
 
@@ -155,6 +156,37 @@ def _optimise(
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
     converged = (solution.result == optx.RESULTS.successful) & fine
     return Optimum(z, cost, solution.stats["num_steps"], converged)
+
+
+def optimise_many(
+    reached: Reached,
+    data: Callable[[Any], Data],
+    starts: Float[Array, "k q"],
+    each: Any,
+    *,
+    hold: int | None = None,
+    max_steps: int = 60,
+    batch: int = 8,
+) -> Optimum:
+    """Optima (k, ...) for many starts or records near an optimum, `batch` at a time by vmap.
+
+    `data` makes the numbers of one run out of its slice of `each`; the unknown at `hold` stays at
+    its start.
+    """
+    first = evaluate(reached.layout, reached.data, reached.noise, reached.z)
+    units = _scaling(first.r, first.J)
+    if hold is not None:
+        units = units._replace(unit=units.unit.at[hold].set(0.0))
+    layout, noise = reached.layout, reached.noise
+
+    @eqx.filter_jit
+    def run(starts: Array, each: Any, noise: Noise, units: _Scaling) -> Optimum:
+        def one(pair: tuple[Array, Any]) -> Optimum:
+            return _optimise(layout, data(pair[1]), noise, pair[0], units, max_steps)
+
+        return jax.lax.map(one, (starts, each), batch_size=min(batch, starts.shape[0]))
+
+    return jax.device_get(run(starts, each, noise, units))
 
 
 def _watched(layout: Layout) -> Array:

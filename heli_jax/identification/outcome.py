@@ -22,7 +22,7 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, layout_of, unpack
+from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -116,6 +116,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         steps=sum(s for s, _ in settled.trace),
         trace=settled.trace,
         notes=tuple(notes),
+        reached=Reached(layout, data, noise, best.z),
         seed=ran.seed,
         timing=ran.timing,
     )

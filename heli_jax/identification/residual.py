@@ -21,7 +21,7 @@ _FLOOR = 1e-3
 """The likelihood's row stays real however far the noise falls; the next round has another level."""
 
 
-def _run(layout: Layout, data: Data, u: Unknowns, flight: FlightData) -> tuple[Any, Any]:
+def driven(layout: Layout, data: Data, u: Unknowns, flight: FlightData) -> tuple[Any, Any]:
     """Parameters and inputs of one flight at the unknowns."""
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
@@ -33,7 +33,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Trajectory, ...]:
     """The simulated flights (without bias)."""
     out = []
     for flight, state in zip(data.flights, u.states, strict=True):
-        params, inputs = _run(layout, data, u, flight)
+        params, inputs = driven(layout, data, u, flight)
         out.append(
             simulate(
                 layout.model,
@@ -55,7 +55,7 @@ def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Inn
     """The innovations of every flight."""
     out = []
     for flight, state, bias, sd in zip(data.flights, u.states, u.biases, noise.sd, strict=True):
-        params, inputs = _run(layout, data, u, flight)
+        params, inputs = driven(layout, data, u, flight)
         out.append(
             innovations(
                 layout.model,

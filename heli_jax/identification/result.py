@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.layout import Reached
 from heli_jax.identification.metrics import Metrics, Whiteness
 
 Status = Literal["converged", "not-converged", "not-identifiable"]
@@ -112,6 +113,8 @@ class Fit:
     trace: tuple[tuple[int, float], ...]
     """(steps, cost) of every round of the optimiser"""
     notes: tuple[str, ...]
+    reached: Reached
+    """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
     coloured: bool = False
     """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0

@@ -17,6 +17,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit, Signals, StartRow
 from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.intervals import Intervals
 from heli_jax.identification.metrics import (
     autocorrelation,
     cross_correlation,
@@ -430,3 +431,43 @@ def _far(limits: tuple[float, float]) -> tuple[float, float]:
     """A little beyond the limits: lines leave the panel, but no path has huge numbers."""
     span = limits[1] - limits[0]
     return limits[0] - span, limits[1] + span
+
+
+_METHODS = {
+    "gaussian": ("Gaussian", style.BLUE),
+    "profile": ("profile", style.VERMILLION),
+    "bootstrap": ("bootstrap", style.GREEN),
+    "nuts": ("NUTS", style.PURPLE),
+}
+
+
+def intervals(found: Intervals, fit: Fit, *, figure: Figure | None = None) -> Panels:
+    """95 % intervals by every method, and the likelihood of the profile; one panel a parameter."""
+    names = list(found.by_parameter)
+    if not names:
+        return ()
+    made = style.figure(1.9, style.WIDTH) if figure is None else figure
+    if figure is None:
+        made.set_layout_engine("constrained")
+    axes = np.atleast_1d(made.subplots(1, len(names)))
+    for i, (ax, name) in enumerate(zip(axes, names, strict=True)):
+        by = found.by_parameter[name]
+        have = [m for m in _METHODS if m in by]
+        for k, m in enumerate(have):
+            low, high = by[m]
+            ax.plot([low, high], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
+        one = fit.estimates[name]
+        ax.axvline(one.value, color=style.GREY, lw=0.8, ls=":")
+        if name in found.profiles:
+            p = found.profiles[name]
+            near = p.deviance < 9.0
+            height = 0.2 - (len(have) - 1) * (1.0 - np.exp(-0.5 * p.deviance[near]))
+            ax.plot(p.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
+        ax.set_yticks(
+            [-k for k in range(len(have))], [_METHODS[m][0] for m in have] if not i else []
+        )
+        ax.set_ylim(-len(have) + 0.4, 0.6)
+        ax.xaxis.set_major_locator(MaxNLocator(nbins=3))
+        ax.set_xlabel(style.label(name, one.unit))
+    axes[0].set_title("95 % intervals", loc="left")
+    return tuple(axes)

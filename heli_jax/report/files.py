@@ -5,19 +5,28 @@ import json
 import math
 import platform
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.flights import Flight
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.choice import Choice
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.intervals import Intervals
 from heli_jax.identification.problem import Problem
 from heli_jax.report.card import card
 
 _PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
+
+
+class Further(NamedTuple):
+    """What was asked for beside the fit."""
+
+    choice: Choice | None = None
+    intervals: Intervals | None = None
 
 
 def versions() -> dict[str, str]:
@@ -26,7 +35,9 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **found}
 
 
-def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str, Any]:
+def fit_json(
+    fit: Fit, problem: Problem, baseline: Baseline | None, further: Further = Further()
+) -> dict[str, Any]:
     """A fit as plain data for fit.json; what is not a finite number is null."""
     whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
     return _plain(
@@ -51,6 +62,8 @@ def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str,
             "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
             "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
             "acceptance": [g._asdict() for g in card(problem, fit)],
+            "models": _choice(further.choice),
+            "intervals": _intervals(further.intervals),
             "log_likelihood": fit.log_likelihood,
             "unknowns": fit.unknowns,
             "aic": fit.aic,
@@ -67,6 +80,37 @@ def fit_json(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str,
             "seed": fit.seed,
         }
     )
+
+
+def _choice(choice: Choice | None) -> dict[str, Any] | None:
+    if choice is None:
+        return None
+    return {
+        "candidates": [c._asdict() for c in choice.candidates],
+        "nested": [t._asdict() for t in choice.nested],
+        "sentences": list(choice.sentences),
+    }
+
+
+def _intervals(found: Intervals | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    content: dict[str, Any] = {
+        "by_parameter": found.by_parameter,
+        "profiles": {n: p._asdict() for n, p in found.profiles.items()},
+        "sentences": list(found.sentences),
+    }
+    if found.bootstrap is not None:
+        content["bootstrap_failures"] = found.bootstrap.failures
+    if found.posterior is not None:
+        p = found.posterior
+        content["nuts"] = {
+            "rhat": p.rhat,
+            "effective": p.effective,
+            "divergent": p.divergent,
+            "trusted": p.trusted,
+        }
+    return content
 
 
 def whiteness_note(fit: Fit) -> str:

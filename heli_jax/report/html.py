@@ -15,12 +15,13 @@ from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
-from heli_jax.report.files import versions
+from heli_jax.report.files import Further, versions
 from heli_jax.vehicle import Constant
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
 
+_GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
 _HERE = Path(__file__).parent
 
 
@@ -40,6 +41,7 @@ def write_report(
     baseline: Baseline | None,
     title: str,
     vehicle_constants: Mapping[str, Constant],
+    further: Further = Further(),
 ) -> list[str]:
     """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
 
@@ -49,12 +51,13 @@ def write_report(
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
-    for name, draw in _drawings(fit, problem, baseline).items():
+    for name, draw in _drawings(fit, problem, baseline, further).items():
         drawn = style.save(draw, folder / name)
         if drawn is not None:
             data = base64.b64encode(drawn[1]).decode("ascii")
             pictures[name] = Picture(name, drawn[0], data)
-    page = render(fit, problem, baseline, title, vehicle_constants, list(pictures.values()))
+    made = list(pictures.values())
+    page = render(fit, problem, baseline, title, vehicle_constants, made, further)
     (directory / "report.html").write_text(page, encoding="utf-8")
     return list(pictures)
 
@@ -62,9 +65,13 @@ def write_report(
 type Draw = Callable[[], Figure | None]
 
 
-def _drawings(fit: Fit, problem: Problem, baseline: Baseline | None) -> dict[str, Draw]:
+def _drawings(
+    fit: Fit, problem: Problem, baseline: Baseline | None, further: Further
+) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
     model, drawings = problem.model, {}
+    if further.intervals is not None:
+        drawings["intervals"] = _drawing(figures.intervals, further.intervals, fit)
     shown = fit.signals[:MOST_FLIGHTS]
     for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
         for output in s.measured:
@@ -116,6 +123,7 @@ def render(
     title: str,
     vehicle_constants: Mapping[str, Constant],
     pictures: list[Picture],
+    further: Further = Further(),
 ) -> str:
     """The page as text."""
     lines = card.card(problem, fit)
@@ -138,6 +146,9 @@ def render(
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),
+        further=further,
+        choice=tables.choice(further.choice) if further.choice else None,
+        intervals=tables.intervals(further.intervals, fit) if further.intervals else None,
         acceptance=tables.acceptance(lines),
         summary=card.summary(lines),
         residuals=tables.residuals(fit, problem),
@@ -152,7 +163,15 @@ def render(
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         pictures={
             group: [p for p in pictures if p.name.startswith(group)]
-            for group in ("response", "residual", "bode", "correlation", "starts", "rls")
+            for group in (
+                "response",
+                "residual",
+                "bode",
+                "correlation",
+                "starts",
+                "rls",
+                "intervals",
+            )
         },
         NOT_DETERMINED=tables.NOT_DETERMINED,
     )

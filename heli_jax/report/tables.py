@@ -8,8 +8,10 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.choice import Choice
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability import ILL_CONDITIONED, Verdict
+from heli_jax.identification.intervals import Intervals
 from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
 from heli_jax.report.card import Gate, shown
@@ -159,6 +161,41 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
         if baseline is not None and baseline.output == output:
             rows.append(_agreement(output, f"RLS ({baseline.flight})", baseline.metrics))
     return Table(head, rows)
+
+
+def choice(found: Choice) -> Table:
+    """The models compared, best AIC first."""
+    best_aic = min(c.aic for c in found.candidates)
+    best_bic = min(c.bic for c in found.candidates)
+    rows = [
+        (
+            c.name,
+            f"{c.log_likelihood:.1f}".replace("-", "−"),
+            str(c.unknowns),
+            f"{c.aic - best_aic:.1f}",
+            f"{c.bic - best_bic:.1f}",
+            "yes" if c.white else "no",
+            c.status,
+        )
+        for c in found.candidates
+    ]
+    head = ("model", "log-likelihood", "unknowns", "AIC above", "BIC above", "white", "status")
+    return Table(head, rows)
+
+
+def intervals(found: Intervals, fit: Fit) -> Table:
+    """95 % intervals by parameter and method."""
+    methods = ("gaussian", "profile", "bootstrap", "nuts")
+    have = [m for m in methods if any(m in by for by in found.by_parameter.values())]
+    rows = []
+    for name, by in found.by_parameter.items():
+        cells = []
+        for m in have:
+            low, high, _ = measured(fit.estimates[name].sd, *by.get(m, (math.nan, math.nan)))
+            cells.append(f"{low} to {high}" if m in by else NOTHING)
+        rows.append((name, *cells, pretty(fit.estimates[name].unit)))
+    heads = {"gaussian": "Gaussian", "nuts": "NUTS"}
+    return Table(("parameter", *(heads.get(m, m) for m in have), "unit"), rows)
 
 
 def acceptance(lines: tuple[Gate, ...]) -> Table:

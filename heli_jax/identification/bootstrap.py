@@ -1,0 +1,131 @@
+"""Parametric bootstrap: the machine found is simulated and identified again, many times."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.identification import coordinates
+from heli_jax.identification.layout import Data, Reached, unpack
+from heli_jax.identification.optimise import optimise_many
+from heli_jax.identification.residual import driven, predict
+from heli_jax.identification.result import Fit
+from heli_jax.simulation.simulate import simulate
+
+_BATCH = 8
+
+
+class Bootstrap(NamedTuple):
+    """Estimates of made records."""
+
+    values: dict[str, np.ndarray]
+    """by free parameter, (runs that converged,)"""
+    failures: int
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """2.5 and 97.5 % of the values."""
+        low, high = np.percentile(self.values[name], [2.5, 97.5])
+        return float(low), float(high)
+
+
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
+    """Refit `runs` records made with the estimates: same inputs, same missing samples, new noise.
+
+    Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
+    are coloured, noise with their spectrum (random phases). Means of priors are drawn anew too.
+
+    Raises:
+        ValueError: the time shift is free, or the data do not determine every parameter.
+    """
+    at = fit.reached
+    if at.layout.shift:
+        raise ValueError("bootstrap: not available with a free time shift")
+    lost = [n for n, e in fit.estimates.items() if e.sd is None]
+    if lost:
+        raise ValueError(f"bootstrap: the data do not determine {', '.join(lost)}")
+    rng = np.random.default_rng(seed)
+    outputs = _records(fit, at, runs, seed, rng)
+    values = np.array([fit.estimates[n].value for n in at.layout.free])
+    spread = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
+    means = values + spread * rng.standard_normal((runs, values.size))
+
+    def data(each: tuple[Any, Array]) -> Data:
+        flights = tuple(
+            flight._replace(outputs=one)
+            for flight, one in zip(at.data.flights, each[0], strict=True)
+        )
+        return at.data._replace(flights=flights, prior_mean=each[1])
+
+    starts = jnp.tile(at.z[None, :], (runs, 1))
+    each = (outputs, jnp.asarray(means, at.z.dtype))
+    ends = optimise_many(at, data, starts, each, batch=_BATCH)
+    fine = np.asarray(ends.converged)
+    found = {}
+    for i, name in enumerate(at.layout.free):
+        args = (at.data.sign[i], at.data.low[i], at.data.high[i])
+        z = jnp.asarray(ends.z[fine, i])
+        found[name] = np.asarray(coordinates.to_value(at.layout.kinds[i], z, *args))
+    return Bootstrap(found, int(runs - fine.sum()))
+
+
+def _records(
+    fit: Fit, at: Reached, runs: int, seed: int, rng: np.random.Generator
+) -> tuple[dict[str, Array], ...]:
+    """By flight and output (runs, N); NaN where the record has it."""
+    u = unpack(at.layout, at.data, at.z)
+    clean = None if at.layout.filtered else predict(at.layout, at.data, u)
+    records = []
+    for i, (flight, sds) in enumerate(zip(at.data.flights, at.noise.sd, strict=True)):
+        if clean is None:
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
+            moved = _disturbed(at, u, i, keys)
+        else:
+            moved = clean[i].outputs
+        one = {}
+        for n, y in flight.outputs.items():
+            sd = float(sds[n]) * float(u.scales.get(n, 1.0))
+            noise = sd * rng.standard_normal((runs, y.shape[0]))
+            if fit.coloured:
+                noise = _like(fit.signals[i].residual(n), runs, rng)
+            made = np.asarray(getattr(moved, n)) + float(u.biases[i][n]) + noise
+            one[n] = jnp.asarray(np.where(np.isnan(np.asarray(y)), np.nan, made), at.z.dtype)
+        records.append(one)
+    return tuple(records)
+
+
+def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> Any:
+    """Outputs (runs, N) with a disturbance drawn for each key."""
+    flight, layout = at.data.flights[i], at.layout
+    params, inputs = driven(layout, at.data, u, flight)
+    start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
+    spread = layout.model.spread(params) if layout.model.spread is not None else {}
+
+    @jax.jit
+    def run(key: Array) -> Any:
+        first, second = jax.random.split(key)
+        drawn = jax.random.normal(first, (len(spread) or 1,), at.z.dtype)
+        random = {n: getattr(start, n) + s * d for (n, s), d in zip(spread.items(), drawn)}  # noqa: B905
+        begin = naming.replace(start, **random)
+        return simulate(
+            layout.model,
+            params,
+            inputs,
+            dt=flight.dt,
+            initial_state=begin,
+            solver=layout.solver,
+            substeps=layout.substeps,
+            key=second,
+        ).outputs
+
+    return jax.lax.map(run, keys, batch_size=_BATCH)
+
+
+def _like(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarray:
+    """Noise (runs, N) with the spectrum of the residual (N,): random phases (Theiler, 1992)."""
+    r = np.where(np.isnan(residual), 0.0, residual - np.nanmean(residual))
+    spectrum = np.abs(np.fft.rfft(r))
+    phases = np.exp(2j * np.pi * rng.uniform(size=(runs, spectrum.size)))
+    return np.fft.irfft(spectrum * phases, r.size, axis=1)
