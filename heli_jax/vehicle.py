@@ -80,6 +80,11 @@ _MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}
 _MAY_BE_ZERO = {"Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
 
 
+def of_helicopter(record: type) -> bool:
+    """Whether a class of parameters has all of Helicopter's, as that of a disturbed model has."""
+    return set(naming.names(Helicopter)) <= set(naming.names(record))
+
+
 def impossible(params: Mapping[str, float]) -> str | None:
     """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
 

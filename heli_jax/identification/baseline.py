@@ -15,7 +15,7 @@ from heli_jax.dynamics.roll import ratios_from_denominator
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.metrics import NO_METRICS, Metrics, metrics, whiteness
 from heli_jax.identification.rls import rls, transfer_function
-from heli_jax.vehicle import Helicopter
+from heli_jax.vehicle import of_helicopter
 
 _solve_banded: Any = get_lapack_funcs("tbtrs")
 
@@ -196,7 +196,7 @@ def _combinations(
 ) -> tuple[dict[str, float], list[str]]:
     """a/Ixx and a/If where the structure of eq. 23 allows to read them off."""
     if (
-        model.Params is not Helicopter
+        not of_helicopter(model.Params)
         or output not in ("roll", "pitch")
         or len(naming.names(model.State)) != 4
     ):
@@ -239,12 +239,19 @@ def _stability(poles: np.ndarray) -> list[str]:
     return []
 
 
+_STARTING = 100
+
+
 def _bias(
     errors: np.ndarray, simulated: np.ndarray, y: np.ndarray, agreement: Metrics
 ) -> list[str]:
     """Noise biases equation error: told by coloured errors or a poor simulation."""
     said = []
+    # While P falls from its start the errors are those of no model.
+    errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
+    if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
+        return said  # no noise at all: what is left is rounding
     if math.isnan(agreement.rmse):
         said.append("Its simulation diverges from the measured output; no metrics are given.")
     elif agreement.rmse > 1.5 * one_step:

@@ -13,8 +13,11 @@ LONGEST = 20.0
 """lags of the residual's autocovariance that are used [s], at most a fifth of the record"""
 
 
-def inflation(layout: Layout, data: Data, e: Evaluation) -> np.ndarray:
-    """How much wider than white noise says the standard deviations (q,) of all unknowns are.
+def inflation(
+    layout: Layout, data: Data, e: Evaluation, along: np.ndarray | None = None
+) -> np.ndarray:
+    """How much wider than white noise says the standard deviations (q,) of all unknowns are, or
+    (k,) of the combinations `along` (k, q) of them.
 
     With M = J'J the covariance is M^-1 (sum over i, k of J_i R(i - k) J_k') M^-1, where R is the
     windowed autocovariance of the residuals; M^-1 would hold if they were white. Several outputs
@@ -36,7 +39,10 @@ def inflation(layout: Layout, data: Data, e: Evaluation) -> np.ndarray:
     inverse = np.linalg.pinv(J, rcond=1e-10)
     white = inverse @ inverse.T
     coloured = white @ meat @ white
-    ratio = np.diag(coloured) / np.where(np.diag(white) > 0, np.diag(white), 1.0)
+    along = np.eye(norms.size) if along is None else along
+    along = along / np.where(norms > 0, norms, 1.0)
+    by_white = np.sum(along @ white * along, axis=1)
+    ratio = np.sum(along @ coloured * along, axis=1) / np.where(by_white > 0, by_white, 1.0)
     return np.sqrt(np.maximum(ratio, 0.0))
 
 

@@ -173,10 +173,11 @@ def _updated(
 def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
     """Sums over all measurements of e^2/s and of log(s/sd^2)."""
     squares, logs = 0.0, 0.0
-    for one, sd in zip(e.innovations, noise.sd, strict=True):
-        for n, s in one.variance.items():
-            squares += float(np.nansum(one.error[n] ** 2 / s))
-            logs += float(np.nansum(np.log(s / sd[n] ** 2)))
+    with np.errstate(all="ignore"):  # an unstable start gives what it gives, and is judged later
+        for one, sd in zip(e.innovations, noise.sd, strict=True):
+            for n, s in one.variance.items():
+                squares += float(np.nansum(one.error[n] ** 2 / s))
+                logs += float(np.nansum(np.log(s / sd[n] ** 2)))
     return squares, logs
 
 

@@ -64,9 +64,8 @@ class _LevenbergMarquardt(optx.AbstractGaussNewton):
         self.rtol, self.atol = rtol, atol
 
         def norm(x: Array) -> Array:
-            # Of the unknowns those watched; of the rows the last, the part of the residuals that
-            # no step can take away.
-            return optx.max_norm(jnp.where(watched, x, 0.0) if x.shape == watched.shape else x[-1])
+            # Of the unknowns those watched; of the rows the first, the size of the residuals.
+            return optx.max_norm(jnp.where(watched, x, 0.0) if x.shape == watched.shape else x[0])
 
         self.norm = norm
         self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
@@ -79,6 +78,11 @@ class _LevenbergMarquardt(optx.AbstractGaussNewton):
 _COLUMN = 300.0
 """Column norm of the scaled Jacobian at the start: optimistix begins with damping 1, which is
 then a hundred-thousandth of J'J; a step that fails raises it tenfold."""
+
+
+_ANCHOR = 100.0
+"""sd, in the coordinates of the free parameters (logarithms), by which they are tied to the start:
+a factor of e^100 is no prior, but it tells one end of a valley from the other"""
 
 
 class _Scaling(NamedTuple):
@@ -119,12 +123,26 @@ def _optimise(
     max_steps: int,
 ) -> Optimum:
     # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
-    # decomposition of [J r]: as many rows as unknowns, and one. The optimiser sees these rows.
+    # decomposition of [r J]: as many rows as unknowns, and one. The optimiser sees these rows; the
+    # first is the size of r, the others are zero but for their derivatives.
+    # Where the data leave a direction of the parameters open, the weakest of anchors keeps them
+    # from drifting along it.
+    free = jnp.arange(layout.size) < len(layout.free)
+    anchor = jnp.where(free, 1.0 / _ANCHOR, 0.0).astype(z0.dtype)
+
+    def reached(xi: Array) -> Array:
+        return z0 + units.unit * xi
+
     def triangle(xi: Array) -> tuple[Array, Array]:
-        e = evaluate(layout, data, noise, z0 + units.unit * xi)
-        columns = jnp.concatenate([e.J * units.unit[None, :], e.r[:, None]], axis=1) / units.level
+        e = evaluate(layout, data, noise, reached(xi))
+        columns = jnp.concatenate([e.r[:, None], e.J * units.unit[None, :]], axis=1) / units.level
         R = jnp.linalg.qr(columns, mode="r")
-        return R[:, -1], R[:, :-1]
+        R = R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
+        held = (z0 - reached(xi)) * anchor, -jnp.diag(anchor * units.unit)
+        return (
+            jnp.concatenate([R[:, 0], held[0] / units.level]),
+            jnp.concatenate([R[:, 1:], held[1] / units.level]),
+        )
 
     @jax.custom_jvp
     def rows(xi: Array) -> Array:
@@ -149,7 +167,7 @@ def _optimise(
         throw=False,
         options={"jac": "fwd"},
     )
-    z = z0 + units.unit * solution.value
+    z = reached(solution.value)
     seen = [jnp.isfinite(y) for flight in data.flights for y in flight.outputs.values()]
     count = jnp.sum(jnp.concatenate(seen)).astype(z.dtype)
     cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / count

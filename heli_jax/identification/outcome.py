@@ -1,5 +1,6 @@
 """From an optimum to a Fit: estimates, verdict, signals, metrics, whiteness, notes."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +23,7 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
+from heli_jax.identification.layout import Data, Layout, Noise, Reached, layout_of, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -72,6 +73,8 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     white = _whiteness(signals, e)
     coloured = usable and not layout.filtered and not all(w.white for w in white.values())
     wider = inflation(layout, data, e) if coloured else np.ones(layout.size)
+    if coloured:
+        verdict = _widened(verdict, layout, data, e)
     named = estimates_of(problem, layout, e, verdict, quantile, wider)
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
@@ -120,6 +123,29 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         seed=ran.seed,
         timing=ran.timing,
     )
+
+
+def _widened(verdict: Verdict, layout: Layout, data: Data, e: Evaluation) -> Verdict:
+    """The verdict with intervals of its combinations that allow for coloured residuals."""
+    if not verdict.combinations:
+        return verdict
+    # What a logarithm gains by the optimiser's coordinate.
+    slopes = np.asarray(e.slopes) / np.asarray(e.named)
+    along = np.zeros((len(verdict.combinations), layout.size))
+    for k, c in enumerate(verdict.combinations):
+        for name, power in c.exponents.items():
+            i = layout.named.index(name)
+            along[k, i] = power * slopes[i]
+    wider = inflation(layout, data, e, along)
+    combinations = tuple(
+        c._replace(
+            sd=float(c.sd * w),
+            lower95=float(c.value * (c.lower95 / c.value) ** w),
+            upper95=float(c.value * (c.upper95 / c.value) ** w),
+        )
+        for c, w in zip(verdict.combinations, wider, strict=True)
+    )
+    return replace(verdict, combinations=combinations)
 
 
 def _status(best: Optimum, usable: bool, verdict: Verdict) -> Status:

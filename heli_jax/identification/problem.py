@@ -13,7 +13,7 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model, field_and_output, linear_misfit, plain
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.vehicle import Helicopter, impossible
+from heli_jax.vehicle import impossible, of_helicopter
 
 
 class Prior(NamedTuple):
@@ -172,7 +172,7 @@ def _check_free(name: str, one: Free, model: Model) -> None:
 
 
 def _check_possible(problem: Problem) -> None:
-    if problem.model.Params is not Helicopter:
+    if not of_helicopter(problem.model.Params):
         return
     for key in ("start", "lower", "upper"):
         values = {n: getattr(f, key) for n, f in problem.free.items()}
@@ -213,7 +213,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
             raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
         if not math.isfinite(value):
             raise ValueError(f"{where}, known.{name}: found {value}, wanted is a finite number")
-        wrong = impossible({name: value}) if model.Params is Helicopter else None
+        wrong = impossible({name: value}) if of_helicopter(model.Params) else None
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
     if not flight.hold_out and flight.n_samples < 3 * len(problem.free):

@@ -450,22 +450,20 @@ def intervals(found: Intervals, fit: Fit, *, figure: Figure | None = None) -> Pa
     if figure is None:
         made.set_layout_engine("constrained")
     axes = np.atleast_1d(made.subplots(1, len(names)))
-    for i, (ax, name) in enumerate(zip(axes, names, strict=True)):
-        by = found.by_parameter[name]
-        have = [m for m in _METHODS if m in by]
+    have = [m for m in _METHODS if any(m in by for by in found.by_parameter.values())]
+    for ax, name in zip(axes, names, strict=True):
+        by, one = found.by_parameter[name], fit.estimates[name]
         for k, m in enumerate(have):
-            low, high = by[m]
-            ax.plot([low, high], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
-        one = fit.estimates[name]
+            if m in by:
+                ax.plot(by[m], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
         ax.axvline(one.value, color=style.GREY, lw=0.8, ls=":")
         if name in found.profiles:
             p = found.profiles[name]
             near = p.deviance < 9.0
             height = 0.2 - (len(have) - 1) * (1.0 - np.exp(-0.5 * p.deviance[near]))
             ax.plot(p.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
-        ax.set_yticks(
-            [-k for k in range(len(have))], [_METHODS[m][0] for m in have] if not i else []
-        )
+        ax.set_yticks([-k for k in range(len(have))], [_METHODS[m][0] for m in have])
+        ax.tick_params(axis="y", labelleft=name == names[0])
         ax.set_ylim(-len(have) + 0.4, 0.6)
         ax.xaxis.set_major_locator(MaxNLocator(nbins=3))
         ax.set_xlabel(style.label(name, one.unit))

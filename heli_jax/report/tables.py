@@ -18,7 +18,7 @@ from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import whiteness_note
 from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.style import pretty
-from heli_jax.vehicle import Constant, Helicopter
+from heli_jax.vehicle import Constant, of_helicopter
 
 NOT_DETERMINED = "not determined"
 
@@ -76,7 +76,7 @@ def warnings(fit: Fit) -> list[str]:
 
 def model_remark(problem: Problem) -> str:
     """Why an inertia found here is a number of the paper's model; empty for other models."""
-    if problem.model.Params is not Helicopter:
+    if not of_helicopter(problem.model.Params):
         return ""
     factor = float(np.asarray(problem.vehicle.cyclic_moment))
     return (

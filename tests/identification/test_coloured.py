@@ -62,3 +62,17 @@ def test_prior_rows_keep_their_weight():
     layout, data, e = case(ar1(0.9)[None], 1e-9 * np.ones((1, N, 1)))
     e.J, e.r = np.vstack([e.J, [[1.0]]]), np.append(e.r, 0.3)
     assert inflation(layout, data, e)[0] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_combination_may_be_wider_than_its_parts():
+    rho, rng = 0.95, np.random.default_rng(5)
+    r = ar1(rho)[None]
+    J = np.stack([np.ones((1, N)), rng.standard_normal((1, N))], axis=-1)
+    layout, data, e = case(r, J)
+    parts = inflation(layout, data, e)
+    # The first column is the mean, which suffers; the second is white and does not.
+    assert parts[0] > 4.0
+    assert parts[1] == pytest.approx(1.0, abs=0.3)
+    np.testing.assert_allclose(inflation(layout, data, e, np.eye(2)), parts)
+    both = inflation(layout, data, e, np.array([[1.0, 1.0]]))[0]
+    assert parts[1] < both < parts[0]
