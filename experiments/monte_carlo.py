@@ -22,6 +22,10 @@ from matplotlib.figure import Figure
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.baseline import baseline
+from heli_jax.identification.data import data_of
+from heli_jax.identification.estimates import deviations
+from heli_jax.identification.layout import Noise, layout_of, start_vector
+from heli_jax.identification.noise import evaluation, levelled
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.inputs import random_steps
 
@@ -91,7 +95,24 @@ def undisturbed(params: Any) -> Any:
     return plain(**{n: getattr(params, n) for n in names(plain)})
 
 
-def rows(runs: list[dict[str, Any]], params: Any) -> list[dict[str, Any]]:
+def fisher(params: Any, records: int = 5) -> dict[str, float]:
+    """The Cramer-Rao sd of filter error at the truth, relative: no unbiased method does better."""
+    free = {n: Free(float(getattr(params, n))) for n in FREE}
+    found = []
+    for seed in range(records):
+        problem = Problem(MODEL, params, [record(params, seed)], free, method="filter-error")
+        layout = layout_of(problem, problem.training)
+        data = data_of(problem, problem.training)
+        z = start_vector(layout, data, problem)
+        dtype = z.dtype
+        noise = Noise(({"roll": np.asarray(NOISE, dtype)},), np.zeros((), dtype))
+        noise = levelled(data, evaluation(layout, data, noise, z), noise)
+        found.append(deviations(evaluation(layout, data, noise, z).J)[: len(FREE)])
+    mean = np.sqrt(np.mean(np.square(found), axis=0))
+    return dict(zip(FREE, (float(v) for v in mean), strict=True))
+
+
+def rows(runs: list[dict[str, Any]], params: Any, bound: dict[str, float]) -> list[dict[str, Any]]:
     table = []
     for method in METHODS:
         done = [r[method] for r in runs if r[method]["status"] == "converged"]
@@ -111,6 +132,7 @@ def rows(runs: list[dict[str, Any]], params: Any) -> list[dict[str, Any]]:
                     "bias": (values.mean() - true) / true,
                     "bias_in_sd": (values.mean() - true) / spread,
                     "rmse": np.sqrt(np.mean((values / true - 1.0) ** 2)),
+                    "rmse_over_fisher": np.sqrt(np.mean((values / true - 1.0) ** 2)) / bound[name],
                     "claimed_over_empirical": np.sqrt(np.mean(sds**2)) / spread,
                     "coverage": inside.mean() if np.isfinite(sds).all() else np.nan,
                     "failures": len(runs) - len(done),
@@ -123,18 +145,19 @@ def rows(runs: list[dict[str, Any]], params: Any) -> list[dict[str, Any]]:
 
 def markdown(table: list[dict[str, Any]], count: int) -> str:
     head = (
-        "| method | parameter | bias | bias/sd | RMSE | claimed/empirical sd | coverage of 95 % "
-        "| failures | steps (99 %) | time [s] |"
+        "| method | parameter | bias | bias/sd | RMSE | RMSE/Fisher | claimed/empirical sd "
+        "| coverage of 95 % | failures | steps (99 %) | time [s] |"
     )
     lines = [f"{count} runs of {N} samples, disturbance as large as the response.", "", head]
-    lines.append("|" + "---|" * 10)
+    lines.append("|" + "---|" * 11)
     for r in table:
         coverage = "none claimed" if np.isnan(r["coverage"]) else f"{100 * r['coverage']:.1f} %"
         ratio = r["claimed_over_empirical"]
         claimed = "" if np.isnan(ratio) else f"{ratio:.2f}"
         lines.append(
             f"| {r['method']} | {r['parameter']} | {100 * r['bias']:+.2f} % | "
-            f"{r['bias_in_sd']:+.2f} | {100 * r['rmse']:.1f} % | {claimed} | {coverage} | "
+            f"{r['bias_in_sd']:+.2f} | {100 * r['rmse']:.1f} % | "
+            f"{r['rmse_over_fisher']:.2f} | {claimed} | {coverage} | "
             f"{r['failures']} | {r['steps_99']:.0f} | {r['seconds']:.2f} |"
         )
     return "\n".join(lines) + "\n"
@@ -170,7 +193,7 @@ def main(count: int, folder: Path) -> None:
         if seed % 10 == 9:
             print(f"{seed + 1} of {count} runs", file=sys.stderr, flush=True)
     chosen = [runs[s] for s in range(count)]
-    text = markdown(rows(chosen, params), count)
+    text = markdown(rows(chosen, params, fisher(params)), count)
     (folder / "table.md").write_text(text, encoding="utf-8")
     figure(chosen, params, folder / "monte_carlo.svg")
     print(text, end="")

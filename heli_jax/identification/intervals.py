@@ -118,7 +118,8 @@ def _which(
 ) -> str:
     """Which interval to believe where some differ from the Gaussian one."""
     names = " and ".join(far)
-    text = f"{names} differ from the Gaussian interval by more than {DIFFERENT:.0%} of its width. "
+    verb = "differ" if len(far) > 1 else "differs"
+    text = f"{names} {verb} from the Gaussian interval by more than {DIFFERENT:.0%} of its width. "
     profiled = others.get("profile")
     if profiled is not None and not np.isfinite(profiled).all():
         return text + (

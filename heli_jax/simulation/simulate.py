@@ -1,5 +1,6 @@
 """simulate: a model, its parameters and inputs in; the trajectory out."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,12 +12,13 @@ from jaxtyping import Array, Bool, Float
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import blockwise, columns, matrix
-from heli_jax.simulation.discretize import discretize, process_noise, square_root
+from heli_jax.simulation.discretize import discretize, process_noise, square_root, van_loan
 from heli_jax.simulation.solvers import (
     RK4,
     Accumulating,
     Exact,
     Held,
+    Noisy,
     PerSample,
     at,
 )
@@ -93,8 +95,9 @@ def simulate(
             `ForwardMode()` compiles faster, `RecursiveCheckpointAdjoint()` saves memory in
             reverse mode.
         max_steps: bound on adaptive steps; where it ends a run, `result` says so.
-        key: a JAX random key: the model's own noise is drawn with it, by the exact discrete
-            process noise (linear models with solver "exact"); without it there is none.
+        key: a JAX random key: the model's own noise is drawn with it, by the discrete process
+            noise of a sample: exact for linear models with solver "exact", of the model linearised
+            at each sample for others with fixed steps; without it there is none.
         block: samples per step of solver "exact", a power of two; 32 is three times as fast as 1
             for a single record, 1 is best for large batches.
 
@@ -116,7 +119,7 @@ def simulate(
     else:
         method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
         if key is not None:
-            held = _with_noise(model, held, method, dt, key)
+            method, held = _with_noise(model, held, method, dt, key)
         if block > 1:
             _require_blocks(method, block)
             states, result = blockwise(held, block, x0), dfx.RESULTS.successful
@@ -242,19 +245,42 @@ def _require_blocks(method: Any, block: int) -> None:
         raise ValueError(f"block is {block}, wanted is a power of two")
 
 
-def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> Held:
+def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tuple[Any, Held]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
     if model.noise is None:
         raise ValueError(f"model {model.name!r} has no noise to draw: see with_disturbance")
-    if not isinstance(method, Exact) or held.delay is not None or held.discrete is None:
-        raise ValueError("noise is drawn with solver='exact' and without a delay only")
-    L = square_root(process_noise(model, held.params, dt))
+    if held.delay is not None:
+        raise ValueError("noise is drawn without a delay only")
     n = jax.tree.leaves(held.inputs)[0].shape[0]
+    dtype, states = jax.tree.leaves(held.inputs)[0].dtype, len(naming.names(model.State))
+    if not isinstance(method, Exact) or held.discrete is None:
+        draws = jax.random.normal(key, (n, states), dtype)
+        held = held._replace(inputs=(held.inputs, tuple(draws.T)))
+        return Noisy(method, functools.partial(_kick, model, held.params, held.dt)), held
+    L = square_root(process_noise(model, held.params, dt))
     draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
     rows = tuple((*b, *row) for b, row in zip(held.discrete.Bd, L, strict=True))
-    return held._replace(
+    return method, held._replace(
         inputs=(held.inputs, tuple(draws.T)), discrete=held.discrete._replace(Bd=rows)
     )
+
+
+def _kick(model: Model, params: Any, dt: Any, state: Any, inputs: Any, draws: Any) -> Any:
+    """The state after a sample with the noise of that sample, of the model linearised there."""
+    names = naming.names(model.State)
+    x = jnp.stack([getattr(state, n) for n in names])
+
+    def rates(x: Array) -> Array:
+        at = model.State(**{n: x[i] for i, n in enumerate(names)})
+        found = naming.asdict(model.vector_field(params, at, inputs))
+        return jnp.stack([jnp.asarray(found[n], x.dtype) for n in names])
+
+    assert model.noise is not None
+    given = naming.asdict(model.noise(params))
+    g = jnp.stack([jnp.asarray(given[n], x.dtype) for n in names])
+    L = square_root(van_loan(jax.jacfwd(rates)(x), g, dt))
+    new = x + L @ jnp.stack(draws)
+    return model.State(**{n: new[i] for i, n in enumerate(names)})
 
 
 def _term(model: Model) -> dfx.ODETerm:

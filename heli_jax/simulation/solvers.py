@@ -189,6 +189,41 @@ class PerSample(dfx.AbstractSolver):
         return y, result
 
 
+class Noisy(dfx.AbstractSolver):
+    """A per-sample solver whose state is kicked after every sample.
+
+    The inputs are (the model's, standard normal numbers); kick(state, held inputs, numbers of that
+    sample) gives the new state.
+    """
+
+    solver: dfx.AbstractSolver
+    kick: Callable[..., Any]
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
+        dfx.LocalLinearInterpolation
+    )
+
+    def order(self, terms: Any) -> int | None:
+        return self.solver.order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return y0
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+    ) -> Any:
+        inputs, draws = args.inputs
+        held = args._replace(inputs=inputs)
+        y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
+        k = _sample(t0)
+        y1 = self.kick(y, at(inputs, k), at(draws, k))
+        return y1, None, {"y0": y0, "y1": y1}, None, result
+
+
 class Accumulating(dfx.AbstractSolver):
     """A per-sample solver that carries a running value beside the state.
 

@@ -1,5 +1,6 @@
 """simulate against scipy.signal, scipy.integrate and finite differences."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -13,6 +14,7 @@ import scipy.linalg
 import scipy.signal
 
 from heli_jax import Flight, Helicopter, Model, accumulate, load_vehicle, models, naming, simulate
+from heli_jax.dynamics.disturbance import with_disturbance
 from tests.dynamics.paper import BENCH, matrices, rates, scattered
 
 DT, N = 0.02, 60
@@ -378,14 +380,29 @@ def test_wrong_arguments(bench30, model, inputs, how, said):
         simulate(model, bench30, models.roll.Inputs(inputs), **how)
 
 
-def test_noise_needs_the_exact_solver_and_no_delay(bench30):
-    from heli_jax.dynamics.disturbance import with_disturbance
-
+def test_noise_needs_fixed_steps_without_a_delay(bench30):
     model = with_disturbance(STAND, "roll")
     p = model.Params(**naming.asdict(bench30))
-    for how in ({"solver": "rk4"}, {"delay": jnp.asarray(0.01)}):
-        with pytest.raises(ValueError, match="noise is drawn with solver='exact' and without a"):
-            simulate(model, p, models.roll.Inputs(U), dt=DT, key=jax.random.key(0), **how)
+    with pytest.raises(ValueError, match="noise is drawn without a delay"):
+        simulate(
+            model, p, models.roll.Inputs(U), dt=DT, key=jax.random.key(0), delay=jnp.asarray(0.01)
+        )
+
+
+def test_noise_of_a_nonlinear_model_is_that_of_its_linearisation(bench30):
+    """On a linear model it is the exact one, draw by draw."""
+    model = with_disturbance(STAND, "roll")
+    p = model.Params(**naming.asdict(bench30), sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(0.5))
+    key, inputs = jax.random.key(3), models.roll.Inputs(U)
+    exact = simulate(model, p, inputs, dt=DT, key=key)
+    stepped = simulate(
+        dataclasses.replace(model, linear=False), p, inputs, dt=DT, key=key, substeps=16
+    )
+    assert float(np.std(np.asarray(exact.states.w1_roll))) > 0.1
+    for name in ("phi", "dphi", "w1_roll"):
+        a = np.asarray(getattr(exact.states, name))
+        b = np.asarray(getattr(stepped.states, name))
+        np.testing.assert_allclose(b, a, rtol=0, atol=1e-6 * np.std(a))
 
 
 def test_missing_input_of_a_flight_is_named(bench30):

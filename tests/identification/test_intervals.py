@@ -1,0 +1,91 @@
+"""Profile, bootstrap and NUTS against the Gaussian interval, and where they part from it."""
+
+import dataclasses
+import importlib.util
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from heli_jax import Free, Prior, Problem, fit, models
+from heli_jax.identification.intervals import apart, intervals
+from heli_jax.identification.profile import profile
+from tests.identification.bench import BENCH, record, vehicle
+
+FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "kappa": Free(3.0)}
+
+
+def made(*, n=400, noise=2e-3, free=FREE, **how):
+    flight = record(BENCH, seed=3, n=n, noise=noise)
+    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free, **how))
+
+
+@pytest.fixture(scope="module")
+def white():
+    return made()
+
+
+def test_on_white_noise_all_agree(white):
+    bayes = importlib.util.find_spec("blackjax") is not None
+    found = intervals(white, profiles=list(FREE), runs=400, draws=400 if bayes else 0)
+    assert found.sentences == ()
+    for by in found.by_parameter.values():
+        assert set(by) == {"gaussian", "profile", "bootstrap", *(["nuts"] if bayes else [])}
+        for interval in by.values():
+            assert apart(by["gaussian"], interval) < 0.15
+    if bayes:
+        assert found.posterior is not None
+        assert found.posterior.trusted
+
+
+def test_the_profile_is_the_likelihood_of_the_others_at_their_best(white):
+    """A point of the profile is a fit with that parameter held."""
+    found = profile(white, ["Ixx"], points=5)["Ixx"]
+    problem = Problem(
+        models.roll_on_stand,
+        vehicle({**BENCH, "Ixx": float(found.values[1])}),
+        [record(BENCH, seed=3, n=400)],
+        {n: f for n, f in FREE.items() if n != "Ixx"},
+    )
+    held = fit(problem)
+    lost = 2.0 * (white.log_likelihood - held.log_likelihood)
+    assert found.deviance[1] == pytest.approx(lost, rel=0.05)
+    assert np.all(np.diff(found.deviance[:3]) < 0)
+    assert np.all(np.diff(found.deviance[2:]) > 0)
+
+
+def test_few_samples_are_told_apart():
+    poor = made(n=200, noise=0.03, free={n: FREE[n] for n in ("Ixx", "If")})
+    found = intervals(poor, profiles=["Ixx"], runs=100)
+    assert any("Ixx" in s and "believe the" in s for s in found.sentences)
+
+
+def test_a_prior_is_drawn_anew(white):
+    free = {**FREE, "a": Free(5.0, prior=Prior(5.1, 0.3))}
+    resting = made(free=free)
+    found = intervals(resting, runs=100)
+    low, high = found.by_parameter["a"]["bootstrap"]
+    width = 2 * scipy.stats.norm.ppf(0.975) * 0.3
+    assert high - low == pytest.approx(width, rel=0.25)
+
+
+def test_coloured_residuals_are_told(white):
+    doubtful = dataclasses.replace(white, coloured=True)
+    found = intervals(doubtful, profiles=["If"])
+    assert any("coloured" in s for s in found.sentences)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"profiles": ["mass"]}, "profile of mass: wanted is one of Ixx, If, kappa"),
+        ({"runs": 5}, "bootstrap: the data do not determine"),
+    ],
+)
+def test_refused(white, how, words):
+    one = white
+    if "runs" in how:
+        lost = {n: e._replace(sd=None) for n, e in white.estimates.items()}
+        one = dataclasses.replace(white, estimates=lost)
+    with pytest.raises(ValueError, match=words):
+        intervals(one, **how)

@@ -1,0 +1,41 @@
+"""Agreement and whiteness against their definitions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from heli_jax.identification.metrics import metrics, noise_guess, whiteness
+
+SIGNAL = np.sin(0.1 * np.arange(500))
+
+
+@given(st.floats(-2.0, 2.0), st.floats(0.1, 3.0), st.floats(1e-3, 1.0))
+def test_theils_parts_make_one(shift, factor, noise):
+    rng = np.random.default_rng(0)
+    m = metrics(SIGNAL, shift + factor * SIGNAL + noise * rng.standard_normal(500))
+    assert m.bias + m.variance + m.covariance == pytest.approx(1.0)
+    assert min(m.bias, m.variance, m.covariance) > -1e-12
+
+
+def test_theils_parts_name_the_error():
+    assert metrics(SIGNAL, SIGNAL + 1.0).bias == pytest.approx(1.0)
+    centred = SIGNAL - SIGNAL.mean()
+    assert metrics(centred, 2.0 * centred).variance == pytest.approx(1.0)
+    rng = np.random.default_rng(1)
+    noisy = metrics(SIGNAL, SIGNAL + 0.01 * rng.standard_normal(500))
+    assert noisy.covariance > 0.95
+
+
+def test_missing_samples_are_left_out():
+    rng = np.random.default_rng(2)
+    model = SIGNAL + 0.1 * rng.standard_normal(500)
+    gone = rng.uniform(size=500) < 0.2
+    assert metrics(np.where(gone, np.nan, SIGNAL), model) == metrics(SIGNAL[~gone], model[~gone])
+    noise = rng.standard_normal(5000)
+    noise[::7] = np.nan
+    assert whiteness(noise).white
+    assert not whiteness(np.cumsum(np.nan_to_num(noise))).white
+    smooth = np.sin(0.01 * np.arange(5000)) + 0.01 * np.nan_to_num(noise)
+    smooth[::7] = np.nan
+    assert noise_guess(smooth) == pytest.approx(0.01, rel=0.2)

@@ -1,0 +1,42 @@
+"""The acceptance card: every gate there, judged as its number says."""
+
+import dataclasses
+import math
+
+from heli_jax.report.card import card, failed, summary
+
+
+def test_a_sound_fit_passes(sound):
+    fit, problem, _ = sound
+    lines = card(problem, fit)
+    assert failed(lines) == ()
+    asked = {g.what for g in lines}
+    assert {
+        "Cramér-Rao", "insensitivity", "condition number", "largest correlation", "VAF",
+        "NRMSE fit", "Theil coefficient", "Theil bias part", "Theil variance part",
+        "Theil covariance part", "whiteness of residuals (p)", "coherence",
+    } == asked  # fmt: skip
+    by = {(g.what, g.of): g for g in lines}
+    for name, one in fit.estimates.items():
+        assert one.sd is not None
+        assert math.isclose(by["Cramér-Rao", name].value, 100 * one.sd / one.value)
+        # Known others can only help.
+        assert by["insensitivity", name].value <= by["Cramér-Rao", name].value * (1 + 1e-9)
+
+
+def test_what_is_not_determined_fails(lost):
+    fit, problem, _ = lost
+    gone = failed(card(problem, fit))
+    assert {("Cramér-Rao", n) for n in fit.estimates} <= {(g.what, g.of) for g in gone}
+    assert any(g.what == "condition number" for g in gone)
+    assert "failed: " in summary(card(problem, fit))
+
+
+def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):
+    fit, problem, _ = sound
+    filtered = dataclasses.replace(fit, method="filter-error", one_step=fit.metrics)
+    lines = [g for g in card(problem, filtered) if g.of == "roll, simulated"]
+    assert lines
+    assert all(g.passed is None for g in lines)
+    judged = [g for g in card(problem, filtered) if g.of == "roll, one step ahead"]
+    assert any(g.passed for g in judged)
