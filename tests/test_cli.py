@@ -230,6 +230,23 @@ WRONG = {
         ["free.tau_w", "leave it out"],
     ),
     "forgetting": (lambda c: c.update(rls={"forgetting": 1.5}), ["rls.forgetting", "1.5"]),
+    "noise fixed and not stated": (
+        lambda c: (
+            c["disturbance"].update(fixed=["sigma_y"]),
+            c["flights"][0]["signals"]["outputs"]["roll"].pop("sd"),
+        ),
+        ["output 'roll'", "fixed (sigma_y) but not stated", "its sd"],
+    ),
+    "profile of what is fixed": (
+        lambda c: c["fit"].update(intervals={"profile": ["Iff"]}),
+        ["fit.intervals.profile", "'Iff' is not free", "did you mean 'If'"],
+    ),
+    "bootstrap with a time shift": (
+        lambda c: c["fit"].update(
+            intervals={"bootstrap": 10}, nuisance={"time_shift": True}
+        ),
+        ["fit.intervals.bootstrap", "time_shift"],
+    ),
 }  # fmt: skip
 BENCH_30 = yaml.safe_load((ROOT / "configs" / "vehicles" / "bench-30.yaml").read_text())
 
@@ -269,6 +286,55 @@ def test_an_input_that_never_moves(bench, capsys):
     log.write_text("\n".join(",".join([r[0], r[1] if i == 0 else "1.0", r[2]])
                              for i, r in enumerate(rows)) + "\n")  # fmt: skip
     refused(capsys, ["fit", bench, "--out", bench.parent / "run"], "bench.csv", "x_roll")
+
+
+def test_missing_samples(bench, capsys):
+    """Some are skipped and told; more than half are refused."""
+    log = bench.parent / "bench.csv"
+    head, *rows = log.read_text().splitlines()
+    at = head.replace('"', "").split(",").index("phi")
+
+    def gone(row):
+        cells = row.split(",")
+        cells[at] = ""
+        return ",".join(cells)
+
+    few = [gone(r) if i % 50 in (3, 4) else r for i, r in enumerate(rows)]
+    log.write_text("\n".join([head, *few]))
+    out = bench.parent / "run"
+    how = ["--set", "fit.method=output-error"]
+    assert main(["fit", str(bench), *how, "--out", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "24 of 600 samples of 'phi' are missing" in shown.err
+    assert "It needs every sample" in shown.out
+    assert json.loads((out / "fit.json").read_text())["n_samples"] == 576
+    many = [gone(r) if i % 5 else r for i, r in enumerate(rows)]
+    log.write_text("\n".join([head, *many]))
+    assert main(["fit", str(bench), "--out", str(bench.parent / "other")]) == 2
+    assert "output 'roll' is missing in 80 % of its samples" in capsys.readouterr().err
+
+
+def test_comparison_and_intervals_by_configuration(bench, capsys):
+    out = bench.parent / "run"
+    how = [
+        "--set", "fit.compare=true", "--set", "fit.intervals.profile=[Ixx]",
+        "--set", "fit.intervals.bootstrap=16", "--set", "rls=null",
+    ]  # fmt: skip
+    assert main(["fit", str(bench), *how, "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "two poles" in shown
+    assert "bootstrap" in shown
+    assert "acceptance card:" in shown
+    content = json.loads((out / "fit.json").read_text())
+    assert {c["name"] for c in content["models"]["candidates"]} == {
+        "no disturbance", "one pole", "two poles",
+    }  # fmt: skip
+    assert set(content["intervals"]["by_parameter"]["Ixx"]) == {"gaussian", "profile", "bootstrap"}
+    assert content["acceptance"]
+    page = (out / "report.html").read_text()
+    assert "Which model" in page
+    assert "Acceptance card" in page
+    assert (out / "figures" / "intervals.svg").exists()
 
 
 def test_usage_and_places_to_write(bench, capsys):

@@ -30,6 +30,7 @@ from heli_jax.identification.noise import (
     Settled,
     evaluation,
     first_noise,
+    innovation_sums,
     log_likelihood,
     noise_unknowns,
 )
@@ -85,20 +86,21 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     held = tuple(f for f in problem.flights if f.hold_out)
     validation = _validation(problem, layout, best.z, noise, held) if held else ()
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
+    ill = _ill_conditioned(layout, e, sds)
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
     notes = [
         *excitation.sampling(problem, reached),
         *_disturbance_notes(settled.ratio if none else None),
-        *_filter_notes(layout, noise, e, sds),
+        *_filter_notes(layout, noise, e, n, ill),
         *stated_noise_notes(problem, sds),
         *bound_notes(estimates),
     ]
     return Fit(
         model=problem.model.name,
         method=problem.method,
-        status=_status(best, usable, verdict),
+        status="not-converged" if ill else _status(best, usable, verdict),
         n_samples=n,
         estimates=estimates,
         nuisance=nuisance,
@@ -170,23 +172,43 @@ def _disturbance_notes(ratio: float | None) -> list[str]:
     ]
 
 
+_DIGITS = 1e13
+"""Variance of an innovation over that of the measurement beyond which float64 has no digits left
+for what the measurement says of the state."""
 _TOLERANCE = 1e-6
 
 
-def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, sds: dict[str, float]) -> list[str]:
-    """A filter whose variances are no variances any more has lost its digits."""
+def _ill_conditioned(layout: Layout, e: Evaluation, sds: dict[str, float]) -> bool:
+    """Whether the filter has lost its digits: variances that are none, or beyond all digits."""
     if not layout.filtered:
-        return []
-    smallest = min(
-        float(np.min(v, initial=np.inf, where=np.isfinite(v))) for v in _variances(e, sds)
+        return False
+    found = np.concatenate(_variances(e, sds))
+    found = found[~np.isnan(found)] if np.isfinite(e.r).all() else found
+    return bool(
+        not found.size
+        or not np.isfinite(found).all()
+        or found.min() < 1.0 - _TOLERANCE
+        or found.max() > _DIGITS
     )
-    broken = any(not np.isfinite(v).any() for v in _variances(e, sds))
-    if not broken and smallest > 1.0 - _TOLERANCE:
+
+
+def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, n: int, ill: bool) -> list[str]:
+    """What is wrong with the filter, and the remedy."""
+    if ill:
+        return [
+            "The Kalman filter is ill-conditioned: next to the disturbance the measurement noise "
+            "is too small for the digits of a computer. These numbers are no result. State a "
+            "measurement noise (sd) of at least the log's resolution, or begin with a smaller "
+            "sigma_w."
+        ]
+    if not layout.filtered or layout.concentrated:
+        return []
+    size = float(np.sqrt(innovation_sums(e, noise)[0] / n))
+    if 0.8 < size < 1.25:
         return []
     return [
-        "The Kalman filter is ill-conditioned here (the variance of an innovation is below that of "
-        "the measurement noise alone): its numbers cannot be relied on. State the noise (sd) of "
-        "the outputs and fix it (disturbance.fixed: [sigma_y]), or fix tau_w."
+        f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
+        "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
     ]
 
 

@@ -177,3 +177,28 @@ def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
     assert found.status == "converged"
     assert found.white
     assert all(abs(e) < 4 for e in errors(found, params).values())
+
+
+def test_noise_that_cannot_be_is_told(bench30):
+    model, _, start, flight = made(bench30, 1)
+    start = replace(start, sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(1.0))
+
+    def run(sd):
+        return fit(
+            Problem(
+                model,
+                start,
+                [dataclasses.replace(flight, sd={"roll": sd})],
+                FREE,
+                method="filter-error",
+                fixed_noise=("sigma_w", "tau_w", "sigma_y"),
+            ),
+            max_steps=30,
+        )
+
+    too_small = run(2e-4)
+    assert any("times as large as the fixed noise" in note for note in too_small.notes)
+    no_digits = run(1e-13)
+    assert no_digits.status == "not-converged"
+    assert any("ill-conditioned" in note for note in no_digits.notes)
+    assert all(np.isfinite(e.value) for e in no_digits.estimates.values())
