@@ -1,6 +1,17 @@
 """float64, strict dtypes and ranks, checked shapes, and examples that are the same every time."""
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
+
+# Before JAX: what one test process has compiled serves the others of the same run.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _compiled = tempfile.mkdtemp(prefix="heli_jax-tests-")
+    atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import hypothesis
 import jax
