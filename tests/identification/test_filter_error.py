@@ -9,6 +9,7 @@ import pytest
 
 from heli_jax import Flight, Free, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.identification.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
 from tests.dynamics.paper import BENCH, matrices
@@ -202,3 +203,21 @@ def test_noise_that_cannot_be_is_told(bench30):
     assert no_digits.status == "not-converged"
     assert any("ill-conditioned" in note for note in no_digits.notes)
     assert all(np.isfinite(e.value) for e in no_digits.estimates.values())
+
+
+def test_a_flight_held_out_is_predicted_and_not_fitted(bench30):
+    model, _, start, flight = made(bench30, 1)
+    other = dataclasses.replace(made(bench30, 2)[3], hold_out=True, name="held")
+    both = fit(Problem(model, start, [flight, other], FREE, method="filter-error"))
+    alone = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+    assert both.n_samples == N
+    for name, one in both.estimates.items():
+        assert one.value == pytest.approx(alone.estimates[name].value, rel=1e-6)
+    assert both.one_step_validation["roll"].rmse == pytest.approx(
+        both.one_step["roll"].rmse, rel=0.1
+    )
+    assert both.one_step_validation["roll"].vaf > 0.99
+    assert both.validation["roll"].vaf < both.one_step_validation["roll"].vaf
+    held = both.signals[1]
+    assert held.hold_out
+    assert whiteness(held.error("roll")).white
