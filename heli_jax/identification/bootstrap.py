@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.identification import coordinates
-from heli_jax.identification.layout import Data, Reached, unpack
+from heli_jax.identification.layout import Data, Reached, unpack, value_of
 from heli_jax.identification.optimise import optimise_many
 from heli_jax.identification.residual import driven, predict
 from heli_jax.identification.result import Fit
@@ -43,9 +42,8 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     at = fit.reached
     if at.layout.shift:
         raise ValueError("bootstrap: not available with a free time shift")
-    lost = [n for n, e in fit.estimates.items() if e.sd is None]
-    if lost:
-        raise ValueError(f"bootstrap: the data do not determine {', '.join(lost)}")
+    if fit.lost:
+        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.lost)}")
     rng = np.random.default_rng(seed)
     outputs = _records(fit, at, runs, seed, rng)
     values = np.array([fit.estimates[n].value for n in at.layout.free])
@@ -63,11 +61,10 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     each = (outputs, jnp.asarray(means, at.z.dtype))
     ends = optimise_many(at, data, starts, each, batch=_BATCH)
     fine = np.asarray(ends.converged)
-    found = {}
-    for i, name in enumerate(at.layout.free):
-        args = (at.data.sign[i], at.data.low[i], at.data.high[i])
-        z = jnp.asarray(ends.z[fine, i])
-        found[name] = np.asarray(coordinates.to_value(at.layout.kinds[i], z, *args))
+    found = {
+        name: np.asarray(value_of(at.layout, at.data, i, jnp.asarray(ends.z[fine, i])))
+        for i, name in enumerate(at.layout.free)
+    }
     return Bootstrap(found, int(runs - fine.sum()))
 
 
@@ -107,7 +104,7 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> Any:
     def run(key: Array) -> Any:
         first, second = jax.random.split(key)
         drawn = jax.random.normal(first, (len(spread) or 1,), at.z.dtype)
-        random = {n: getattr(start, n) + s * d for (n, s), d in zip(spread.items(), drawn)}  # noqa: B905
+        random = {n: getattr(start, n) + s * drawn[j] for j, (n, s) in enumerate(spread.items())}
         begin = naming.replace(start, **random)
         return simulate(
             layout.model,

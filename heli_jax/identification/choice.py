@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 import scipy.special
 
 from heli_jax import naming
@@ -89,7 +88,7 @@ def alternatives(
             fixed = tuple(n for n in problem.fixed_noise if poles)
             if not poles:
                 # So little that it is none; the noise is then laid out as in the others.
-                known |= {"sigma_w": jnp.asarray(_nothing(problem)), "tau_w": jnp.asarray(1.0)}
+                known |= {"sigma_w": jnp.asarray(1e-9 * problem.motion), "tau_w": jnp.asarray(1.0)}
                 fixed = ("sigma_w", "tau_w", *(n for n in problem.fixed_noise if n == "sigma_y"))
             problems[words + ending] = replace(
                 problem,
@@ -104,11 +103,6 @@ def alternatives(
             if ending:
                 nested.append((words + ending, words))
     return Alternatives(problems, tuple(nested))
-
-
-def _nothing(problem: Problem) -> float:
-    size = max(float(np.nanstd(y)) for f in problem.training for y in f.outputs.values())
-    return 1e-9 * (size or 1.0)
 
 
 def choose(

@@ -17,7 +17,7 @@ FACTOR = 10.0
 ILL_CONDITIONED = 1e4
 STRONG = 0.99
 _TAKES_PART = 0.1  # of a unit direction: less is not worth naming
-_Z95 = 1.959963984540054
+Z95 = 1.959963984540054
 
 
 class Unknown(NamedTuple):
@@ -183,7 +183,7 @@ def _too_wide(
     total: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
 ) -> list[np.ndarray]:
     """Directions of full rank along which a 95 % interval still spans more than the factor."""
-    limit = math.log(FACTOR) / _Z95
+    limit = math.log(FACTOR) / Z95
     wide = [u.logarithmic and covariance[i, i] > limit**2 for i, u in enumerate(unknowns)]
     if not any(wide):
         return []
@@ -267,7 +267,7 @@ def _combination(
     log = sum(e * math.log(abs(u.value)) for u, e in zip(unknowns, exponents, strict=True) if e)
     value = math.exp(log) if abs(log) < 700 else math.inf
     sd = math.sqrt(max(0.0, float(exponents @ covariance @ exponents)))
-    reach = math.exp(min(_Z95 * sd, 700.0))
+    reach = math.exp(min(Z95 * sd, 700.0))
     return Combination(
         combination_name(by_name), by_name, value, value * sd, value / reach, value * reach
     )

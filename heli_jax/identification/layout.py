@@ -167,13 +167,15 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
     )
 
 
+def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
+    """The i-th free parameter at its coordinate z (any shape)."""
+    return coordinates.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
+
+
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     """Names for the entries of z."""
     q = len(layout.free)
-    params = {
-        name: coordinates.to_value(how, z[i], data.sign[i], data.low[i], data.high[i])
-        for i, (name, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
-    }
+    params = {name: value_of(layout, data, i, z[i]) for i, name in enumerate(layout.free)}
     gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
     at = q + len(layout.gains)
     shift = None

@@ -191,10 +191,6 @@ def _residual_sd(r: np.ndarray, y: Any, freedom: float) -> np.ndarray:
 def log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
     """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that is
     not given."""
-    return float(_log_likelihood(layout, data, noise, e))
-
-
-def _log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
     if not layout.filtered:
         found = [
             r[np.isfinite(np.asarray(flight.outputs[k]))]
@@ -208,8 +204,8 @@ def _log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> 
         for k, y in flight.outputs.items():
             logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
     if layout.concentrated:
-        return -0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs)
-    return -0.5 * (squares + n * np.log(2.0 * np.pi) + logs)
+        return float(-0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs))
+    return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
 
 
 def noise_unknowns(layout: Layout) -> int:

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.identification import coordinates
-from heli_jax.identification.layout import Data, Layout, Noise, Reached
+from heli_jax.identification.layout import Data, Layout, Noise, Reached, value_of
 from heli_jax.identification.noise import evaluation
 from heli_jax.identification.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
@@ -55,9 +54,8 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
             "nuts: blackjax is not installed, wanted is the extra: pip install 'heli_jax[bayes]'"
         ) from e
     at = fit.reached
-    lost = [n for n, e in fit.estimates.items() if e.sd is None]
-    if lost:
-        raise ValueError(f"nuts: the data do not determine {', '.join(lost)}")
+    if fit.lost:
+        raise ValueError(f"nuts: the data do not determine {', '.join(fit.lost)}")
     e = evaluation(at.layout, at.data, at.noise, at.z)
     # Whitened by the Gaussian approximation, so that all directions have size one.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
@@ -119,10 +117,10 @@ def _posterior(at: Reached, z: np.ndarray, divergent: int) -> Posterior:
     named = jnp.asarray(z[:, :, : len(at.layout.free)])
     rhat = np.max(np.asarray(diagnostics.potential_scale_reduction(named)))
     effective = np.min(np.asarray(diagnostics.effective_sample_size(named)))
-    found = {}
-    for i, name in enumerate(at.layout.free):
-        args = (at.data.sign[i], at.data.low[i], at.data.high[i])
-        found[name] = np.asarray(coordinates.to_value(at.layout.kinds[i], named[:, :, i], *args))
+    found = {
+        name: np.asarray(value_of(at.layout, at.data, i, named[:, :, i]))
+        for i, name in enumerate(at.layout.free)
+    }
     return Posterior(found, float(rhat), float(effective), divergent)
 
 

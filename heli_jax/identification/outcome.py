@@ -23,7 +23,7 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Data, Layout, Noise, Reached, layout_of, unpack
+from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -73,9 +73,11 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
     coloured = usable and not layout.filtered and not all(w.white for w in white.values())
-    wider = inflation(layout, data, e) if coloured else np.ones(layout.size)
+    wider = np.ones(layout.size)
     if coloured:
-        verdict = _widened(verdict, layout, data, e)
+        both = np.vstack([np.eye(layout.size), _along(verdict, layout, e)])
+        wider, of_combinations = np.split(inflation(layout, data, e, both), [layout.size])
+        verdict = _widened(verdict, of_combinations)
     named = estimates_of(problem, layout, e, verdict, quantile, wider)
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
@@ -100,7 +102,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     return Fit(
         model=problem.model.name,
         method=problem.method,
-        status="not-converged" if ill else _status(best, usable, verdict),
+        status=_status(best, usable and not ill, verdict),
         n_samples=n,
         estimates=estimates,
         nuisance=nuisance,
@@ -127,10 +129,8 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     )
 
 
-def _widened(verdict: Verdict, layout: Layout, data: Data, e: Evaluation) -> Verdict:
-    """The verdict with intervals of its combinations that allow for coloured residuals."""
-    if not verdict.combinations:
-        return verdict
+def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
+    """The logarithms of the verdict's combinations as directions (k, q) of the unknowns."""
     # What a logarithm gains by the optimiser's coordinate.
     slopes = np.asarray(e.slopes) / np.asarray(e.named)
     along = np.zeros((len(verdict.combinations), layout.size))
@@ -138,7 +138,11 @@ def _widened(verdict: Verdict, layout: Layout, data: Data, e: Evaluation) -> Ver
         for name, power in c.exponents.items():
             i = layout.named.index(name)
             along[k, i] = power * slopes[i]
-    wider = inflation(layout, data, e, along)
+    return along
+
+
+def _widened(verdict: Verdict, wider: np.ndarray) -> Verdict:
+    """The verdict with intervals of its combinations (k,) that many times as wide."""
     combinations = tuple(
         c._replace(
             sd=float(c.sd * w),

@@ -101,13 +101,17 @@ class Problem:
         """The parameters of the disturbance that filter error estimates, with their starts."""
         if self.method == "output-error":
             return {}
-        size = max(float(np.nanstd(y)) for f in self.training for y in f.outputs.values())
-        found = {"sigma_w": Free(size or 1.0), "tau_w": Free(1.0)}
+        found = {"sigma_w": Free(self.motion), "tau_w": Free(1.0)}
         for name in found:
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 found[name] = Free(value)
         return {n: f for n, f in found.items() if n not in self.fixed_noise}
+
+    @property
+    def motion(self) -> float:
+        """The largest standard deviation of a measured output; 1 where nothing moves."""
+        return max(float(np.nanstd(y)) for f in self.training for y in f.outputs.values()) or 1.0
 
     @property
     def training(self) -> tuple[Flight, ...]:

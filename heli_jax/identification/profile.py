@@ -6,13 +6,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax.identification import coordinates
-from heli_jax.identification.layout import Reached
+from heli_jax.identification.identifiability import Z95
+from heli_jax.identification.layout import Reached, value_of
 from heli_jax.identification.noise import evaluation
 from heli_jax.identification.optimise import optimise_many, residuals_count
 from heli_jax.identification.result import Fit
 
-_LIMIT = 1.959963984540054
 _WIDER = (3.0, 9.0)
 
 
@@ -38,13 +37,12 @@ def profile(
     Raises:
         ValueError: a name is not free, or the data do not determine it.
     """
-    lost = {n for n, e in fit.estimates.items() if e.sd is None}
     for name in names or ():
         if name not in fit.estimates:
             raise ValueError(f"profile of {name}: wanted is one of {', '.join(fit.estimates)}")
-        if name in lost:
+        if name in fit.lost:
             raise ValueError(f"profile of {name}: the data do not determine it")
-    chosen = names or [n for n in fit.estimates if n not in lost]
+    chosen = names or [n for n in fit.estimates if n not in fit.lost]
     return {name: _profile(fit.reached, name, points) for name in chosen}
 
 
@@ -67,15 +65,11 @@ def _profile(at: Reached, name: str, points: int) -> Profile:
         lost = n * (np.log(cost / first) if at.layout.concentrated else cost - first)
         deviance = np.maximum(lost - min(0.0, np.nanmin(lost, initial=0.0)), 0.0)
         root = np.sign(t) * np.sqrt(deviance)
-        low, high = (_crossing(root, starts[:, i], side * _LIMIT) for side in (-1, 1))
-        args = (at.data.sign[i], at.data.low[i], at.data.high[i])
-
-        def value(z: np.ndarray | float, args: tuple = args) -> np.ndarray:
-            how = at.layout.kinds[i]
-            return np.asarray(coordinates.to_value(how, jnp.asarray(z, at.z.dtype), *args))
-
-        bounds = sorted((float(value(low)), float(value(high))), key=lambda v: (np.isnan(v), v))
-        found = Profile(value(starts[:, i]), deviance, *bounds)
+        low, high = (_crossing(root, starts[:, i], side * Z95) for side in (-1, 1))
+        z = jnp.asarray([low, high, *starts[:, i]], at.z.dtype)
+        values = np.asarray(value_of(at.layout, at.data, i, z))
+        bounds = sorted((float(v) for v in values[:2]), key=lambda v: (np.isnan(v), v))
+        found = Profile(values[2:], deviance, *bounds)
         if np.isfinite(bounds).all():
             break
     return found

@@ -121,6 +121,11 @@ class Fit:
     timing: dict[str, float] = field(default_factory=dict)
 
     @property
+    def lost(self) -> tuple[str, ...]:
+        """The free parameters that the data do not determine."""
+        return tuple(n for n, e in self.estimates.items() if e.sd is None)
+
+    @property
     def aic(self) -> float:
         """Akaike's information criterion."""
         return 2.0 * self.unknowns - 2.0 * self.log_likelihood

@@ -46,18 +46,34 @@ def _sample(t: Any) -> Any:
     return jnp.floor(t + 1e-3).astype(int)
 
 
-class Exact(dfx.AbstractSolver):
-    """Exact zero-order hold for linear models: a recurrence with scalar coefficients."""
+class _Stateless(dfx.AbstractSolver):
+    """What all solvers here share: straight lines between samples, nothing kept between steps."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
         dfx.LocalLinearInterpolation
     )
 
-    def order(self, terms: Any) -> None:
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
         return None
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+
+class _Around(_Stateless):
+    """A solver of whole samples around another."""
+
+    solver: dfx.AbstractSolver
+
+    def order(self, terms: Any) -> int | None:
+        return self.solver.order(terms)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return y0
+
+
+class Exact(_Stateless):
+    """Exact zero-order hold for linear models: a recurrence with scalar coefficients."""
+
+    def order(self, terms: Any) -> None:
         return None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
@@ -92,19 +108,11 @@ def _dot(coefficients: Any, values: Any) -> Any:
     return total
 
 
-class RK4(dfx.AbstractSolver):
+class RK4(_Stateless):
     """The classical Runge-Kutta method of fourth order on named scalar leaves."""
-
-    term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
-        dfx.LocalLinearInterpolation
-    )
 
     def order(self, terms: Any) -> int:
         return 4
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
@@ -132,26 +140,14 @@ class RK4(dfx.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
-class PerSample(dfx.AbstractSolver):
+class PerSample(_Around):
     """Any solver inside one sample: the input held, `substeps` equal steps.
 
     With a delayed input the interval has two parts, before and after the change of the input,
     with `substeps` steps each.
     """
 
-    solver: dfx.AbstractSolver
     substeps: int = eqx.field(static=True)
-
-    term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
-        dfx.LocalLinearInterpolation
-    )
-
-    def order(self, terms: Any) -> int | None:
-        return self.solver.order(terms)
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
@@ -189,29 +185,14 @@ class PerSample(dfx.AbstractSolver):
         return y, result
 
 
-class Noisy(dfx.AbstractSolver):
+class Noisy(_Around):
     """A per-sample solver whose state is kicked after every sample.
 
     The inputs are (the model's, standard normal numbers); kick(state, held inputs, numbers of that
     sample) gives the new state.
     """
 
-    solver: dfx.AbstractSolver
     kick: Callable[..., Any]
-
-    term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
-        dfx.LocalLinearInterpolation
-    )
-
-    def order(self, terms: Any) -> int | None:
-        return self.solver.order(terms)
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return y0
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
@@ -224,29 +205,14 @@ class Noisy(dfx.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
-class Accumulating(dfx.AbstractSolver):
+class Accumulating(_Around):
     """A per-sample solver that carries a running value beside the state.
 
     y = (state, value); at each sample, before the step, value = update(value, state, held inputs
     at that sample, k). Nothing else of the trajectory is kept.
     """
 
-    solver: dfx.AbstractSolver
     update: Callable[..., Any] = eqx.field(static=True)
-
-    term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.LocalLinearInterpolation]] = (
-        dfx.LocalLinearInterpolation
-    )
-
-    def order(self, terms: Any) -> int | None:
-        return self.solver.order(terms)
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return y0
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
