@@ -12,6 +12,10 @@ from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Estimate
 
+_SAYS_NOTHING = 1e3
+"""A disturbance's standard deviation or memory whose interval reaches by this factor to either side
+is not determined."""
+
 
 def estimates_of(
     problem: Problem,
@@ -132,7 +136,8 @@ def flight_nuisances(
         reach = float(np.exp(min(quantile * relative, 700.0)))
         unit = naming.unit(layout.model.Params, name) or ""
         limits = (value / reach, value * reach)
-        out[name] = Estimate(value, value * relative, *limits, unit, starts[name].start, 0.0, False)
+        said = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
+        out[name] = Estimate(value, *said, unit, starts[name].start, 0.0, False)
     at = layout.weak
     for label, flight, outputs in zip(
         labels(problem.training), data.flights, layout.outputs, strict=True

@@ -117,20 +117,38 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
     if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
         return found
     none = without_disturbance(search, found)
-    if not bool(none.best.converged):
-        return found
-    ratio = 2.0 * (
-        log_likelihood(layout, data, noise, e)
-        - log_likelihood(
-            layout, data, none.noise, evaluation(layout, data, none.noise, none.best.z)
-        )
-    )
-    if not np.isfinite(ratio) or ratio < NO_DISTURBANCE:
-        return none._replace(trace=found.trace, ratio=ratio)
+    alone = evaluation(layout, data, none.noise, none.best.z)
+    if bool(none.best.converged) and not _corrects(alone, none.noise):
+        without = log_likelihood(layout, data, none.noise, alone)
+        ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
+        if np.isfinite(ratio) and ratio < -NO_DISTURBANCE:
+            # What has one unknown less cannot be better: the search with it went astray.
+            z = none.best.z.at[at].set(best.z[at])
+            [best] = search.run(none.noise, z[None, :])
+            again = settle(search, none.noise, best)
+            found = again._replace(trace=(*found.trace, *again.trace))
+            best, noise = found.best, found.noise
+            e = evaluation(layout, data, noise, best.z)
+            ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
+        if not np.isfinite(ratio) or ratio < NO_DISTURBANCE:
+            return none._replace(trace=found.trace, ratio=ratio)
+        found = found._replace(ratio=ratio)
     if not bool(best.converged):
         [best] = search.run(noise, best.z[None, :])
-        found = settle(search, noise, best)._replace(trace=found.trace)
-    return found._replace(ratio=ratio)
+        found = settle(search, noise, best)._replace(trace=found.trace, ratio=found.ratio)
+    return found
+
+
+def _corrects(e: Evaluation, noise: Noise) -> bool:
+    """Whether the filter corrects its state even where there is no disturbance.
+
+    It does in an unstable model, whose error grows from nothing: that is no output error.
+    """
+    return any(
+        float(np.nanmax(s / sd[n] ** 2)) > 1.01
+        for one, sd in zip(e.innovations, noise.sd, strict=True)
+        for n, s in one.variance.items()
+    )
 
 
 def without_disturbance(search: Search, found: Settled) -> Settled:

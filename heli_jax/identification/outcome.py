@@ -98,6 +98,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *_filter_notes(layout, noise, e, n, ill),
         *stated_noise_notes(problem, sds),
         *bound_notes(estimates),
+        *_useless_notes(_pooled(signals)),
     ]
     return Fit(
         model=problem.model.name,
@@ -165,6 +166,17 @@ def _absent(name: str, one: Estimate) -> Estimate:
     gone = name == "sigma_w"
     value = 0.0 if gone else one.value
     return one._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
+
+
+def _useless_notes(pooled: dict[str, Metrics]) -> list[str]:
+    """Where the model says less than no model at all."""
+    return [
+        f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
+        f"{m.vaf:.3g}): its parameters mean little. Are the columns, signs and units the right "
+        "ones, and the start values near?"
+        for name, m in pooled.items()
+        if m.vaf < 0
+    ]
 
 
 def _disturbance_notes(ratio: float | None) -> list[str]:

@@ -221,3 +221,16 @@ def test_a_flight_held_out_is_predicted_and_not_fitted(bench30):
     held = both.signals[1]
     assert held.hold_out
     assert whiteness(held.error("roll")).white
+
+
+def test_swapped_columns_are_told(bench30):
+    """Where stick and angle are exchanged, an unstable model that the filter holds fits best."""
+    model, _, start, flight = made(bench30, 3)
+    stick, angle = flight.inputs["x_roll"], flight.outputs["roll"]
+    swapped = Flight(
+        dt=DT, inputs={"x_roll": 1e-6 * angle}, outputs={"roll": np.deg2rad(1e6 * stick)}
+    )
+    found = fit(Problem(model, start, [swapped], FREE, method="filter-error"))
+    assert found.metrics["roll"].vaf < 0
+    assert any("worse than its mean" in n and "columns, signs" in n for n in found.notes)
+    assert not any("output error suffices" in n for n in found.notes)
