@@ -43,11 +43,24 @@ def intervals(
         draws: draws of each of four NUTS chains, 0 for none (needs the extra `bayes`).
         progress: told in words what is going on.
 
+    Where the fit did not converge or the data leave a parameter open, there are none of these,
+    and a sentence says so.
+
     Raises:
-        ValueError: a parameter that is not free or not determined, or a missing extra.
+        ValueError: a parameter that is not free, or a missing extra.
     """
     tell = progress or (lambda _: None)
     lines, booted, posterior = {}, None, None
+    missing = [n for n in profiles or () if n not in fit.estimates]
+    if missing:
+        raise ValueError(f"profile of {missing[0]}: wanted is one of {', '.join(fit.estimates)}")
+    said: list[str] = []
+    if fit.status != "converged" and (profiles or runs or draws):
+        why = "the fit did not converge"
+        if fit.lost:
+            why = f"the data do not determine {', '.join(fit.lost)}"
+        said = [f"No further intervals: {why}."]
+        profiles, runs, draws = None, 0, 0
     if profiles:
         tell(f"profile likelihood of {', '.join(profiles)}")
         lines = profile(fit, profiles)
@@ -68,8 +81,8 @@ def intervals(
             found[name]["bootstrap"] = booted.interval(name)
         if posterior is not None:
             found[name]["nuts"] = posterior.interval(name)
-    sentences = _sentences(fit, found, booted, posterior)
-    return Intervals(found, lines, booted, posterior, tuple(sentences))
+    said += _sentences(fit, found, booted, posterior)
+    return Intervals(found, lines, booted, posterior, tuple(said))
 
 
 def apart(one: tuple[float, float], other: tuple[float, float]) -> float:

@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 
 from heli_jax import Free, Prior, Problem, fit, models
+from heli_jax.identification.bootstrap import bootstrap
 from heli_jax.identification.intervals import apart, intervals
 from heli_jax.identification.profile import profile
 from tests.identification.bench import BENCH, record, vehicle
@@ -27,7 +28,7 @@ def white():
 
 def test_on_white_noise_all_agree(white):
     bayes = importlib.util.find_spec("blackjax") is not None
-    found = intervals(white, profiles=list(FREE), runs=400, draws=400 if bayes else 0)
+    found = intervals(white, profiles=list(FREE), runs=300, draws=300 if bayes else 0)
     assert found.sentences == ()
     for by in found.by_parameter.values():
         assert set(by) == {"gaussian", "profile", "bootstrap", *(["nuts"] if bayes else [])}
@@ -75,17 +76,17 @@ def test_coloured_residuals_are_told(white):
     assert any("coloured" in s for s in found.sentences)
 
 
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ({"profiles": ["mass"]}, "profile of mass: wanted is one of Ixx, If, kappa"),
-        ({"runs": 5}, "bootstrap: the data do not determine"),
-    ],
-)
-def test_refused(white, how, words):
-    one = white
-    if "runs" in how:
-        lost = {n: e._replace(sd=None) for n, e in white.estimates.items()}
-        one = dataclasses.replace(white, estimates=lost)
-    with pytest.raises(ValueError, match=words):
-        intervals(one, **how)
+def test_a_name_that_is_not_free_is_refused(white):
+    with pytest.raises(ValueError, match="profile of mass: wanted is one of Ixx, If, kappa"):
+        intervals(white, profiles=["mass"])
+
+
+def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
+    open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in white.estimates.items()}
+    poor = dataclasses.replace(white, estimates=open_, status="not-identifiable")
+    found = intervals(poor, profiles=["Ixx"], runs=5)
+    assert found.sentences == ("No further intervals: the data do not determine If.",)
+    assert found.profiles == {}
+    assert found.bootstrap is None
+    with pytest.raises(ValueError, match="bootstrap: the data do not determine If"):
+        bootstrap(poor, 5)
