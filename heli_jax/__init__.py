@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from heli_jax.analysis.linear import linearize as linearize
     from heli_jax.analysis.lti import c2d as c2d
     from heli_jax.analysis.lti import d2c as d2c
+    from heli_jax.analysis.trim import trim as trim
     from heli_jax.dynamics.model import Model as Model
     from heli_jax.flights import Flight as Flight
     from heli_jax.flights import Signal as Signal
@@ -48,6 +49,7 @@ _HOMES = {
     "c2d": "analysis.lti",
     "d2c": "analysis.lti",
     "linearize": "analysis.linear",
+    "trim": "analysis.trim",
 }
 
 

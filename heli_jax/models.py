@@ -5,6 +5,7 @@ import re
 import sys
 from pathlib import Path
 
+from heli_jax.dynamics.helicopter import helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import on_stand, pitch, roll
 from heli_jax.errors import InputError, nearest
@@ -12,7 +13,7 @@ from heli_jax.errors import InputError, nearest
 roll_on_stand = on_stand(roll)
 pitch_on_stand = on_stand(pitch)
 
-__all__ = ["by_name", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
+__all__ = ["by_name", "helicopter", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
 
 _SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
 

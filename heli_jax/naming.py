@@ -61,15 +61,20 @@ def replace(record: Any, **changes: Any) -> Any:
     return type(record)(**{**asdict(record), **changes})
 
 
-def extended(record: type, title: str, fields: Mapping[str, tuple[Any, Any]]) -> type:
-    """A record class with the fields of `record` and more of them, given as (annotation, default).
+def fields(record: type) -> dict[str, Any]:
+    """The annotations of a record class by name, in order."""
+    hints = get_type_hints(record, include_extras=True)
+    return {name: hints[name] for name in names(record)}
+
+
+def extended(record: type, title: str, more: Mapping[str, tuple[Any, Any]]) -> type:
+    """A record class with the fields of `record` and `more`, given as (annotation, default).
 
     The fields without a default come first, as Python wants.
     """
-    hints = {**get_type_hints(record, include_extras=True)}
-    known = {name: hints[name] for name in names(record)}
-    given = {**defaults(record), **{n: d for n, (_, d) in fields.items() if d is not None}}
-    known.update({n: annotation for n, (annotation, _) in fields.items()})
+    known = fields(record)
+    given = {**defaults(record), **{n: d for n, (_, d) in more.items() if d is not None}}
+    known.update({n: annotation for n, (annotation, _) in more.items()})
     ordered = sorted(known, key=lambda n: n in given)
     made: Any = NamedTuple(title, [(n, known[n]) for n in ordered])  # type: ignore[misc]
     made.__new__.__defaults__ = tuple(given[n] for n in ordered if n in given)

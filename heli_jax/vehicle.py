@@ -68,6 +68,11 @@ class Helicopter(eqx.Module):
     K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
     K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
     K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
+    Sx: Annotated[Scalar, "m^2", "fuselage drag area along the body, beyond the paper"] = _field(
+        0.0
+    )
+    Sy: Annotated[Scalar, "m^2", "fuselage drag area across, beyond the paper"] = _field(0.0)
+    Sz: Annotated[Scalar, "m^2", "fuselage drag area from above, beyond the paper"] = _field(0.0)
     Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
@@ -77,7 +82,7 @@ class Helicopter(eqx.Module):
 
 # A vehicle may leave out what the model at hand does not read; what it gives must be possible.
 _MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}
-_MAY_BE_ZERO = {"Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
+_MAY_BE_ZERO = {"Sx", "Sy", "Sz", "Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
 
 
 def of_helicopter(record: type) -> bool:

@@ -65,12 +65,14 @@ X_CELL_60 = {
 STAND = {"kappa": 4.0, "zeta": 0.2}
 SAME = {"B": 0.97, "cyclic_moment": 0.5, "Ixx_added": 0.0, "Iyy_added": 0.0}
 
+DRAG = {"Sx": 0.1, "Sy": 0.22, "Sz": 0.15}
+
 
 @pytest.mark.parametrize(
     ("file", "wanted"),
     [
-        ("bench-30.yaml", {**BENCH_30, **STAND, **SAME}),
-        ("x-cell-60.yaml", {**X_CELL_60, **SAME, "kappa": 0.0, "zeta": 0.0, "g": 9.80665}),
+        ("bench-30.yaml", {**BENCH_30, **STAND, **SAME, "Sx": 0.0, "Sy": 0.0, "Sz": 0.0}),
+        ("x-cell-60.yaml", {**X_CELL_60, **SAME, **DRAG, "kappa": 0.0, "zeta": 0.0, "g": 9.80665}),
     ],
 )
 def test_shipped_vehicles(file, wanted, vehicles_folder):

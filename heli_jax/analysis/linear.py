@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
@@ -21,9 +22,25 @@ class Linearization(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
+    def to_control(self) -> Any:
+        """The same as a `control.StateSpace` of python-control, with its names.
+
+        Raises:
+            ImportError: python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError as e:
+            raise ImportError(
+                "python-control is not installed, wanted is: pip install control"
+            ) from e
+        A, B, C, D = (np.asarray(M, np.float64) for M in self.matrices)
+        names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        return control.ss(A, B, C, D, **{k: list(v) for k, v in names.items()})
+
 
 def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) -> Linearization:
-    """The model's matrices at a state and inputs (all zeros unless given)."""
+    """The model's matrices at a state and inputs: its initial state and zeros unless given."""
     return Linearization(
         jacobians(model, params, state, inputs),
         naming.names(model.State),
@@ -36,6 +53,72 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
     """Eigenvalues of A [1/s], (n,) complex, slowest first. Concrete parameters only."""
     eigenvalues = np.linalg.eigvals(np.asarray(jacobians(model, params, state, inputs).A))
     return eigenvalues[np.argsort(np.abs(eigenvalues))]
+
+
+class Mode(NamedTuple):
+    """A motion of its own."""
+
+    eigenvalue: complex
+    """[1/s]; of a pair the one with the positive imaginary part"""
+    name: str
+    """what moves most, as 'roll with flybar roll'"""
+    frequency: float
+    """undamped, |eigenvalue| [rad/s]"""
+    damping: float
+    """ratio, 1 for a motion that does not oscillate, negative where it grows"""
+    shares: dict[str, float]
+    """of each state in the mode; they add up to 1"""
+
+
+# Which motion a state belongs to; others stand for themselves.
+_MOTIONS = {
+    "phi": "roll", "dphi": "roll", "theta": "pitch", "dtheta": "pitch", "psi": "yaw",
+    "dpsi": "yaw", "x": "surge", "dx": "surge", "y": "sway", "dy": "sway", "z": "heave",
+    "dz": "heave", "Omega": "rotor speed", "vi": "inflow",
+    "beta_roll": "flybar roll", "dbeta_roll": "flybar roll",
+    "beta_pitch": "flybar pitch", "dbeta_pitch": "flybar pitch",
+}  # fmt: skip
+_TAKES_PART = 0.2
+_STILL = 1e-9
+
+
+def eigenmodes(
+    model: Model, params: Any, state: Any = None, inputs: Any = None
+) -> tuple[Mode, ...]:
+    """The modes of the linearisation, slowest first, named by the states that take part.
+
+    A state's share is its participation factor |left x right eigenvector|, which does not depend
+    on units; in a mode that does not move (an eigenvalue of zero, a position or a heading) it is
+    the right eigenvector's alone. Concrete parameters only.
+    """
+    A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
+    values, left, right = scipy.linalg.eig(A, left=True)
+    largest = max(float(np.max(np.abs(values), initial=0.0)), 1.0)
+    names, found = naming.names(model.State), []
+    for i in np.argsort(np.abs(values), kind="stable"):
+        value = complex(values[i])
+        if value.imag < 0:
+            continue
+        still = abs(value) < _STILL * largest
+        part = np.abs(right[:, i]) if still else np.abs(left[:, i] * right[:, i])
+        part = part / np.sum(part)
+        shares = dict(zip(names, (float(p) for p in part), strict=True))
+        size = abs(value)
+        damping = 1.0 if still else -value.real / size
+        found.append(Mode(value, _mode_name(shares), size, damping, shares))
+    return tuple(found)
+
+
+def _mode_name(shares: dict[str, float]) -> str:
+    motions: dict[str, float] = {}
+    for name, share in shares.items():
+        motion = _MOTIONS.get(name, name)
+        motions[motion] = motions.get(motion, 0.0) + share
+    ordered = sorted(motions, key=lambda m: -motions[m])
+    part = [m for m in ordered if motions[m] >= _TAKES_PART]
+    # The body before what moves with it.
+    part = sorted(part or ordered[:1], key=lambda m: m.startswith(("flybar", "rotor", "inflow")))
+    return " with ".join(part)
 
 
 def transfer_function(

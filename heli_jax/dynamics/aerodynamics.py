@@ -1,10 +1,49 @@
-"""Forces and moments of the rotors."""
+"""Forces and moments of the rotors: eqs 10 and 13 to 20.
 
+Airspeeds are in m/s where the paper has ratios to R Omega ($\\mu$, $\\nu$, $\\lambda$): nothing is
+then divided by the rotor's speed, and a rotor at rest is an ordinary point.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from heli_jax.dynamics.inflow import induced_velocity
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
 
 
-def cyclic_moment(p: Helicopter, theta_cyc: Scalar) -> Scalar:
+class Flow(NamedTuple):
+    """The air that a rotor meets."""
+
+    V2: Scalar
+    """square of the speed in the plane of the rotor, (mu R Omega)^2 [m^2/s^2]"""
+    W: Scalar
+    """speed through the rotor against its thrust, -nu R Omega [m/s]"""
+    edgewise: Scalar
+    """mu R Omega times the cyclic pitch that meets it [rad m/s]; see `thrust`"""
+
+
+class RotorForce(NamedTuple):
+    """The thrust of a rotor and the flow that goes with it."""
+
+    T: Scalar
+    """thrust [N]"""
+    inflow: Scalar
+    """lambda R Omega, the whole flow through the rotor [m/s]"""
+    vi: Scalar
+    """induced velocity [m/s]"""
+    T0: Scalar
+    """thrust without induced velocity over rho pi R^2 [m^2/s^2]"""
+
+
+def solidity(R: Scalar, c: Scalar) -> Scalar:
+    r"""$\sigma = 2c/(\pi R)$ [1]."""
+    return (2.0 / math.pi) * c / R
+
+
+def cyclic_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar) -> Scalar:
     r"""Roll or pitch moment of the rotor for a cyclic blade angle, eqs 14-15 [N m].
 
     $$M = \tfrac12 \rho \Omega^2 a c R^4 \theta_{cyc}$$
@@ -12,4 +51,93 @@ def cyclic_moment(p: Helicopter, theta_cyc: Scalar) -> Scalar:
     The factor 1/2 is the named parameter `cyclic_moment`; blade-element theory averaged over a
     turn gives 1/8 for two blades, so an inertia found with 1/2 is a number of this model.
     """
-    return p.cyclic_moment * p.rho * p.Omega**2 * p.a * p.c * p.R**4 * theta_cyc
+    return (p.cyclic_moment * p.rho * p.a * p.c * p.R**4) * Omega**2 * theta_cyc
+
+
+def hub_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar, omega: Scalar) -> Scalar:
+    r"""Roll or pitch moment of a hingeless two-bladed rotor averaged over a turn [N m].
+
+    $$M = \tfrac18 \rho \Omega^2 a c R^4 (\theta_{cyc} - \omega/\Omega)$$
+
+    In place of eqs 14-15: blade-element theory's factor, and the rotor's damping of the body's
+    rate `omega` [rad/s].
+    """
+    return (0.125 * p.rho * p.a * p.c * p.R**4) * Omega * (Omega * theta_cyc - omega)
+
+
+def thrust(
+    p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, vi: Scalar | None = None
+) -> RotorForce:
+    r"""Thrust of the main rotor, eq. 13, with the inflow of momentum theory.
+
+    $$T = \tfrac12\rho\pi R^4\Omega^2 a\sigma
+      \left[\tfrac{B^3}{3}\theta_0 - \tfrac{B^2}{2}\lambda
+      + \tfrac{B^2}{2}\mu\,\theta_{edge}\right], \qquad \lambda = -\nu + \frac{v_i}{R\Omega}$$
+
+    `flow.edgewise` holds $\mu R\Omega\,\theta_{edge}$, where the paper has
+    $\theta_{edge} = (x_{roll} + x_{pitch})/L_1$. `vi` is found here unless it is given, as by
+    dynamic inflow.
+    """
+    half = 0.5 * p.a * solidity(p.R, p.c)
+    b = (half * 0.5 * p.B**2 * p.R) * Omega
+    lifting = (half * p.B**3 / 3.0 * p.R**2) * Omega**2 * theta0 + b * flow.edgewise
+    T0 = lifting - b * flow.W
+    if vi is None:
+        vi = induced_velocity(flow.V2, flow.W, T0, b)
+    return RotorForce((p.rho * math.pi * p.R**2) * (T0 - b * vi), flow.W + vi, vi, T0)
+
+
+def torque(p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, inflow: Scalar) -> Scalar:
+    r"""Torque of the main rotor [N m], the bracket of eq. 10.
+
+    $$Q = \rho\pi R^5\Omega^2\left[\tfrac18\sigma C_{d0} + \tfrac12 a\sigma\lambda
+      \left(\tfrac{B^3}{3}\theta_0 - \tfrac{B^2}{2}\lambda
+      + \tfrac{B^2}{4}\mu\,\theta_{edge}\right)\right]$$
+
+    `inflow` is $\lambda R\Omega$ [m/s].
+    """
+    sigma = solidity(p.R, p.c)
+    scale = p.rho * math.pi * p.R**3
+    lifting = (p.B**3 / 3.0 * p.R) * Omega * theta0 - (0.5 * p.B**2) * inflow
+    induced = inflow * (lifting + (0.25 * p.B**2) * flow.edgewise)
+    return (scale * sigma * p.Cd0 / 8.0 * p.R**2) * Omega**2 + (scale * 0.5 * p.a * sigma) * induced
+
+
+def tail_moment(p: Helicopter, Omega: Scalar, theta0T: Scalar) -> Scalar:
+    r"""Yaw moment of the tail rotor [N m], eqs 16 and 20; `Omega` is the main rotor's speed.
+
+    $$M_\psi = \tfrac12\rho\pi R_T^4\Omega_T^2 a_T\sigma_T\tfrac{B^3}{3}\theta_{0T}L_T,
+      \qquad \Omega_T = K_\Omega\Omega$$
+    """
+    scale = 0.5 * p.rho * math.pi * p.R_T**4 * p.a_T * solidity(p.R_T, p.c_T) * p.B**3 / 3.0
+    return (scale * p.L_T * p.K_Omega**2) * Omega**2 * theta0T
+
+
+def tail_thrust(p: Helicopter, Omega: Scalar, theta0T: Scalar, V2: Scalar, W: Scalar) -> RotorForce:
+    r"""Thrust of the tail rotor with inflow, in place of eq. 16's.
+
+    $$T_T = \tfrac12\rho\pi R_T^4\Omega_T^2 a_T\sigma_T
+      \left[\tfrac{B^3}{3}\theta_{0T} - \tfrac{B^2}{2}\lambda_T\right]$$
+
+    `V2` and `W` are as in `Flow`, in the tail rotor's plane and against its thrust.
+    """
+    half = 0.5 * p.a_T * solidity(p.R_T, p.c_T)
+    b = (half * 0.5 * p.B**2 * p.R_T * p.K_Omega) * Omega
+    T0 = (half * p.B**3 / 3.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2 * theta0T - b * W
+    vi = induced_velocity(V2, W, T0, b)
+    return RotorForce((p.rho * math.pi * p.R_T**2) * (T0 - b * vi), W + vi, vi, T0)
+
+
+def inflow_rate(p: Helicopter, force: RotorForce, V2: Scalar) -> Scalar:
+    r"""Acceleration of the induced velocity [m/s^2] where the air has inertia.
+
+    $$0.637\cdot\tfrac43\rho\pi R^3\,\dot v_i
+      = T - 2\rho\pi R^2 v_i\sqrt{V^2 + (W + v_i)^2}$$
+
+    Source: Carpenter and Fridovich, NACA TN 3044 (1953).
+    """
+    # A little flow is always there: the root has a derivative even where nothing moves.
+    through = jnp.sqrt(V2 + force.inflow**2 + 1e-16)
+    area = math.pi * p.R**2
+    excess = (1.0 / (p.rho * area)) * force.T - 2.0 * force.vi * through
+    return (1.0 / (0.637 * 4.0 / 3.0 * p.R)) * excess

@@ -1,7 +1,8 @@
-"""The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12).
+"""The Bell-Hiller flybar: mixing (eq. 11) and flapping (eq. 12), and the first-order bar.
 
 Factors of parameters alone stand in brackets of their own here and in the other equations: they
-are then computed once, outside the loop over time, and no division is left in it.
+are then computed once, outside the loop over time, and no division is left in it. Nothing is
+divided by the rotor's speed, so that a rotor at rest is an ordinary point.
 """
 
 from heli_jax.naming import Scalar
@@ -20,19 +21,43 @@ def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
 
 def flapping_rate_gain(p: Helicopter) -> Scalar:
     r"""$k_1 = \rho \Omega^2 a c (R_2^4 - R_1^4) / (8 I_f)$ [1/s^2]: eq. 12 divided by If."""
-    return p.rho * p.Omega**2 * p.a * p.c * (p.R2**4 - p.R1**4) / (8.0 * p.If)
+    return _paddle(p) * p.Omega**2
+
+
+def _paddle(p: Helicopter) -> Scalar:
+    return p.rho * p.a * p.c * (p.R2**4 - p.R1**4) / (8.0 * p.If)
 
 
 def flapping_acceleration(
-    p: Helicopter, x_cyc: Scalar, beta: Scalar, dbeta: Scalar, omega: Scalar
+    p: Helicopter, Omega: Scalar, x_cyc: Scalar, beta: Scalar, dbeta: Scalar, omega: Scalar
 ) -> Scalar:
     r"""Flapping acceleration of the flybar [rad/s^2], eq. 12.
 
     $$I_f \ddot\beta + \Omega^2 I_f \beta = \tfrac18 \rho \Omega^2 a c
       \left(\frac{x_{cyc}}{L_5} - \frac{\dot\beta + \omega}{\Omega}\right)(R_2^4 - R_1^4)$$
 
-    `omega` is the body's rate about the same axis [rad/s]. The paper's text prints
-    $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the denominator of eq. 23.
+    `Omega` is the rotor's speed, `omega` the body's rate about the same axis [rad/s]. The paper's
+    text prints $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the
+    denominator of eq. 23.
     """
-    pull = (1.0 / p.L5) * x_cyc - (1.0 / p.Omega) * (dbeta + omega)
-    return flapping_rate_gain(p) * pull - (p.Omega**2) * beta
+    pull = (Omega * (1.0 / p.L5)) * x_cyc - (dbeta + omega)
+    return (_paddle(p) * Omega) * pull - (Omega**2) * beta
+
+
+def flybar_time_constant(p: Helicopter, Omega: Scalar) -> Scalar:
+    r"""$\tau = 2/(K\Omega)$, $K = \rho a c (R_2^4 - R_1^4)/(4 I_f)$ [s].
+
+    Two paddles and the inertia of the whole bar, where eq. 12 has one paddle.
+    """
+    return 1.0 / (_paddle(p) * Omega)
+
+
+def flybar_rate(p: Helicopter, Omega: Scalar, x_cyc: Scalar, beta: Scalar, omega: Scalar) -> Scalar:
+    r"""Tilt rate of the flybar's plane seen from the body [rad/s]: the bar as it moves.
+
+    $$\dot\beta = (x_{cyc}/L_5 - \beta)/\tau - \omega$$
+
+    Eq. 12 is an equation of the rotating frame driven by inputs of the fixed one; averaged over a
+    turn the bar is of first order, with the time constant of `flybar_time_constant`.
+    """
+    return (_paddle(p) * Omega) * ((1.0 / p.L5) * x_cyc - beta) - omega

@@ -22,10 +22,13 @@ class StateSpace(NamedTuple):
 
 @eqx.filter_jit
 def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) -> StateSpace:
-    """The model's A, B, C, D at a state and inputs (all zeros unless given), by forward mode."""
+    """The model's A, B, C, D at a state and inputs, by forward mode.
+
+    Unless given the state is the model's initial one and the inputs are zero.
+    """
     dtype = jnp.result_type(*(jnp.asarray(v).dtype for v in jax.tree.leaves(params)))
     dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
-    x = zeros(model.State, dtype) if state is None else state
+    x = model.initial_state(params) if state is None else state
     u = zeros(model.Inputs, dtype) if inputs is None else inputs
 
     def stacked(record: Any) -> Array:

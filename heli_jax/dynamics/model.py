@@ -38,6 +38,8 @@ class Model(eqx.Module):
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
     """spread(params): standard deviation at the first sample of the states that are random there,
     by name; the others begin where `start` puts them"""
+    limits: Callable[[Any, Any, Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
+    """limits(params, state, inputs): by name, whether the range of validity is left there"""
 
     @property
     def spread_names(self) -> tuple[str, ...]:
@@ -102,3 +104,20 @@ def field_and_output(model: Model, params: Any, state: Any, inputs: Any) -> tupl
 def plain(record: Any) -> Any:
     """A record of concrete numbers as NumPy scalars: quicker than JAX outside jit."""
     return type(record)(**{n: np.float64(v) for n, v in naming.asdict(record).items()})
+
+
+def needed_but_missing(model: Model, params: Any) -> list[str]:
+    """The parameters that are NaN (not given) and that the model reads, in field order."""
+    params = plain(params)
+    open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    one = np.float64(1.0)
+    x = model.State(**dict.fromkeys(naming.names(model.State), one))
+    u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
+
+    def reads(name: str) -> bool:
+        filled = naming.replace(params, **{n: one for n in open_ if n != name})
+        with np.errstate(all="ignore"):
+            parts = field_and_output(model, filled, x, u)
+        return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
+
+    return [n for n in open_ if reads(n)]

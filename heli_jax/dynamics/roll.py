@@ -65,12 +65,12 @@ def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
     $$\ddot\phi = \frac{\rho\Omega^2 a c R^4}{2 I_{xx} L_1 (L_2+L_3)}
       (L_3 x_{roll} + L_2 L_4 \beta)$$
     """
-    return (1.0 / roll_inertia(p)) * cyclic_moment(p, cyclic_pitch(p, x_roll, beta))
+    return (1.0 / roll_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_roll, beta))
 
 
 def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
     """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll."""
-    return (1.0 / pitch_inertia(p)) * cyclic_moment(p, cyclic_pitch(p, x_pitch, beta))
+    return (1.0 / pitch_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_pitch, beta))
 
 
 def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
@@ -79,7 +79,7 @@ def _roll_field(p: Helicopter, s: RollState, u: RollInputs) -> RollState:
         phi=s.dphi,
         dphi=roll_acceleration(p, u.x_roll, s.beta_roll),
         beta_roll=s.dbeta_roll,
-        dbeta_roll=flapping_acceleration(p, u.x_roll, s.beta_roll, s.dbeta_roll, s.dphi),
+        dbeta_roll=flapping_acceleration(p, p.Omega, u.x_roll, s.beta_roll, s.dbeta_roll, s.dphi),
     )
 
 
@@ -89,7 +89,9 @@ def _pitch_field(p: Helicopter, s: PitchState, u: PitchInputs) -> PitchState:
         theta=s.dtheta,
         dtheta=pitch_acceleration(p, u.x_pitch, s.beta_pitch),
         beta_pitch=s.dbeta_pitch,
-        dbeta_pitch=flapping_acceleration(p, u.x_pitch, s.beta_pitch, s.dbeta_pitch, s.dtheta),
+        dbeta_pitch=flapping_acceleration(
+            p, p.Omega, u.x_pitch, s.beta_pitch, s.dbeta_pitch, s.dtheta
+        ),
     )
 
 
@@ -174,7 +176,7 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
     The second numerator $d_3 = k_2 (L_3\Omega^2 + L_2 L_4 k_1/L_5)$. num has 3, den 5 numbers.
     """
     k1 = flapping_rate_gain(p)
-    k2 = cyclic_moment(p, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
+    k2 = cyclic_moment(p, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
     share = p.Ixx / roll_inertia(p)
     c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
     kappa, zeta = (share * p.kappa, share * p.zeta) if stand else (0.0 * k1, 0.0 * k1)
@@ -211,7 +213,7 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
     k1 = c1 * p.Omega
     k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
     unit_a = naming.replace(p, a=1.0, If=1.0)
-    moment_per_a = cyclic_moment(unit_a, 1.0 / (p.L1 * (p.L2 + p.L3)))
+    moment_per_a = cyclic_moment(unit_a, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3)))
     over = f"a/{axis.inertia}"
     total = k2 / moment_per_a  # a over the whole inertia, what is added included
     ratios = {over: total * (inertia + added) / inertia, "a/If": k1 / flapping_rate_gain(unit_a)}

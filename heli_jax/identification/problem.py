@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.dynamics.model import Model, field_and_output, linear_misfit, plain
+from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.vehicle import impossible, of_helicopter
@@ -256,20 +255,3 @@ def _check_model(problem: Problem) -> None:
             f"model {problem.model.name} says linear=True, but its vector field or output is not "
             "linear in state and inputs at the start values"
         )
-
-
-def needed_but_missing(model: Model, params: Any) -> list[str]:
-    """The parameters that are NaN (not given) and that the model reads, in field order."""
-    params = plain(params)
-    open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
-    one = np.float64(1.0)
-    x = model.State(**dict.fromkeys(naming.names(model.State), one))
-    u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
-
-    def reads(name: str) -> bool:
-        filled = naming.replace(params, **{n: one for n in open_ if n != name})
-        with np.errstate(all="ignore"):
-            parts = field_and_output(model, filled, x, u)
-        return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
-
-    return [n for n in open_ if reads(n)]

@@ -1,42 +1,33 @@
 """simulate: a model, its parameters and inputs in; the trajectory out."""
 
+import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import blockwise, columns, matrix
 from heli_jax.simulation.discretize import discretize, process_noise, square_root, van_loan
+from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.solvers import (
     RK4,
     Accumulating,
+    Adaptive,
     Exact,
+    Fed,
     Held,
     Noisy,
     PerSample,
+    Stopping,
     at,
 )
-
-
-class Trajectory(NamedTuple):
-    """What a simulation gives, sample by sample; batched from outside by vmap."""
-
-    times: Float[Array, " N"]
-    """[s], from 0"""
-    states: Any
-    """the model's State with arrays (N,)"""
-    outputs: Any
-    """the model's Outputs with arrays (N,)"""
-    result: dfx.RESULTS
-    """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
-    finite: Bool[Array, ""]
-    """whether every state is a finite number"""
+from heli_jax.simulation.trajectory import Trajectory
 
 
 def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:
@@ -74,9 +65,11 @@ def simulate(
     controller: dfx.AbstractStepSizeController | None = None,
     delay: Any = None,
     adjoint: dfx.AbstractAdjoint | None = None,
-    max_steps: int = 1_000_000,
+    max_steps: int = 4096,
     key: Any = None,
     block: int = 1,
+    feedback: Callable[[Any, Any], Any] | None = None,
+    events: Mapping[str, Event] | None = None,
 ) -> Trajectory:
     """Simulate one machine; each input sample is held until the next (zero-order hold).
 
@@ -86,49 +79,75 @@ def simulate(
         solver: "exact" (linear models, the default there), "rk4" (the default elsewhere), or any
             diffrax solver.
         substeps: steps per sample for fixed-step solvers.
-        controller: a diffrax step-size controller makes the steps adaptive; they then end at
-            every change of the input (`jump_ts`).
-        delay: the inputs act this much later (+) or earlier (-) than given [s]; differentiable
-            with fixed steps (with adaptive ones its derivative is NaN).
+        controller: a diffrax step-size controller makes the steps adaptive, with Dopri8 unless
+            another solver is given; they end at every sample.
+        delay: the inputs act this much later (+) or earlier (-) than given [s]; differentiable.
             Before the first sample its value holds, after the last the last one's.
         adjoint: `diffrax.DirectAdjoint()` unless given: forward and reverse mode both work.
             `ForwardMode()` compiles faster, `RecursiveCheckpointAdjoint()` saves memory in
             reverse mode.
-        max_steps: bound on adaptive steps; where it ends a run, `result` says so.
+        max_steps: bound on adaptive steps a sample; where it ends a run, `result` says so.
         key: a JAX random key: the model's own noise is drawn with it, by the discrete process
             noise of a sample: exact for linear models with solver "exact", of the model linearised
             at each sample for others with fixed steps; without it there is none.
         block: samples per step of solver "exact", a power of two; 32 is three times as fast as 1
             for a single record, 1 is best for large batches.
+        feedback: feedback(state, inputs) -> Inputs that act, once a sample; `inputs` are the given
+            ones at that sample (references, or what is added).
+        events: by name, event(params, state, inputs) -> a number that is above zero while the run
+            goes on (see `heli_jax.simulation.events`). The first to fall to zero or below ends
+            the run: from there on the state stays as it was at that moment.
 
     Returns:
-        A Trajectory; a failed integration is in its `result` and `finite`, never an exception.
+        A Trajectory; a failed integration is in its `status`, never an exception.
 
     Raises:
-        ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, or a
-            key for a model without noise or another solver.
+        ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, a key
+            for a model without noise or with adaptive steps, or feedback with a delay.
     """
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = _start(model, params, initial_state, inputs, dt)
     adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
-    if controller is not None:
-        states, result = _adaptive(
-            model, params, inputs, dt, x0, solver, controller, delay, adjoint, max_steps
-        )
-    else:
-        method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay)
+    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay, controller)
+    if isinstance(method, Adaptive):
+        method = dataclasses.replace(method, adjoint=adjoint, max_steps=max_steps)
         if key is not None:
-            method, held = _with_noise(model, held, method, dt, key)
-        if block > 1:
-            _require_blocks(method, block)
-            states, result = blockwise(held, block, x0), dfx.RESULTS.successful
+            raise ValueError("noise is drawn with fixed steps only")
+    if feedback is not None:
+        if delay is not None:
+            raise ValueError("feedback is for runs without a delay only")
+        method = Fed(method, feedback)
+    if key is not None:
+        method, held = _with_noise(model, held, method, dt, key)
+    if block > 1:
+        _require_blocks(method, block, events)
+        states, result = blockwise(held, block, x0), dfx.RESULTS.successful
+    else:
+        states, result, dtype = None, None, jax.tree.leaves(x0)[0].dtype
+        if events:
+            over = functools.partial(any_over, events, params)
+            first = 1.0 - over(x0, at(inputs, 0)).astype(dtype)
+            stopping = Stopping(method, over)
+            (states, _), result = _stepwise(stopping, held, term, (x0, first), n, adjoint)
         else:
             states, result = _stepwise(method, held, term, x0, n, adjoint)
-    outputs = _outputs(model, params, states, inputs, dt, delay)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
+    acting = inputs
+    if delay is not None:
+        acting = acting_inputs(inputs, dt, delay, n)
+    if feedback is not None:
+        acting = jax.vmap(feedback)(states, inputs)
     times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
-    return Trajectory(times, states, outputs, result, finite)
+    end = NO_END
+    if events:
+        states, end = stopped(model, params, events, times, states, acting)
+    outputs = jax.vmap(lambda x, u: model.output(params, x, u))(states, acting)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
+    outside = {}
+    if model.limits is not None:
+        limits = model.limits
+        outside = jax.vmap(lambda x, u: limits(params, x, u))(states, acting)
+    return Trajectory(times, states, outputs, acting, result, finite, outside, *end)
 
 
 def accumulate(
@@ -157,7 +176,7 @@ def accumulate(
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = _start(model, params, initial_state, inputs, dt)
     dtype = jax.tree.leaves(x0)[0].dtype
-    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, None)
+    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, None, None)
 
     def per_sample(value: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
         return update(value, model.output(params, state, inputs_now), data_now)
@@ -210,10 +229,19 @@ def split_delay(delay: Any, dt: Any) -> tuple[Any, Any]:
 
 
 def _per_sample(
-    model: Model, params: Any, inputs: Any, dt: Any, solver: Any, substeps: int, delay: Any
+    model: Model,
+    params: Any,
+    inputs: Any,
+    dt: Any,
+    solver: Any,
+    substeps: int,
+    delay: Any,
+    controller: dfx.AbstractStepSizeController | None,
 ) -> tuple[dfx.AbstractSolver, Held, dfx.ODETerm]:
     """The solver, its arguments and the term for time counted in samples."""
-    method = _method(model, solver)
+    method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
+    if controller is not None and isinstance(method, Exact | RK4):
+        raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
     parts = None if delay is None else split_delay(delay, dt)
 
     term = _term(model)
@@ -223,14 +251,17 @@ def _per_sample(
         return method, Held(params, inputs, dt, parts, discretize(model, params, dt, late)), term
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, wanted is at least 1")
-    return PerSample(method, substeps), Held(params, inputs, dt, parts, None), term
+    held = Held(params, inputs, dt, parts, None)
+    if controller is not None:
+        return Adaptive(method, 1, controller, dfx.DirectAdjoint(), 4096), held, term
+    return PerSample(method, substeps), held, term
 
 
 def held_columns(
     model: Model, params: Any, inputs: Any, dt: Any, delay: Any
 ) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
     """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k."""
-    _, held, _ = _per_sample(model, params, inputs, dt, "exact", 1, delay)
+    _, held, _ = _per_sample(model, params, inputs, dt, "exact", 1, delay, None)
     assert held.discrete is not None
     B, U = columns(held)
     n = U.shape[0]
@@ -238,9 +269,9 @@ def held_columns(
     return matrix(held.discrete.Ad), U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
 
 
-def _require_blocks(method: Any, block: int) -> None:
-    if not isinstance(method, Exact):
-        raise ValueError("block is for solver='exact' only")
+def _require_blocks(method: Any, block: int, events: Any) -> None:
+    if not isinstance(method, Exact) or events:
+        raise ValueError("block is for solver='exact' without feedback and events only")
     if block & (block - 1):
         raise ValueError(f"block is {block}, wanted is a power of two")
 
@@ -254,9 +285,10 @@ def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tup
     n = jax.tree.leaves(held.inputs)[0].shape[0]
     dtype, states = jax.tree.leaves(held.inputs)[0].dtype, len(naming.names(model.State))
     if not isinstance(method, Exact) or held.discrete is None:
+        feedback = method.feedback if isinstance(method, Fed) else None
         draws = jax.random.normal(key, (n, states), dtype)
         held = held._replace(inputs=(held.inputs, tuple(draws.T)))
-        return Noisy(method, functools.partial(_kick, model, held.params, held.dt)), held
+        return Noisy(method, functools.partial(_kick, model, held.params, held.dt, feedback)), held
     L = square_root(process_noise(model, held.params, dt))
     draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
     rows = tuple((*b, *row) for b, row in zip(held.discrete.Bd, L, strict=True))
@@ -265,8 +297,12 @@ def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tup
     )
 
 
-def _kick(model: Model, params: Any, dt: Any, state: Any, inputs: Any, draws: Any) -> Any:
+def _kick(
+    model: Model, params: Any, dt: Any, feedback: Any, state: Any, inputs: Any, draws: Any
+) -> Any:
     """The state after a sample with the noise of that sample, of the model linearised there."""
+    if feedback is not None:
+        inputs = feedback(state, inputs)
     names = naming.names(model.State)
     x = jnp.stack([getattr(state, n) for n in names])
 
@@ -317,58 +353,6 @@ def _stepwise(
         throw=False,
     )
     return sol.ys, sol.result
-
-
-def _adaptive(
-    model: Model,
-    params: Any,
-    inputs: Any,
-    dt: Any,
-    x0: Any,
-    solver: Any,
-    controller: Any,
-    delay: Any,
-    adjoint: Any,
-    max_steps: int,
-) -> tuple[Any, dfx.RESULTS]:
-    method = _method(model, dfx.Dopri8() if solver is None else solver)
-    if isinstance(method, Exact | RK4):
-        raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
-    shift = jnp.zeros((), times.dtype) if delay is None else jnp.asarray(delay, times.dtype)
-    jumps = times + shift
-    clipped = dfx.ClipStepSizeController(controller, jump_ts=jumps)
-
-    def field(t: Any, x: Any, args: Any) -> Any:
-        # A step ends one float before a jump and the next begins one after it, so the sample is
-        # told apart exactly; the first sample holds before the first jump.
-        params, inputs, jumps = args
-        k = jnp.searchsorted(jumps, jax.lax.stop_gradient(t), side="right") - 1
-        return model.vector_field(params, x, at(inputs, k))
-
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(field),
-        method,
-        t0=times[0],
-        t1=times[-1],
-        dt0=None,
-        y0=x0,
-        args=(params, inputs, jumps),
-        saveat=dfx.SaveAt(ts=times),
-        stepsize_controller=clipped,
-        max_steps=max_steps,
-        adjoint=adjoint,
-        throw=False,
-    )
-    return sol.ys, sol.result
-
-
-def _outputs(model: Model, params: Any, states: Any, inputs: Any, dt: Any, delay: Any) -> Any:
-    """The outputs at the samples, with the input that acts there."""
-    if delay is not None:
-        inputs = acting_inputs(inputs, dt, delay, jax.tree.leaves(inputs)[0].shape[0])
-    return jax.vmap(lambda x, u: model.output(params, x, u))(states, inputs)
 
 
 def acting_inputs(inputs: Any, dt: Any, delay: Any, n: int) -> Any:

@@ -185,6 +185,70 @@ class PerSample(_Around):
         return y, result
 
 
+class Adaptive(PerSample):
+    """A diffrax solver with a step-size controller inside one sample: the input held."""
+
+    controller: dfx.AbstractStepSizeController
+    adjoint: dfx.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+
+    def _steps(self, terms: Any, h: Any, y0: Any, now: Now) -> Any:
+        sol = dfx.diffeqsolve(
+            terms,
+            self.solver,
+            t0=jnp.zeros_like(h),
+            t1=self.substeps * h,
+            dt0=None,
+            y0=y0,
+            args=now,
+            saveat=dfx.SaveAt(t1=True),
+            stepsize_controller=self.controller,
+            max_steps=self.max_steps,
+            adjoint=self.adjoint,
+            throw=False,
+        )
+        # A sample cut short by a delay may have no length at all, and then nothing happens.
+        reached = jax.tree.map(lambda a, b: jnp.where(h > 0, a[-1], b), sol.ys, y0)
+        fine = dfx.RESULTS.where(h > 0, sol.result, dfx.RESULTS.successful)
+        return reached, fine
+
+
+class Fed(_Around):
+    """A per-sample solver whose inputs are a function of the state at the sample.
+
+    feedback(state, given inputs of that sample) gives the inputs that are held.
+    """
+
+    feedback: Callable[..., Any]
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+    ) -> Any:
+        u = self.feedback(y0, at(args.inputs, _sample(t0)))
+        held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
+        return self.solver.step(terms, t0, t1, y0, held, solver_state, made_jump)
+
+
+class Stopping(_Around):
+    """A per-sample solver that stays where it is after the first sample at which `over` holds.
+
+    y = (state, going), where going is 1 until then and 0 from there on.
+    """
+
+    over: Callable[..., Any]
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+    ) -> Any:
+        state, going = y0
+        new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
+        new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
+        result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
+        ended = self.over(new, at(args.inputs, _sample(t0)))
+        y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
+        return y1, None, {"y0": y0, "y1": y1}, None, result
+
+
 class Noisy(_Around):
     """A per-sample solver whose state is kicked after every sample.
 

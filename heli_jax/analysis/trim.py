@@ -1,0 +1,254 @@
+"""Trim: the state and the sticks at which a helicopter stays in a steady flight."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model, needed_but_missing, zeros
+
+STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
+"""Where the sticks end, unless `trim` is told otherwise; the cyclic ones are lengths, and open."""
+
+_TOLERANCE = 1e-10
+_POLISH = 3
+_TRIES = 12
+_SCALE = {"phi": 0.1, "theta": 0.1, "beta_roll": 0.1, "beta_pitch": 0.1, "vi": 1.0}
+
+
+class Condition(NamedTuple):
+    """A steady flight; speeds over the ground in m/s, along the heading and across it."""
+
+    ahead: Any = 0.0
+    aside: Any = 0.0
+    """to the right"""
+    climb: Any = 0.0
+    heading: Any = 0.0
+    """psi [rad]"""
+
+
+class Trim(NamedTuple):
+    """A steady flight that a vehicle can fly."""
+
+    state: Any
+    """the model's State; x, y and z are zero"""
+    inputs: Any
+    """the model's Inputs"""
+    residual: Any
+    """the largest acceleration left, in m/s^2 or rad/s^2"""
+
+
+HOVER = Condition()
+
+
+def trim(
+    model: Model,
+    params: Any,
+    condition: Condition = HOVER,
+    *,
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sticks: Mapping[str, tuple[float, float]] = STICKS,
+) -> Trim:
+    """The steady flight of a helicopter model: hover, climb, forward and sideward flight.
+
+    All sticks, the attitude, the flybar and the rotor's speed are found together. Concrete
+    parameters only: `equilibrium` is what can be differentiated and batched.
+
+    Args:
+        wind: velocity of the air along x, y and z [m/s], for a model that has it.
+        sticks: the ends of the sticks' travel by name.
+
+    Raises:
+        ValueError: no such flight exists (the residual is named), it needs more than a stick
+            gives, or it is outside the model's range.
+    """
+    _check_model(model)
+    missing = needed_but_missing(model, params)
+    if missing:
+        raise ValueError(f"trim: {', '.join(missing)} missing, model {model.name} needs it")
+    best: Trim | None = None
+    condition = Condition(*(jnp.asarray(v, jnp.result_type(float)) for v in condition))
+    air = tuple(jnp.asarray(v, jnp.result_type(float)) for v in wind)
+    rng = np.random.default_rng(0)
+    spread = np.zeros(len(_unknowns(model)))
+    for _ in range(_TRIES):
+        found = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(spread)))
+        if _plausible(found) and (best is None or found.residual < best.residual):
+            best = found
+        if best is not None and best.residual < _TOLERANCE:
+            _check_sticks(model, params, best, condition, sticks)
+            _check_range(model, params, best, condition)
+            return best
+        spread = rng.standard_normal(spread.size)
+    left = "" if best is None else f": the nearest leaves an acceleration of {best.residual:.3g}"
+    raise ValueError(f"no trim of {_words(condition)} exists for this vehicle{left}")
+
+
+def equilibrium(
+    model: Model,
+    params: Any,
+    condition: Condition = HOVER,
+    wind: tuple[Any, Any, Any] = (0.0, 0.0, 0.0),
+) -> Trim:
+    """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
+
+    Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
+    """
+    _check_model(model)
+    return _equilibrium(model, params, condition, wind, jnp.zeros(len(_unknowns(model))))
+
+
+@eqx.filter_jit
+def _equilibrium(
+    model: Model, params: Any, condition: Condition, wind: Any, spread: Float[Array, " k"]
+) -> Trim:
+    names, rates = _unknowns(model), _equations(model)
+    dtype = spread.dtype
+    guess, scale = _guess(params, condition)
+    start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
+    scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
+    cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
+
+    def point(z: Array) -> tuple[Any, Any]:
+        values = dict(zip(names, z, strict=True))
+        fixed = {
+            "psi": condition.heading,
+            "dx": condition.ahead * cpsi - condition.aside * spsi,
+            "dy": condition.ahead * spsi + condition.aside * cpsi,
+            "dz": condition.climb,
+        }
+        state = naming.replace(
+            zeros(model.State, dtype),
+            **{n: jnp.asarray(v, dtype) for n, v in fixed.items()},
+            **{n: v for n, v in values.items() if n in naming.names(model.State)},
+        )
+        air = {f"wind_{a}": jnp.asarray(w, dtype) for a, w in zip("xyz", wind, strict=True)}
+        inputs = model.Inputs(
+            **{n: values[n] if n in values else air[n] for n in naming.names(model.Inputs)}
+        )
+        return state, inputs
+
+    def fn(xi: Array, parameters: Any) -> Array:
+        state, inputs = point(scales * xi)
+        found = model.vector_field(parameters, state, inputs)
+        return jnp.stack([getattr(found, n) for n in rates])
+
+    solution = optx.root_find(
+        fn,
+        optx.LevenbergMarquardt(1e-12, 1e-12),
+        start / scales + 0.5 * spread,
+        args=jax.lax.stop_gradient(params),
+        max_steps=200,
+        throw=False,
+    )
+    # Newton's method takes it to the last digit, and gives it the derivatives of a root.
+    xi = jax.lax.stop_gradient(solution.value)
+
+    def polish(z: Array, _: Any) -> tuple[Array, None]:
+        return z - jnp.linalg.solve(jax.jacfwd(fn)(z, params), fn(z, params)), None
+
+    xi, _ = jax.lax.scan(polish, xi, None, length=_POLISH)
+    state, inputs = point(scales * xi)
+    return Trim(state, inputs, jnp.max(jnp.abs(fn(xi, params))))
+
+
+def _unknowns(model: Model) -> tuple[str, ...]:
+    """What trim has to find: attitude, flybar, rotor speed, inflow, and all sticks."""
+    names = [n for n in naming.names(model.State) if n in ("phi", "theta", "Omega", "vi")]
+    names += [n for n in naming.names(model.State) if n.startswith("beta")]
+    return (*names, *(n for n in naming.names(model.Inputs) if not n.startswith("wind")))
+
+
+def _equations(model: Model) -> tuple[str, ...]:
+    """The states whose derivatives have to vanish and do not do so by themselves."""
+    names = naming.names(model.State)
+    given = {"x", "y", "z", "phi", "theta", "psi"}
+    return tuple(n for n in names if n not in given and f"d{n}" not in names)
+
+
+def _check_model(model: Model) -> None:
+    wanted = {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"}
+    missing = wanted - set(naming.names(model.State))
+    if missing or len(_unknowns(model)) != len(_equations(model)):
+        raise ValueError(
+            f"trim: model {model.name} is not a whole helicopter, wanted is one of "
+            "models.helicopter(...)"
+        )
+
+
+def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight."""
+    area = jnp.pi * p.R**2
+    vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
+    tip = p.R * p.Omega
+    sigma = 2.0 * p.c / (jnp.pi * p.R)
+    loading = 2.0 * p.m * p.g / (p.rho * area * tip**2 * p.a * sigma)
+    inflow = (vi + condition.climb) / tip
+    theta0 = 3.0 / p.B**3 * (loading + 0.5 * p.B**2 * inflow)
+    throttle = theta0 / p.K_theta0
+    guess = {"Omega": p.Omega, "vi": vi, "x_throttle": throttle, "x_yaw": -0.5 * throttle}
+    scale = {
+        "Omega": p.Omega, "vi": vi, "x_throttle": throttle, "x_yaw": throttle,
+        "x_roll": 0.1 * p.L5, "x_pitch": 0.1 * p.L5,
+    }  # fmt: skip
+    return guess, scale
+
+
+def _plausible(found: Trim) -> bool:
+    """The rotor turns, the blades push upwards, and the machine is not on its back."""
+    level = abs(float(found.state.phi)) < 1.5 and abs(float(found.state.theta)) < 1.5
+    turning = float(found.state.Omega) > 0 and float(found.inputs.x_throttle) > 0
+    return bool(np.isfinite(found.residual)) and turning and level
+
+
+def _check_sticks(
+    model: Model,
+    params: Any,
+    found: Trim,
+    condition: Condition,
+    sticks: Mapping[str, tuple[float, float]],
+) -> None:
+    for name, (low, high) in sticks.items():
+        if name not in naming.names(model.Inputs):
+            raise ValueError(
+                f"trim: model {model.name} has no stick {name!r}, it has "
+                f"{', '.join(naming.names(model.Inputs))}"
+            )
+        value = float(getattr(found.inputs, name))
+        if low <= value <= high:
+            continue
+        why = ""
+        if name == "x_throttle" and value > high:
+            weight, speed = float(params.m * params.g), float(found.state.Omega)
+            why = (
+                f"; to carry its weight of {weight:.3g} N the rotor would have to turn at "
+                f"{speed:.4g} rad/s: too heavy, or too slow a rotor (K_throttle, K_theta0)"
+            )
+        raise ValueError(
+            f"no trim of {_words(condition)}: it needs {name} {value:.3g}, the stick goes from "
+            f"{low:g} to {high:g}{why}"
+        )
+
+
+def _check_range(model: Model, params: Any, found: Trim, condition: Condition) -> None:
+    left = [] if model.limits is None else model.limits(params, found.state, found.inputs).items()
+    outside = [name for name, out in left if bool(out)]
+    if outside:
+        raise ValueError(
+            f"no trim of {_words(condition)} within the model's range: {', '.join(outside)}"
+        )
+
+
+def _words(condition: Condition) -> str:
+    speeds = {
+        f"{float(v):g} m/s {n}"
+        for n, v in condition._asdict().items()
+        if n != "heading" and float(v) != 0.0
+    }
+    return " and ".join(sorted(speeds)) or "hover"

@@ -1,0 +1,74 @@
+"""The induced velocity of a rotor by momentum theory.
+
+Everything here is divided by the air's mass flow scale, so that nothing is divided by the rotor's
+speed: a rotor at rest is an ordinary point.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from heli_jax.naming import Scalar
+
+_STEPS = 5
+"""Newton steps; from the closed forms they start at, four to five reach the last digit."""
+_REST = 1e-8
+"""[m/s] of flow that is always there: the square root has a derivative even where nothing moves."""
+
+
+@jax.custom_jvp
+def induced_velocity(V2: Scalar, W: Scalar, T0: Scalar, b: Scalar) -> Scalar:
+    r"""The root $v_i$ [m/s] of $2 v_i \sqrt{V^2 + (W + v_i)^2} = T_0 - b v_i$.
+
+    Momentum theory (Glauert) with the thrust of the blades, which falls with the inflow. The
+    sign of the root is that of T0. Where a fast descent has three roots, this is the one that is
+    connected with hover.
+
+    Args:
+        V2: square of the airspeed in the plane of the rotor [m^2/s^2].
+        W: airspeed through the rotor against the thrust, positive in climb [m/s].
+        T0: thrust without induced velocity over rho pi R^2 [m^2/s^2].
+        b: what an induced velocity of 1 m/s takes off it, zero or more [m/s].
+
+    The derivative, of any order and in both modes, is that of the implicit function.
+    """
+    sign = jnp.where(T0 < 0, -1.0, 1.0).astype(jnp.result_type(T0))
+    c, t = sign * W, sign * T0
+    # The root lies between 0 and that of V = 0, where the equation is quadratic, and below that of
+    # W + v = 0, where it is linear.
+    q = 2.0 * c + b
+    root = jnp.sqrt(q * q + 8.0 * t) + _REST
+    axial = jnp.where(q > 0, 2.0 * t / (jnp.abs(q) + root), 0.25 * (root - q))
+    x = jnp.minimum(axial, t / (2.0 * jnp.sqrt(V2 + _REST**2) + b))
+    for _ in range(_STEPS):
+        w = c + x
+        s = jnp.sqrt(V2 + w * w + _REST**2)
+        slope = 2.0 * (s + x * w / s) + b
+        step = (2.0 * x * s + b * x - t) / jnp.where(slope > 0, slope, 2.0 * s + b)
+        x = jnp.maximum(x - step, 0.0)
+    return sign * x
+
+
+@induced_velocity.defjvp
+def _induced_velocity_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    V2, W, _, b = primals
+    dV2, dW, dT0, db = tangents
+    v = induced_velocity(*primals)
+    w = W + v
+    s = jnp.sqrt(V2 + w * w + _REST**2)
+    slope = 2.0 * (s + v * w / s) + b
+    return v, (dT0 - v * db - (v / s) * dV2 - (2.0 * v * w / s) * dW) / slope
+
+
+def vortex_ring(V2: Scalar, W: Scalar, T0: Scalar, v: Scalar) -> Any:
+    """Whether momentum theory has left its range: in a descent through the rotor's own wake.
+
+    That is where the rotor sinks faster than half the induced velocity that the same thrust has
+    in hover, with little flow in its plane (Johnson, Helicopter Theory, section 3-2). Only there
+    can the equation have more than one root.
+    """
+    x = jnp.abs(v)
+    sinking = jnp.where(T0 < 0, W, -W)
+    hover2 = x * jnp.sqrt(V2 + (W + v) ** 2)
+    return (sinking > 0) & (4.0 * sinking**2 > hover2) & (jnp.maximum(hover2, sinking**2 / 8) > V2)

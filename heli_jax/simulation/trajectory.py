@@ -1,0 +1,52 @@
+"""What a simulation gives."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+STATUS = ("ok", "ended by an event", "outside the model's range", "not finite", "solver stopped")
+"""What `Trajectory.status` counts, from the best to the worst."""
+
+
+class Trajectory(NamedTuple):
+    """A run, sample by sample; batched from outside by vmap."""
+
+    times: Float[Array, " N"]
+    """[s], from 0"""
+    states: Any
+    """the model's State with arrays (N,)"""
+    outputs: Any
+    """the model's Outputs with arrays (N,)"""
+    inputs: Any
+    """the model's Inputs with arrays (N,), as they acted"""
+    result: dfx.RESULTS
+    """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
+    finite: Bool[Array, ""]
+    """whether every state is a finite number"""
+    outside: dict[str, Bool[Array, " N"]]
+    """by name of a limit of the model, where it was left; empty for a model without limits"""
+    ended: Float[Array, ""] | float
+    """when an event ended the run [s]; inf where none did"""
+    event: Int[Array, ""] | int
+    """which event that was, in the order given; -1 where none did"""
+
+    @property
+    def valid(self) -> Bool[Array, " N"]:
+        """Where the run is within the model's range and finite."""
+        finite = [jnp.isfinite(v) for v in jax.tree.leaves(self.states)]
+        return functools.reduce(
+            jnp.logical_and, [*finite, *(~out for out in self.outside.values())]
+        )
+
+    @property
+    def status(self) -> Int[Array, ""]:
+        """The worst that happened, an index into `STATUS`; one a run of a batch."""
+        code = jnp.where(jnp.asarray(self.event) >= 0, 1, 0)
+        for out in self.outside.values():
+            code = jnp.where(jnp.any(out, axis=-1), 2, code)
+        code = jnp.where(self.finite, code, 3)
+        return jnp.where(self.result == dfx.RESULTS.successful, code, jnp.maximum(code, 4))

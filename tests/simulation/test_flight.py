@@ -1,0 +1,272 @@
+"""The whole helicopter in flight: invariants, order of the steps, feedback, events, status."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+from heli_jax import Model, load_vehicle, models, naming, simulate, trim
+from heli_jax.dynamics import helicopter as whole
+from heli_jax.simulation.events import ground, rotor_speed
+from heli_jax.simulation.trajectory import STATUS
+from tests.dynamics import whole_helicopter as oracle
+
+DT = 0.02
+
+
+@pytest.fixture(scope="module")
+def xcell(vehicles_folder):
+    p = load_vehicle(vehicles_folder / "x-cell-60.yaml")
+    return naming.replace(p, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
+
+
+@pytest.fixture(scope="module")
+def hover(xcell):
+    return trim(models.helicopter(), xcell)
+
+
+def sticks(found, n, *, roll=2e-4, pitch=-2e-4, yaw=0.05, throttle=0.01, seed=0):
+    """Small steps of all sticks about a trim, (N,)."""
+    rng = np.random.default_rng(seed)
+    sizes = {"x_roll": roll, "x_pitch": pitch, "x_yaw": yaw, "x_throttle": throttle}
+
+    def one(name, value):
+        steps = rng.uniform(-1, 1, n // 20 + 1) * sizes.get(name, 0.0)
+        return jnp.asarray(float(value) + np.repeat(steps, 20)[:n])
+
+    inputs = naming.asdict(found.inputs)
+    return type(found.inputs)(**{k: one(k, v) for k, v in inputs.items()})
+
+
+def bare(xcell):
+    """No lift, no drag."""
+    return naming.replace(xcell, **{n: jnp.zeros(()) for n in ("a", "Cd0", "Sx", "Sy", "Sz")})
+
+
+def test_free_fall_is_a_parabola(xcell):
+    """Without a rotor that the air could turn, and without drag."""
+    model, p = models.helicopter(), bare(xcell)
+    s = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, dy=-1.0, dz=5.0, phi=0.3, psi=1.0)
+    zero = jnp.zeros(60)
+    run = jax.jit(lambda s: simulate(model, p, model.Inputs(zero, zero, zero, zero), dt=DT,
+                                     initial_state=s))(s)  # fmt: skip
+    t = np.asarray(run.times)
+    np.testing.assert_allclose(run.states.x, 3.0 * t, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.states.y, -1.0 * t, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.states.z, 5.0 * t - 0.5 * 9.80665 * t**2, rtol=1e-9, atol=1e-12)
+    assert STATUS[int(run.status)] == "outside the model's range"  # the rotor stands still
+    assert set(np.flatnonzero(run.outside["slow rotor"])) == set(range(60))
+
+
+def test_turning_the_problem_turns_the_trajectory(xcell, hover):
+    model, angle, n = models.helicopter(), 2.2, 150
+    u = sticks(hover, n)
+
+    @jax.jit
+    def flown(s):
+        return simulate(model, xcell, u, dt=DT, initial_state=s).states
+
+    start = naming.replace(hover.state, dx=2.0, dy=1.0, dphi=0.1)
+    c, d = np.cos(angle), np.sin(angle)
+    turned = naming.replace(start, dx=2.0 * c - 1.0 * d, dy=2.0 * d + 1.0 * c, psi=angle)
+    one, other = flown(start), flown(turned)
+    np.testing.assert_allclose(other.x, c * one.x - d * one.y, atol=1e-9)
+    np.testing.assert_allclose(other.y, d * one.x + c * one.y, atol=1e-9)
+    np.testing.assert_allclose(other.psi, one.psi + angle, atol=1e-9)
+    for name in ("z", "phi", "theta", "Omega", "beta_roll"):
+        np.testing.assert_allclose(getattr(other, name), getattr(one, name), atol=1e-9)
+
+
+def energetic(p):
+    """The consistent helicopter with the work done on it as one more state, and its energy."""
+    base = models.helicopter()
+    how = whole.Corrections(*[True] * 11)
+    State = naming.extended(base.State, "Working", {"work": (float, None)})
+
+    def inner(s):
+        return base.State(**{n: getattr(s, n) for n in naming.names(base.State)})
+
+    def field(p, s, u):
+        m = whole.motion(how, s, u)
+        air = whole.flow(how, p, s, u, m)
+        force = whole.main_rotor(p, s, u, air)
+        dOmega = whole.rotor_acceleration(p, s, u, air, force)
+        a = whole.accelerations(how, p, m, force.T)
+        M = whole.moments(how, p, s, u, m, force.T, dOmega)
+        power = p.m * (a[0] * s.dx + a[1] * s.dy + (a[2] + p.g) * s.dz)
+        power = power + M.roll * m.p + M.pitch * m.q + M.yaw * m.r
+        return State(**naming.asdict(base.vector_field(p, inner(s), u)), work=power)
+
+    def energy(s):
+        m = whole.motion(how, s, None)
+        spin = p.Ixx * m.p**2 + p.Iyy * m.q**2 + p.Izz * m.r**2
+        return 0.5 * p.m * (s.dx**2 + s.dy**2 + s.dz**2) + 0.5 * spin + p.m * p.g * s.z
+
+    model = Model("working", field, lambda p, s, u: base.output(p, inner(s), u), base.Params, State,
+                  base.Inputs, base.Outputs)  # fmt: skip
+    return model, energy
+
+
+def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
+    model, energy = energetic(xcell)
+    start = model.State(**naming.asdict(hover.state), work=jnp.zeros(()))
+    u = sticks(hover, 100, roll=2e-3, pitch=2e-3, yaw=0.2, throttle=0.05)
+    left = []
+    for substeps in (2, 4, 8):
+        run = jax.jit(
+            lambda s, k=substeps: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=k)
+        )(start)
+        E = np.asarray(jax.vmap(energy)(run.states))
+        assert np.ptp(E) > 10.0  # something happens
+        left.append(np.max(np.abs(E - E[0] - np.asarray(run.states.work))) / np.ptp(E))
+    assert left[2] < 1e-6
+    assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
+    assert 10 < left[1] / left[2] < 30
+
+
+@pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
+def test_rk4_is_dopri8(variant, substeps, xcell):
+    model = models.helicopter(variant)
+    found = trim(model, xcell)
+    u = sticks(found, 500, roll=1e-6, pitch=1e-6, yaw=0.01, throttle=2e-3)
+    if variant == "consistent":
+        u = sticks(found, 500)
+    run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=substeps))(
+        found.state
+    )
+    exact = jax.jit(
+        lambda s: simulate(
+            model, xcell, u, dt=DT, initial_state=s,
+            controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
+        )
+    )(found.state)  # fmt: skip
+    assert int(run.status) == int(exact.status) == 0
+    for name in ("x", "y", "z", "phi", "theta", "psi", "Omega"):
+        np.testing.assert_allclose(
+            getattr(run.states, name), getattr(exact.states, name), atol=1e-6, err_msg=name
+        )
+
+
+def test_two_seconds_are_scipys(xcell, hover):
+    """One flight against solve_ivp with the second program's derivatives."""
+    model, n = models.helicopter(), 50
+    u = sticks(hover, n)
+    names = oracle.STATES["consistent"]
+    v = {**oracle.XCELL}
+    x = np.array([float(getattr(hover.state, k)) for k in names])
+    for k in range(n - 1):
+        now = {m: float(a[k]) for m, a in naming.asdict(u).items()}
+
+        def rates(t, y, now=now):
+            d = oracle.consistent_rates(v, dict(zip(names, y, strict=True)), now)
+            return [d[m] for m in names]
+
+        x = scipy.integrate.solve_ivp(rates, (0, DT), x, rtol=1e-9, atol=1e-11).y[:, -1]
+    run = simulate(model, xcell, u, dt=DT, initial_state=hover.state)
+    for k, name in enumerate(names):
+        assert float(getattr(run.states, name)[-1]) == pytest.approx(x[k], rel=1e-6, abs=1e-7)
+
+
+def pilot(hover, gain=1.0):
+    """Attitude feedback to hover, as a user would write it."""
+
+    def feedback(s, u):
+        return u._replace(
+            x_roll=u.x_roll - gain * (4e-3 * s.phi + 1e-3 * s.dphi),
+            x_pitch=u.x_pitch - gain * (4e-3 * s.theta + 1e-3 * s.dtheta),
+            x_yaw=u.x_yaw - gain * (0.5 * s.psi + 0.2 * s.dpsi),
+        )
+
+    return feedback
+
+
+def test_feedback_is_applied_once_a_sample(xcell, hover):
+    model, n = models.helicopter(), 30
+    u = sticks(hover, n, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)
+    start = naming.replace(hover.state, phi=0.2, dtheta=0.1)
+    law = pilot(hover)
+    run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, feedback=law))(start)
+    two = jax.jit(lambda s, u: simulate(model, xcell, u, dt=DT, initial_state=s).states)
+    # By hand: a run of two samples, again and again.
+    x = start
+    for k in range(n - 1):
+        now = law(x, jax.tree.map(lambda v, k=k: v[k], u))
+        assert float(run.inputs.x_roll[k]) == pytest.approx(float(now.x_roll), rel=1e-12)
+        pair = jax.tree.map(lambda v: jnp.stack([v, v]), now)
+        x = jax.tree.map(lambda v: v[1], two(x, pair))
+    for name in ("phi", "theta", "psi", "Omega"):
+        assert float(getattr(run.states, name)[-1]) == pytest.approx(float(getattr(x, name)))
+    adaptive = simulate(
+        model, xcell, u, dt=DT, initial_state=start, feedback=law,
+        controller=dfx.PIDController(rtol=1e-10, atol=1e-10),
+    )  # fmt: skip
+    np.testing.assert_allclose(adaptive.states.phi, run.states.phi, atol=1e-6)
+    with pytest.raises(ValueError, match="feedback is for runs without a delay"):
+        simulate(model, xcell, u, dt=DT, feedback=law, delay=0.01)
+
+
+def test_the_ground_ends_a_run_at_its_moment(xcell):
+    model, p = models.helicopter(), bare(xcell)
+    zero = jnp.zeros(60)
+    u = model.Inputs(zero, zero, zero, zero)
+    fall = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, z=2.0)
+
+    def land(z, **how):
+        start = naming.replace(fall, z=z)
+        return simulate(model, p, u, dt=DT, initial_state=start, events={"ground": ground(0.3)},
+                        **how)  # fmt: skip
+
+    moment = np.sqrt(2 * 1.7 / 9.80665)
+    for how in ({}, {"controller": dfx.PIDController(rtol=1e-10, atol=1e-10)}):
+        run = land(2.0, **how)
+        assert int(run.event) == 0
+        assert float(run.ended) == pytest.approx(moment, rel=1e-9)
+        after = np.asarray(run.times) > moment
+        np.testing.assert_allclose(np.asarray(run.states.z)[after], 0.3, atol=1e-9)
+        np.testing.assert_allclose(np.asarray(run.states.x)[after], 3.0 * moment, rtol=1e-9)
+    slope = jax.jacfwd(lambda z: land(z).ended)(2.0)
+    assert float(land(0.2).ended) == 0.0  # it began below
+    aloft = land(200.0)
+    assert int(aloft.event) == -1
+    assert float(aloft.ended) == np.inf
+    assert np.isfinite(float(slope))
+
+
+def test_the_rotor_s_limits_end_a_run(xcell, hover):
+    model = models.helicopter()
+    u = sticks(hover, 60, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)
+    u = u._replace(x_throttle=0.8 * u.x_throttle)
+
+    @jax.jit
+    def flown(low, high):
+        events = {"ground": ground(-1e3), "rotor speed": rotor_speed(low, high)}
+        return simulate(model, xcell, u, dt=DT, initial_state=hover.state, events=events)
+
+    Omega = np.asarray(flown(0.0, 1e3).states.Omega)
+    farthest = Omega[np.argmax(np.abs(Omega - Omega[0]))]
+    limit = 0.5 * (Omega[0] + farthest)
+    run = flown(*((limit, 1e3) if farthest < Omega[0] else (0.0, limit)))
+    assert int(run.event) == 1
+    assert float(run.states.Omega[-1]) == pytest.approx(limit, abs=1e-6)
+    assert STATUS[int(run.status)] == "ended by an event"
+
+
+def test_one_bad_element_leaves_the_others_alone(xcell, hover):
+    model, n = models.helicopter(), 50
+    u = sticks(hover, n)
+
+    @jax.jit
+    @jax.vmap
+    def fleet(Ixx):
+        run = simulate(model, naming.replace(xcell, Ixx=Ixx), u, dt=DT, initial_state=hover.state)
+        return run.states.phi, run.status
+
+    good = jnp.asarray([0.25, 0.3, 0.35])
+    bad = jnp.asarray([0.25, jnp.nan, 0.35])
+    (phi, status), (spoilt, told) = fleet(good), fleet(bad)
+    np.testing.assert_array_equal(status, [0, 0, 0])
+    assert [STATUS[int(s)] for s in told] == ["ok", "not finite", "ok"]
+    np.testing.assert_array_equal(spoilt[0], phi[0])
+    np.testing.assert_array_equal(spoilt[2], phi[2])
