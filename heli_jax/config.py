@@ -91,10 +91,20 @@ class IntervalsConfig(_Strict):
     """draws of each of four chains (extra `bayes`); 0 for none"""
 
 
+class ShootingConfig(_Strict):
+    """Multiple shooting: windows with initial states of their own."""
+
+    window: Positive
+    """length [s]"""
+    continuity: Positive | None = None
+    """sd of the jump of each state between windows, as a part of what it does; null: free"""
+
+
 class FitConfig(_Strict):
     method: Method = "output-error"
     free: dict[str, FreeConfig]
     nuisance: NuisanceConfig = NuisanceConfig()
+    shooting: ShootingConfig | None = None
     starts: Annotated[int, Field(ge=1, le=10_000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     max_steps: Annotated[int, Field(ge=1)] = 200
@@ -339,6 +349,8 @@ def problem(experiment: Experiment) -> Problem:
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
             fixed_noise=fixed,
+            window=None if config.fit.shooting is None else config.fit.shooting.window,
+            continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
         )
     except ValueError as e:
         raise InputError(

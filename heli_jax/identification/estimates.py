@@ -112,7 +112,7 @@ def deviations(J: np.ndarray) -> np.ndarray:
     J = np.asarray(J, dtype=np.float64)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    inverse = np.linalg.pinv(J / norms, rcond=1e-10)
+    inverse = np.linalg.pinv(np.linalg.qr(J / norms, mode="r"), rcond=1e-10)
     return np.sqrt(np.sum(inverse**2, axis=1)) / norms
 
 
@@ -139,11 +139,16 @@ def flight_nuisances(
         said = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
         out[name] = Estimate(value, *said, unit, starts[name].start, 0.0, False)
     at = layout.weak
-    for label, flight, outputs in zip(
-        labels(problem.training), data.flights, layout.outputs, strict=True
+    for label, flight, outputs, (count, _) in zip(
+        labels(problem.training), data.flights, layout.outputs, layout.windows, strict=True
     ):
         parts = [
-            (f"initial {n}", flight.state_scale[n], naming.unit(layout.model.State, n))
+            (
+                f"initial {n}" + (f" of window {k + 1}" if count > 1 else ""),
+                flight.state_scale[n],
+                naming.unit(layout.model.State, n),
+            )
+            for k in range(count)
             for n in layout.states
         ]
         if layout.bias:

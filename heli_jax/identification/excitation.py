@@ -26,13 +26,14 @@ def notes(problem: Problem, simulated: tuple[dict[str, np.ndarray], ...], sd: An
                     f"{moved:.2g} (rms, at the start values) where the noise is "
                     f"{float(noise[name]):.2g}; use larger or more inputs."
                 )
-        for name, u in flight.inputs.items():
-            changes = int(np.count_nonzero(np.diff(u)))
-            if changes < len(problem.free):
-                found.append(
-                    f"{where}: {name} changes {changes} times in the record, fewer than there "
-                    f"are free parameters ({len(problem.free)}): it excites too little."
-                )
+        changes = sum(int(np.count_nonzero(np.diff(u))) for u in flight.inputs.values())
+        if changes < len(problem.free):
+            names = " and ".join(flight.inputs)
+            found.append(
+                f"{where}: {names} {'change' if len(flight.inputs) > 1 else 'changes'} {changes} "
+                f"times in the record, fewer than there are free parameters "
+                f"({len(problem.free)}): it excites too little."
+            )
     return found
 
 

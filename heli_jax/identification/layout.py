@@ -7,11 +7,13 @@ for each flight the initial state and the biases.
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import coordinates
@@ -72,6 +74,10 @@ class Layout(eqx.Module):
     substeps: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
     """samples per step of the exact recurrence"""
+    windows: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    """by flight: how many windows, and the samples of each"""
+    continuity: float | None = eqx.field(static=True)
+    """see `Problem.continuity`"""
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -99,8 +105,17 @@ class Layout(eqx.Module):
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        each = [len(self.states) + (len(o) if self.bias else 0) for o in self.outputs]
-        return self.weak + sum(each)
+        return self.weak + sum(
+            count * len(self.states) + (len(outputs) if self.bias else 0)
+            for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
+        )
+
+    @property
+    def determined(self) -> int:
+        """Unknowns that the data have to determine: those that windows tie together count once."""
+        if self.continuity is None:
+            return self.size
+        return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
 
 
 class Noise(NamedTuple):
@@ -132,7 +147,8 @@ class Unknowns(NamedTuple):
     gains: dict[str, Any]
     shift: Any
     states: tuple[Any, ...]
-    """one State or None a flight"""
+    """by flight the State at the first sample, with arrays (windows,) where there are several; None
+    where it is the model's own"""
     biases: tuple[dict[str, Any], ...]
 
 
@@ -164,7 +180,19 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         solver=problem.solver,
         substeps=problem.substeps,
         block=_BLOCK if exact else 1,
+        windows=tuple(_windows(problem, flight) for flight in flights),
+        continuity=problem.continuity,
     )
+
+
+def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
+    """How many windows, and the samples of each; a short rest belongs to the last window."""
+    n = flight.n_samples
+    if problem.window is None:
+        return 1, n
+    samples = round(problem.window / flight.dt)
+    count = max(1, round(n / samples))
+    return count, -(-n // count)
 
 
 def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
@@ -187,13 +215,17 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     scales = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.scaled)}
     at = layout.weak
     states, biases = [], []
-    for flight, outputs in zip(data.flights, layout.outputs, strict=True):
+    for flight, outputs, (count, _) in zip(
+        data.flights, layout.outputs, layout.windows, strict=True
+    ):
         state = None
         if layout.initial_state:
-            zero = jnp.zeros_like(z[0])
-            values = dict.fromkeys(naming.names(layout.model.State), zero)
-            values |= {n: z[at + i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
-            state, at = layout.model.State(**values), at + len(layout.states)
+            k = len(layout.states)
+            own = z[at : at + count * k].reshape(count, k)
+            own = own[0] if count == 1 else own
+            values = dict.fromkeys(naming.names(layout.model.State), jnp.zeros_like(own[..., 0]))
+            values |= {n: own[..., i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
+            state, at = layout.model.State(**values), at + count * k
         bias = {n: jnp.zeros_like(z[0]) for n in outputs}
         if layout.bias:
             bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
@@ -221,12 +253,53 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 
 
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
+    """The model's own initial state, or for one that is not linear the nearest that shows the
+    measured outputs at the first sample of the window."""
     at = layout.weak
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
-    for flight, outputs in zip(data.flights, layout.outputs, strict=True):
+    for flight, outputs, (count, m) in zip(
+        data.flights, layout.outputs, layout.windows, strict=True
+    ):
         params = layout.model.Params(**{**data.base, **values, **flight.known})
-        state = naming.asdict(layout.model.initial_state(params))
-        for i, name in enumerate(layout.states):
-            z = z.at[at + i].set(state[name] / flight.state_scale[name])
-        at += len(layout.states) + (len(outputs) if layout.bias else 0)
+        own = naming.asdict(layout.model.initial_state(params))
+        first = np.array([float(own[n]) for n in naming.names(layout.model.State)])
+        for k in range(count):
+            found = first
+            if not layout.model.linear:
+                found = _shown(layout, params, flight, k * m, first)
+            for i, name in enumerate(layout.states):
+                value = found[naming.names(layout.model.State).index(name)]
+                scale = float(flight.state_scale[name])
+                z = z.at[at + i].set(jnp.asarray(value / scale, z.dtype))
+            at += len(layout.states)
+        at += len(outputs) if layout.bias else 0
     return z
+
+
+_LINE = 5
+"""samples to which a straight line is fitted for the value at the first"""
+
+
+def _shown(
+    layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
+) -> np.ndarray:
+    """The state (n,) nearest to `first` whose outputs are the measured ones at sample k."""
+    measured = {n: _at_start(np.asarray(y)[k : k + _LINE]) for n, y in flight.outputs.items()}
+    measured = {n: v for n, v in measured.items() if np.isfinite(v)}
+    inputs = jax.tree.map(lambda u: u[k], flight.inputs)
+    names, x = naming.names(layout.model.State), first
+    rows = [naming.names(layout.model.Outputs).index(n) for n in measured]
+    for _ in range(3):
+        state = layout.model.State(**dict(zip(names, jnp.asarray(x), strict=True)))
+        _, _, C, _ = jacobians(layout.model, params, state, inputs)
+        outputs = naming.asdict(layout.model.output(params, state, inputs))
+        missed = np.array([v - float(outputs[n]) for n, v in measured.items()])
+        x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ missed
+    return x
+
+
+def _at_start(y: np.ndarray) -> float:
+    seen = np.flatnonzero(np.isfinite(y))
+    if seen.size < 3:
+        return float(y[seen[0]]) if seen.size else float("nan")
+    return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

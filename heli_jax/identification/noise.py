@@ -169,7 +169,7 @@ def _updated(
     that the optimum stays where it is.
     """
     n = residuals_count(data)
-    freedom = n / max(n - layout.size, 1)
+    freedom = n / max(n - layout.determined, 1)
     if not layout.filtered:
         new = tuple(
             {k: _residual_sd(r, flight.outputs[k], freedom) for k, r in by_name.items()}

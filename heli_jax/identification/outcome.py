@@ -23,7 +23,7 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
+from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, start_vector, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -69,7 +69,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e) if usable else ran.before
     n = residuals_count(data)
-    quantile = float(scipy.special.stdtrit(max(n - layout.size, 1), 0.975))
+    quantile = float(scipy.special.stdtrit(max(n - layout.determined, 1), 0.975))
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
     coloured = usable and not layout.filtered and not all(w.white for w in white.values())
@@ -112,7 +112,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         verdict=verdict,
         noise=sds,
         log_likelihood=log_likelihood(layout, data, noise, e),
-        unknowns=layout.size + noise_unknowns(layout) - (len(layout.noise) if none else 0),
+        unknowns=layout.determined + noise_unknowns(layout) - (len(layout.noise) if none else 0),
         signals=(*signals, *validation),
         metrics=_pooled(signals),
         validation=_pooled(validation),
@@ -268,15 +268,19 @@ def _validation(
     problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
 ) -> tuple[Signals, ...]:
     """Flights held out, predicted with the estimates; only their initial state and bias are
-    adjusted, by linear least squares."""
+    adjusted, by least squares (linear in them, or step by step)."""
     other, data = layout_of(problem, held), data_of(problem, held)
-    full = jnp.concatenate([z[: layout.weak], jnp.zeros(other.size - layout.weak, z.dtype)])
+    begin = jnp.zeros(other.size - layout.weak, z.dtype)
+    if not problem.model.linear:
+        begin = start_vector(other, data, problem)[layout.weak :]
+    full = jnp.concatenate([z[: layout.weak], begin])
     theirs = first_noise(problem, held)
     if layout.filtered:
         known = {n: s for one in noise.sd for n, s in one.items()}
         sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
         theirs = theirs._replace(sd=sd)
-    if other.size > layout.weak:
+    steps = 1 if problem.model.linear else 5
+    for _ in range(steps if other.size > layout.weak else 0):
         e = evaluation(other, data, theirs, full)
         columns = np.asarray(e.J)[:, layout.weak :]
         step, *_ = np.linalg.lstsq(columns, -np.asarray(e.r), rcond=1e-10)

@@ -79,6 +79,12 @@ class Problem:
     fixed_noise: tuple[str, ...] = ()
     """what filter error takes as given instead of estimating it: `sigma_w` and `tau_w` from
     `vehicle`, `sigma_y` (the measurement noise) from the flights' `sd`"""
+    window: float | None = None
+    """multiple shooting: flights are simulated in windows of this length [s], each from an initial
+    state of its own, because the error of an initial state grows in unstable flight"""
+    continuity: float | None = None
+    """with windows: standard deviation of the jump of each state from one window to the next, as a
+    part of what the state does; None leaves them apart"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "flights", tuple(self.flights))
@@ -89,6 +95,7 @@ class Problem:
         for name, one in self.free.items():
             _check_free(name, one, self.model)
         _check_possible(self)
+        _check_windows(self)
         if not self.training:
             raise ValueError("no flight to fit: every one is held out")
         for flight in self.flights:
@@ -143,6 +150,33 @@ def _check_method(problem: Problem) -> None:
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
             raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
+
+
+def _check_windows(problem: Problem) -> None:
+    if problem.window is None:
+        if problem.continuity is not None:
+            raise ValueError("continuity is for windows only, wanted is a window")
+        return
+    if not (math.isfinite(problem.window) and problem.window > 0):
+        raise ValueError(f"window is {problem.window:g} s, wanted is above zero")
+    if problem.continuity is not None and not (
+        math.isfinite(problem.continuity) and problem.continuity > 0
+    ):
+        raise ValueError(f"continuity is {problem.continuity:g}, wanted is above zero")
+    if problem.method != "output-error":
+        raise ValueError("window is for method output-error: a filter needs none")
+    if not problem.nuisance.initial_state:
+        raise ValueError("windows need nuisance.initial_state, which is off")
+    if problem.nuisance.time_shift:
+        raise ValueError("window and nuisance.time_shift: wanted is one of the two")
+    for flight in problem.flights:
+        samples = round(problem.window / flight.dt)
+        if samples < 4:
+            where = f"flight {flight.name!r}" if flight.name else "a flight"
+            raise ValueError(
+                f"{where}: a window of {problem.window:g} s holds {samples} samples, wanted are 4 "
+                "at least"
+            )
 
 
 def _check_free(name: str, one: Free, model: Model) -> None:

@@ -1,0 +1,127 @@
+"""What separates the lift slope a from the inertias: thrust carries a known mass.
+
+    .venv/bin/python experiments/heave_separates_a.py [FOLDER]
+
+Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
+rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. Attitude alone knows a only beside the inertias;
+hover and heave know it beside the mass, which a balance gives. Moving the throttle by 3 % tells the
+rotor's inertia from the motor's gain as well; with 0.2 % only their product is known.
+FOLDER (runs/heave) gets results.json and
+page.md.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, load_vehicle, models, simulate, trim
+from heli_jax.identification.result import Fit
+from heli_jax.naming import replace
+
+jax.config.update("jax_enable_x64", True)
+N, DT = 100, 0.02
+NOISE = {
+    "x": 2e-3, "y": 2e-3, "z": 2e-3, "roll": 2e-3, "pitch": 2e-3, "yaw": 2e-3, "rotor_speed": 0.5,
+}  # fmt: skip
+FREE = ("a", "Ixx", "Iyy", "Izz", "If", "Ir", "K_theta0", "K_throttle", "K_theta0T")
+STICKS = {"x_roll": (1e-3, 10), "x_pitch": (1e-3, 10), "x_yaw": (0.2, 15)}
+"""size of the steps, and samples between two of them"""
+MODEL = models.helicopter("consistent")
+
+
+def vehicle() -> Any:
+    return load_vehicle(Path(__file__).parents[1] / "configs" / "vehicles" / "x-cell-60.yaml")
+
+
+def records(
+    throttle: float, measured: tuple[str, ...] = tuple(NOISE), count: int = 6
+) -> list[Flight]:
+    """Records about hover, the throttle moved by up to `throttle` to both sides."""
+    params = vehicle()
+    hover = trim(MODEL, params)
+    flights = []
+
+    @jax.jit
+    def flown(inputs: Any) -> Any:
+        return simulate(MODEL, params, inputs, dt=DT, initial_state=hover.state).outputs
+
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        inputs = {}
+        for name, about in hover.inputs._asdict().items():
+            size, hold = (throttle, 15) if name == "x_throttle" else STICKS[name]
+            steps = np.repeat(rng.uniform(-1.0, 1.0, N // hold + 1), hold)[:N]
+            inputs[name] = float(about) + size * steps
+        run = flown(MODEL.Inputs(**{n: jnp.asarray(u) for n, u in inputs.items()}))
+        outputs = {
+            n: np.asarray(getattr(run, n)) + sd * rng.standard_normal(N) for n, sd in NOISE.items()
+        }
+        outputs = {n: outputs[n] for n in measured}
+        flights.append(
+            Flight(dt=DT, inputs=inputs, outputs=outputs, sd={n: NOISE[n] for n in measured})
+        )
+    return flights
+
+
+def identify(flights: list[Flight], names: tuple[str, ...] = FREE) -> Fit:
+    """Fitted from values that are off by 15 % in the mean."""
+    params = vehicle()
+    rng = np.random.default_rng(0)
+    free = {
+        n: Free(float(getattr(params, n)) * float(np.exp(0.15 * rng.standard_normal())))
+        for n in names
+    }
+    start = replace(params, **{n: jnp.asarray(f.start) for n, f in free.items()})
+    nuisance = Nuisance(bias=False)
+    return fit(Problem(MODEL, start, flights, free, nuisance, substeps=2), progress=print)
+
+
+def table(found: Fit) -> list[str]:
+    params = vehicle()
+    rows = ["| parameter | estimate over truth | sd | error in sd |", "|---|---|---|---|"]
+    for name, e in found.estimates.items():
+        truth = float(getattr(params, name))
+        if e.sd is None:
+            rows.append(f"| {name} | not determined | | |")
+            continue
+        error = (e.value - truth) / e.sd
+        rows.append(
+            f"| {name} | {e.value / truth:.4f} | {100 * e.sd / truth:.2f} % | {error:+.1f} |"
+        )
+    return rows
+
+
+ATTITUDE = ("roll", "pitch", "yaw")
+CASES = {
+    "attitude alone": (0.03, ATTITUDE, ("a", "Ixx", "Iyy", "Izz", "If", "K_theta0T")),
+    "all measured, throttle moved by 0.2 %": (0.002, tuple(NOISE), FREE),
+    "all measured, throttle moved by 3 %": (0.03, tuple(NOISE), FREE),
+}
+
+
+def main() -> None:
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("runs/heave")
+    folder.mkdir(parents=True, exist_ok=True)
+    page, results = ["# What separates a from the inertias", ""], {}
+    for title, (throttle, measured, names) in CASES.items():
+        found = identify(records(throttle, measured), names)
+        page += [f"## {title}", "", *table(found), "", found.verdict.text, ""]
+        results[title] = {
+            "status": found.status,
+            "condition": found.verdict.condition,
+            "values": {n: e.value for n, e in found.estimates.items()},
+            "sd": {n: e.sd for n, e in found.estimates.items()},
+            "pairs": [list(p) for p in found.verdict.pairs],
+        }
+    (folder / "page.md").write_text("\n".join(page))
+    (folder / "results.json").write_text(json.dumps(results, indent=1))
+    print("\n".join(page))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Multiple shooting: windows with initial states of their own."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, models
+from heli_jax.identification.data import data_of
+from heli_jax.identification.layout import layout_of, start_vector
+from heli_jax.identification.noise import first_noise
+from heli_jax.identification.residual import evaluate, rows_of
+from tests.identification.bench import BENCH, record, vehicle
+
+FREE = {"Ixx": Free(0.03), "If": Free(2e-4)}
+
+
+def problem(flights=1, **how):
+    made = [record(BENCH, seed=3 + i, n=200 + 40 * i) for i in range(flights)]
+    return Problem(models.roll_on_stand, vehicle(BENCH), made, FREE, **how)
+
+
+@pytest.mark.parametrize("continuity", [None, 0.01])
+@pytest.mark.parametrize("nuisance", [Nuisance(), Nuisance(bias=False, input_gain=True)])
+def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
+    one = problem(2, window=1.0, continuity=continuity, nuisance=nuisance)
+    layout, data = layout_of(one, one.training), data_of(one, one.training)
+    assert layout.windows == ((4, 50), (5, 48))
+    noise = first_noise(one, one.training)
+    rng = np.random.default_rng(0)
+    z = start_vector(layout, data, one)
+    z = z + jnp.asarray(0.1 * rng.standard_normal(z.shape))
+    e = evaluate(layout, data, noise, z)
+    wanted = jax.jit(jax.jacfwd(lambda z: rows_of(layout, data, noise, z)))(z)
+    np.testing.assert_allclose(e.r, rows_of(layout, data, noise, z), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(e.J, wanted, rtol=1e-7, atol=1e-9 * np.abs(wanted).max())
+    jumps = 0 if continuity is None else 4 * (3 + 4)
+    assert e.r.size == 200 + 240 + jumps + 2 + (layout.size - layout.weak)
+
+
+def test_windows_that_hang_together_are_one_run():
+    plain, chained, apart = (
+        fit(problem(**how)) for how in ({}, {"window": 1.0, "continuity": 1e-5}, {"window": 1.0})
+    )
+    assert plain.status == chained.status == apart.status == "converged"
+    for name, one in plain.estimates.items():
+        other = chained.estimates[name]
+        assert other.value == pytest.approx(one.value, abs=0.02 * one.sd)
+        assert other.sd == pytest.approx(one.sd, rel=0.02)
+        # States of their own in every window cost information, and no bias.
+        loose = apart.estimates[name]
+        assert loose.sd > one.sd
+        assert abs(loose.value - BENCH[name]) < 4 * loose.sd
+    assert apart.signals[0].simulated["roll"].shape == (200,)
+    assert "flight 1/initial phi of window 4" in apart.nuisance
+
+
+def test_a_flight_held_out_is_cut_as_well():
+    one = problem(2, window=1.0)
+    held = dataclasses.replace(one.flights[1], hold_out=True, name="held")
+    found = fit(dataclasses.replace(one, flights=[one.flights[0], held]))
+    assert found.validation["roll"].vaf > 0.99
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"window": -1.0}, "window is -1 s, wanted is above zero"),
+        ({"continuity": 0.1}, "continuity is for windows only"),
+        ({"window": 1.0, "continuity": 0.0}, "continuity is 0, wanted is above zero"),
+        ({"window": 0.05}, "a window of 0.05 s holds 2 samples, wanted are 4"),
+        ({"window": 1.0, "nuisance": Nuisance(initial_state=False)}, "windows need"),
+        ({"window": 1.0, "nuisance": Nuisance(time_shift=True)}, "wanted is one of the two"),
+    ],
+)
+def test_refused(how, words):
+    with pytest.raises(ValueError, match=words):
+        problem(**how)
+
+
+def test_a_window_as_long_as_the_flight_is_the_flight():
+    one, other = fit(problem()), fit(problem(window=100.0))
+    for name, found in one.estimates.items():
+        assert other.estimates[name].value == pytest.approx(found.value, rel=1e-9)
+
+
+def test_gaps_and_a_short_last_window():
+    flight = problem().flights[0]
+    y = flight.outputs["roll"].copy()
+    y[40:90:3] = np.nan
+    gappy = Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": y})
+    found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [gappy], FREE, window=0.75))
+    assert found.status == "converged"
+    for name, one in found.estimates.items():
+        assert abs(one.value - BENCH[name]) < 4 * one.sd
