@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
+from heli_jax.dynamics.angles import sincos
 from heli_jax.dynamics.inflow import vortex_ring
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Scalar
@@ -205,13 +206,7 @@ def motion(how: Corrections, s: Any, u: Any) -> Motion:
     $r = \dot\psi c_\theta c_\phi - \dot\theta s_\phi$; without `rigid_body` they are the
     angles' derivatives, as the paper has it.
     """
-    at = _once(
-        Attitude(
-            jnp.sin(s.phi), jnp.cos(s.phi),
-            jnp.sin(s.theta), jnp.cos(s.theta),
-            jnp.sin(s.psi), jnp.cos(s.psi),
-        )
-    )  # fmt: skip
+    at = _once(Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi)))
     dx, dy, dz = s.dx, s.dy, s.dz
     if hasattr(u, "wind_x"):
         dx, dy, dz = dx - u.wind_x, dy - u.wind_y, dz - u.wind_z
