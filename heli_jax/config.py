@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
 from heli_jax import models, naming, units
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
@@ -182,6 +182,9 @@ class Config(_Strict):
 
     model: str
     vehicle: str | dict[str, Any]
+    corrections: dict[str, StrictBool] | None = None
+    """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
+    off in place of what the model has; for the whole helicopter only"""
     flights: list[FlightConfig] = []
     fit: FitConfig | None = None
     rls: RLSConfig | None = RLSConfig()
@@ -212,9 +215,18 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
     for text in overrides:
         _override(content, text)
     config = _validated(content, str(path))
-    model = models.by_name(config.model, f"{path}: model", path.absolute().parent)
+    model = _model(config, path)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle)
+
+
+def _model(config: Config, path: Path) -> Model:
+    folder = path.absolute().parent
+    model = models.by_name(config.model, f"{path}: model", folder)
+    if config.corrections is None:
+        return model
+    where = f"{path}: corrections"
+    return models.by_name(config.model, where, folder, corrections=config.corrections)
 
 
 def _override(content: dict[str, Any], text: str) -> None:

@@ -3,9 +3,11 @@
 import importlib
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
-from heli_jax.dynamics.helicopter import helicopter
+from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import on_stand, pitch, roll
 from heli_jax.errors import InputError, nearest
@@ -16,20 +18,52 @@ pitch_on_stand = on_stand(pitch)
 __all__ = ["by_name", "helicopter", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
 
 _SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
+_HELICOPTERS: dict[str, Literal["paper", "consistent"]] = {
+    "helicopter": "consistent",
+    "helicopter-consistent": "consistent",
+    "helicopter-paper": "paper",
+}
 
 
-def by_name(name: str, where: str = "model", folder: str | Path | None = None) -> Model:
+def by_name(
+    name: str,
+    where: str = "model",
+    folder: str | Path | None = None,
+    *,
+    corrections: Mapping[str, bool] | None = None,
+    wind: bool = False,
+) -> Model:
     """The shipped model of that name, or anyone's own at 'package.module:name'.
 
     A module of one's own may lie in `folder`, as beside the configuration that names it.
+    `corrections` and `wind` are those of `helicopter`, and for the whole helicopter only.
 
     Raises:
-        InputError: neither exists; `where` begins the sentence.
+        InputError: neither exists, or it takes no such correction or no wind; `where` begins the
+            sentence.
     """
-    if name in _SHIPPED:
-        return _SHIPPED[name]
+    if name in _HELICOPTERS:
+        for one in corrections or {}:
+            if one not in Corrections._fields:
+                raise InputError(
+                    f"{where}: the helicopter has no correction {one!r}"
+                    f"{nearest(one, Corrections._fields)}"
+                )
+        # Always called in this way: the cache then gives the same model for the same switches.
+        switches = dict(sorted((corrections or {}).items()))
+        return helicopter(_HELICOPTERS[name], wind=wind, **switches)
+    model = _SHIPPED[name] if name in _SHIPPED else _imported(name, where, folder)
+    if corrections is not None or wind:
+        what = "wind" if wind else "corrections"
+        raise InputError(
+            f"{where}: {name!r} takes no {what}, wanted is one of {', '.join(_HELICOPTERS)}"
+        )
+    return model
+
+
+def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name):
-        known = [*_SHIPPED, "package.module:name"]
+        known = [*_SHIPPED, *_HELICOPTERS, "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     module_name, attribute = name.split(":")
     if folder is not None and str(folder) not in sys.path:

@@ -1,0 +1,67 @@
+"""Configurations of the whole helicopter: its variants, its corrections, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from heli_jax import config as configuration
+from heli_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
+
+
+@pytest.fixture
+def load(tmp_path):
+    """load(key=value, ...) -> the experiment of an X-Cell configuration with these keys."""
+
+    def load(*overrides, **content):
+        path = tmp_path / "xcell.yaml"
+        path.write_text(yaml.safe_dump({"model": "helicopter", "vehicle": XCELL, **content}))
+        return configuration.load(path, overrides)
+
+    return load
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("helicopter", "helicopter-consistent"),
+        ("helicopter-consistent", "helicopter-consistent"),
+        ("helicopter-paper", "helicopter-paper"),
+    ],
+)
+def test_the_helicopter_by_name(load, name, model):
+    found = load(model=name)
+    assert found.model.name == model
+    assert load(model=name).model is found.model
+    assert "beta_roll" in found.model.State._fields
+
+
+def test_corrections_switch_on_and_off(load):
+    some = load(model="helicopter-paper", corrections={"tail": True, "drag": False})
+    assert some.model.name == "helicopter-paper+tail"
+    assert load("corrections.drag=false").model.name == "helicopter-consistent-drag"
+    again = load(model="helicopter-paper", corrections={"drag": False, "tail": True})
+    assert again.model is some.model
+    assert configuration.resolved(some)["corrections"] == {"tail": True, "drag": False}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"model": "helicoptr"}, ["model", "did you mean 'helicopter'"]),
+        ({"corrections": {"tial": True}}, ["corrections", "'tial'", "did you mean 'tail'"]),
+        ({"corrections": {"tail": 2}}, ["corrections.tail", "found 2", "boolean"]),
+        ({"model": "roll", "corrections": {"tail": True}}, ["corrections", "'roll' takes no"]),
+        ({"model": "roll", "corrections": {}}, ["corrections", "'roll' takes no", "helicopter"]),
+        ({"corection": {}}, ["corection", "did you mean 'corrections'"]),
+    ],
+)
+def test_wrong_models_and_corrections(load, content, words):
+    with pytest.raises(InputError) as e:
+        load(**content)
+    assert "xcell.yaml" in str(e.value)
+    for word in words:
+        assert word in str(e.value)
