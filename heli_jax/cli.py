@@ -207,6 +207,8 @@ def _simulate(options: argparse.Namespace) -> int:
         table = generate.generate(experiment)
     else:
         table = generate.follow(experiment)
+    for note in table.notes:
+        _say(f"{options.config}: {note}")
     output.write_table(out, table.columns)
     if out is not None:
         _say(f"wrote {len(next(iter(table.columns.values())))} samples to {out}")

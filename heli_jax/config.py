@@ -159,14 +159,40 @@ class NoiseConfig(_Strict):
     unit: str | None = None
 
 
+class StartConfig(_Strict):
+    """The steady flight in which a run of the whole helicopter begins."""
+
+    ahead: Finite = 0.0
+    """speed over the ground along the heading [m/s]"""
+    aside: Finite = 0.0
+    """to the right of it [m/s]"""
+    climb: Finite = 0.0
+    """[m/s]"""
+    heading: Finite = 0.0
+    """psi [rad]"""
+
+
 class SimulateConfig(_Strict):
-    """A run that the project makes itself."""
+    """A run that the project makes itself.
+
+    The whole helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
+    start, wind, hold_attitude and ground are for it alone.
+    """
 
     duration: Positive
     rate: Positive
-    inputs: dict[str, StickConfig]
+    inputs: dict[str, StickConfig] = {}
     noise: dict[str, NoiseConfig] = {}
     seed: Annotated[int, Field(ge=0)] = 0
+    start: StartConfig | None = None
+    """hover unless given"""
+    wind: tuple[Finite, Finite, Finite] | None = None
+    """velocity of the air along x, y and z (up) [m/s]"""
+    hold_attitude: bool = False
+    """whether a pilot's gentle feedback is added to the sticks, so that a long manoeuvre does not
+    diverge (`heli_jax.analysis.pilot`)"""
+    ground: Annotated[float, Field(lt=0, allow_inf_nan=False)] | None = None
+    """height at which the run ends [m]; it begins at a height of zero"""
 
     @model_validator(mode="after")
     def _bounded(self) -> "SimulateConfig":
@@ -227,6 +253,23 @@ def _model(config: Config, path: Path) -> Model:
         return model
     where = f"{path}: corrections"
     return models.by_name(config.model, where, folder, corrections=config.corrections)
+
+
+def in_wind(experiment: Experiment) -> Experiment:
+    """The experiment with a model that has the wind as inputs.
+
+    Raises:
+        InputError: the model takes no wind.
+    """
+    config, path = experiment.config, experiment.path
+    model = models.by_name(
+        config.model,
+        f"{path}: simulate.wind",
+        path.absolute().parent,
+        corrections=config.corrections,
+        wind=True,
+    )
+    return experiment._replace(model=model)
 
 
 def _override(content: dict[str, Any], text: str) -> None:

@@ -1,5 +1,6 @@
 """Runs that a configuration describes and the project makes itself."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -7,33 +8,50 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming, units
+from heli_jax.analysis.pilot import Pilot, attitude_hold
+from heli_jax.analysis.trim import STICKS, Condition, Trim, is_whole, trim
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
     StickConfig,
     disturbed,
+    in_wind,
     read_flights,
     signals,
 )
+from heli_jax.dynamics.model import Model, needed_but_missing, zeros
 from heli_jax.errors import InputError, nearest
+from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate
+from heli_jax.simulation.trajectory import Trajectory
+
+_LONGEST_STEP = 0.005
+"""of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
+
+_MIDDLE = 1e-14
 
 
 class Table(NamedTuple):
-    """Columns of one simulated run under the names and in the units of a log."""
+    """Columns of simulated runs under the names and in the units of a log."""
 
     columns: dict[str, np.ndarray]
+    runs: dict[str, Trajectory]
+    """the runs by name, without noise, in SI, as NumPy arrays"""
+    notes: tuple[str, ...]
+    """what is to be said of them, a sentence each"""
 
 
 def generate(experiment: Experiment) -> Table:
     """The run of the configuration's `simulate`, with noise and disturbance.
 
     Its columns have the names and units of the first flight's `signals`, so that the same
-    configuration reads it back; without flights, the model's names in SI.
+    configuration reads it back; without flights, the model's names in SI. A whole helicopter
+    begins in a trimmed flight, and its sticks are those of the trim and what is added to them.
 
     Raises:
-        InputError: an input or output that the model lacks, or a unit of the wrong kind.
+        InputError: an input or output that the model lacks, a unit of the wrong kind, a vehicle
+            that lacks something, or no trim of that flight.
     """
     wanted = experiment.config.simulate
     assert wanted is not None
@@ -43,25 +61,169 @@ def generate(experiment: Experiment) -> Table:
     drawn = experiment.config.disturbance
     if drawn is not None and (drawn.sigma_w is None or drawn.tau_w is None):
         raise InputError(f"{experiment.path}: disturbance: simulate needs its sigma_w and tau_w")
-    model, params = disturbed(experiment)
+    _check_outputs(experiment, wanted, where)
     driven = _inputs(experiment, wanted, n, rng, where)
-    key = jax.random.key(wanted.seed) if experiment.config.disturbance else None
-    run = jax.jit(lambda p, u: simulate(model, p, u, dt=1.0 / wanted.rate, key=key))(
-        params, model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
-    )
+    run = _run(experiment, wanted, n, driven, where)
     if not bool(run.finite):
-        raise InputError(f"{where}: the run is not finite: the model is unstable with this vehicle")
+        raise InputError(f"{where}: {_diverged(experiment, run)}")
+    notes = _notes(experiment, run)
+    if np.isfinite(run.ended):
+        run = _until(run, float(run.ended))
     outputs = {k: np.asarray(v) for k, v in naming.asdict(run.outputs).items()}
     for name, noise in wanted.noise.items():
-        if name not in outputs:
+        si = naming.unit(experiment.model.Outputs, name) or "1"
+        scale = _factor(noise.unit or si, si, f"{where}.noise.{name}.unit")
+        draws = noise.sd * scale * rng.standard_normal(n)
+        outputs[name] = outputs[name] + draws[: outputs[name].size]
+    acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
+    columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
+    return Table(columns, {experiment.path.stem: run}, notes)
+
+
+def _check_outputs(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
+    known = naming.names(experiment.model.Outputs)
+    for name in wanted.noise:
+        if name not in known:
             raise InputError(
                 f"{where}.noise: model {experiment.model.name} has no output {name!r}"
-                f"{nearest(name, outputs)}"
+                f"{nearest(name, known)}"
             )
-        si = naming.unit(model.Outputs, name) or "1"
-        scale = _factor(noise.unit or si, si, f"{where}.noise.{name}.unit")
-        outputs[name] = outputs[name] + noise.sd * scale * rng.standard_normal(n)
-    return _as_logged(experiment, np.arange(n) / wanted.rate, driven, outputs)
+
+
+def _run(
+    experiment: Experiment,
+    wanted: SimulateConfig,
+    n: int,
+    driven: dict[str, np.ndarray],
+    where: str,
+) -> Trajectory:
+    """The run as NumPy arrays, without measurement noise."""
+    _check_whole(experiment, wanted, where)
+    plain = in_wind(experiment) if wanted.wind is not None else experiment
+    missing = needed_but_missing(plain.model, plain.vehicle.params)
+    if missing:
+        raise InputError(
+            f"{experiment.path}: vehicle: {', '.join(missing)} missing, model "
+            f"{experiment.model.name} needs {'it' if len(missing) == 1 else 'them'}"
+        )
+    model, params = disturbed(plain)
+    start, pilot, ends = None, None, {}
+    if is_whole(plain.model):
+        begin = _begin(plain, wanted, where)
+        start = _extended(model, begin.state)
+        trimmed = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
+        # What trim leaves of a stick in the middle, 1e-79, is for no reader of a log.
+        trimmed = {k: v if abs(v) > _MIDDLE else 0.0 for k, v in trimmed.items()}
+        driven = {k: v + driven.get(k, np.zeros(n)) for k, v in trimmed.items()}
+        if wanted.hold_attitude:
+            pilot = _pilot(plain, begin, where)
+        if wanted.ground is not None:
+            ends = {"ground": events.ground(wanted.ground)}
+
+    def one(p: Any, u: Any, x: Any, pilot: Pilot | None) -> Trajectory:
+        return simulate(
+            model,
+            p,
+            u,
+            dt=1.0 / wanted.rate,
+            initial_state=x,
+            substeps=max(4, math.ceil(1.0 / (wanted.rate * _LONGEST_STEP))),
+            key=jax.random.key(wanted.seed) if experiment.config.disturbance else None,
+            feedback=pilot,
+            events=ends or None,
+        )
+
+    inputs = model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
+    run = jax.device_get(jax.jit(one)(params, inputs, start, pilot))
+    return run._replace(times=np.arange(n) / wanted.rate)
+
+
+def _check_whole(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
+    if is_whole(experiment.model):
+        return
+    given = {
+        "start": wanted.start is not None,
+        "wind": wanted.wind is not None,
+        "hold_attitude": wanted.hold_attitude,
+        "ground": wanted.ground is not None,
+    }
+    for name in (n for n, there in given.items() if there):
+        raise InputError(
+            f"{where}.{name}: model {experiment.model.name} is not a whole helicopter, wanted is "
+            "model: helicopter or helicopter-paper"
+        )
+
+
+def _begin(experiment: Experiment, wanted: SimulateConfig, where: str) -> Trim:
+    """The trimmed flight that a run begins in."""
+    condition = Condition(**wanted.start.model_dump()) if wanted.start else Condition()
+    wind = wanted.wind or (0.0, 0.0, 0.0)
+    try:
+        return trim(experiment.model, experiment.vehicle.params, condition, wind=wind)
+    except ValueError as e:
+        raise InputError(f"{where}.start: {e}") from e
+
+
+def _pilot(experiment: Experiment, begin: Trim, where: str) -> Pilot:
+    try:
+        return attitude_hold(experiment.model, experiment.vehicle.params, begin)
+    except ValueError as e:
+        raise InputError(f"{where}.hold_attitude: {e}") from e
+
+
+def _extended(model: Model, state: Any) -> Any:
+    """A state of the model without disturbance as one of the model with it, at zero there."""
+    given = {k: jnp.asarray(v) for k, v in naming.asdict(state).items()}
+    return naming.replace(zeros(model.State), **given)
+
+
+def _diverged(experiment: Experiment, run: Trajectory) -> str:
+    if not is_whole(experiment.model):
+        return "the run is not finite: the model is unstable with this vehicle"
+    good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
+    first = float(run.times[np.argmin(good)])
+    return (
+        f"the run is not finite from {first:g} s on, wanted is a shorter duration, gentler inputs "
+        "or hold_attitude: true"
+    )
+
+
+def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
+    """What is to be said of a run: its end, and where it left the range of model and sticks."""
+    found = []
+    if np.isfinite(run.ended):
+        wanted = experiment.config.simulate
+        assert wanted is not None
+        found.append(
+            f"the machine comes down to {wanted.ground:g} m at {float(run.ended):.4g} s: nothing "
+            "is written after that"
+        )
+    flown = run.times <= float(run.ended)
+    for name, out in run.outside.items():
+        left = np.asarray(out) & flown
+        if left.any():
+            share = left.sum() / flown.sum()
+            found.append(
+                f"the run leaves the model's range at {run.times[np.argmax(left)]:g} s: {name} "
+                f"({100 * share:.2g} % of the samples)"
+            )
+    for name, (low, high) in STICKS.items():
+        if not is_whole(experiment.model):
+            break
+        stick = np.asarray(getattr(run.inputs, name))[flown]
+        beyond = (stick < low) | (stick > high)
+        if beyond.any():
+            first = run.times[np.argmax(beyond)]
+            found.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
+    return tuple(found)
+
+
+def _until(run: Trajectory, ended: float) -> Trajectory:
+    """The samples of a run up to a time [s]."""
+    n = int(np.searchsorted(run.times, ended, side="right"))
+    parts = (run.times, run.states, run.outputs, run.inputs, run.outside)
+    times, states, outputs, inputs, outside = jax.tree.map(lambda v: v[:n], parts)
+    return run._replace(times=times, states=states, outputs=outputs, inputs=inputs, outside=outside)
 
 
 def follow(experiment: Experiment) -> Table:
@@ -72,6 +234,7 @@ def follow(experiment: Experiment) -> Table:
     """
     model = experiment.model
     parts: list[dict[str, Any]] = []
+    runs: dict[str, Trajectory] = {}
     gain = experiment.config.fit is not None and experiment.config.fit.nuisance.input_gain
     for flight in read_flights(experiment, gain=gain, moving_inputs=False):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
@@ -79,7 +242,9 @@ def follow(experiment: Experiment) -> Table:
         outputs = {n: np.asarray(v) for n, v in naming.asdict(run.outputs).items()}
         label = np.array([flight.name] * flight.n_samples)
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
-    return Table({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+        runs[f"{len(runs) + 1}: {flight.name}"] = jax.device_get(run)._replace(times=flight.times)
+    columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    return Table(columns, runs, ())
 
 
 def _inputs(
@@ -127,9 +292,9 @@ def _as_logged(
     times: np.ndarray,
     driven: dict[str, np.ndarray],
     outputs: dict[str, np.ndarray],
-) -> Table:
+) -> dict[str, np.ndarray]:
     if not experiment.config.flights:
-        return Table({"time": times, **driven, **outputs})
+        return {"time": times, **driven, **outputs}
     given, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
     model = experiment.model
     columns = {given.time.signal: times / _factor(given.time.unit, "s", f"{where}.time.unit")}
@@ -139,4 +304,4 @@ def _as_logged(
     ):
         for name, one in signal.items():
             columns[one.name] = values[name] / units.factor(one.unit, one.si)
-    return Table(columns)
+    return columns

@@ -65,3 +65,37 @@ def test_wrong_models_and_corrections(load, content, words):
     assert "xcell.yaml" in str(e.value)
     for word in words:
         assert word in str(e.value)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
+def test_shipped_configurations(path):
+    found = configuration.load(path)
+    wanted = found.config
+    assert wanted.simulate is not None
+    for i, flight in enumerate(wanted.flights):
+        where = f"{path}: flights[{i}].signals"
+        configuration.signals(found.model, "inputs", flight.signals.inputs, where)
+        configuration.signals(found.model, "outputs", flight.signals.outputs, where)
+        assert set(wanted.simulate.noise) <= set(flight.signals.outputs)
+    for name, free in wanted.fit.free.items() if wanted.fit else ():
+        low, high = free.lower or 0.0, free.upper or float("inf")
+        assert low < free.start < high
+        # A fit that begins at the truth could not fail.
+        assert free.start != float(getattr(found.vehicle.params, name))
+
+
+@pytest.mark.parametrize(
+    ("simulate", "words"),
+    [
+        ({"ground": 0.0}, ["simulate.ground", "found 0", "less than 0"]),
+        ({"start": {"clmb": 1}}, ["simulate.start.clmb", "did you mean 'climb'"]),
+        ({"wind": [1, 2]}, ["simulate.wind[2]", "missing"]),
+        ({"wind": [1, 2, float("nan")]}, ["simulate.wind[2]", "finite"]),
+        ({"hold_attitude": "often"}, ["simulate.hold_attitude", "'often'", "boolean"]),
+    ],
+)
+def test_wrong_runs(load, simulate, words):
+    with pytest.raises(InputError) as e:
+        load(simulate={"duration": 2, "rate": 50, **simulate})
+    for word in words:
+        assert word in str(e.value)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model, needed_but_missing, zeros
+from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
 """Where the sticks end, unless `trim` is told otherwise; the cyclic ones are lengths, and open."""
@@ -172,10 +173,18 @@ def _equations(model: Model) -> tuple[str, ...]:
     return tuple(n for n in names if n not in given and f"d{n}" not in names)
 
 
-def _check_model(model: Model) -> None:
+def is_whole(model: Model) -> bool:
+    """Whether a model is a whole helicopter, so that it can be trimmed."""
     wanted = {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"}
-    missing = wanted - set(naming.names(model.State))
-    if missing or len(_unknowns(model)) != len(_equations(model)):
+    return (
+        wanted <= set(naming.names(model.State))
+        and of_helicopter(model.Params)
+        and len(_unknowns(model)) == len(_equations(model))
+    )
+
+
+def _check_model(model: Model) -> None:
+    if not is_whole(model):
         raise ValueError(
             f"trim: model {model.name} is not a whole helicopter, wanted is one of "
             "models.helicopter(...)"

@@ -48,6 +48,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     )
     # Two equal lags halve the variance of the first; the gain brings it back.
     gain = 2.0**0.5 if poles == 2 else 1.0
+    limits = model.limits
 
     def inner(state: Any) -> Any:
         return model.State(**{n: getattr(state, n) for n in naming.names(model.State)})
@@ -84,4 +85,5 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         start=start,
         noise=noise,
         spread=lambda p: dict.fromkeys(chain, p.sigma_w),
+        limits=None if limits is None else lambda p, s, u: limits(p, inner(s), u),
     )

@@ -1,0 +1,139 @@
+"""Runs of the whole helicopter by configuration: trimmed start, wind, pilot, ground, limits."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax import config as configuration
+from heli_jax import generate
+from heli_jax.cli import main
+from heli_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
+HOVER_THROTTLE, HOVER_YAW = 0.49980745, -0.54833409
+
+
+@pytest.fixture
+def made(tmp_path):
+    """made(key=value, ...) -> the table of a run of two seconds with these keys in `simulate`."""
+
+    def made(model="helicopter", disturbance=None, **simulate):
+        path = tmp_path / "xcell.yaml"
+        content = {
+            "model": model,
+            "vehicle": XCELL,
+            "simulate": {"duration": 2, "rate": 50, **simulate},
+        }
+        if disturbance:
+            content["disturbance"] = disturbance
+        path.write_text(yaml.safe_dump(content))
+        return generate.generate(configuration.load(path))
+
+    return made
+
+
+STEPS = {"x_throttle": {"kind": "3-2-1-1", "amplitude": 3, "unit": "%", "step": 0.1, "pause": 1}}
+
+
+def test_hover_stays_and_sticks_are_added_to_the_trim(made):
+    found = made(inputs=STEPS)
+    assert found.notes == ()
+    c = found.columns
+    still, added = c["time"] < 1.0, c["x_throttle"] - HOVER_THROTTLE
+    assert np.ptp(c["z"][still]) < 1e-8
+    assert np.ptp(c["yaw"][still]) < 1e-8
+    assert np.ptp(c["z"]) > 0.01
+    np.testing.assert_allclose(c["x_yaw"], HOVER_YAW, atol=1e-6)
+    assert set(np.round(added, 6)) == {-0.03, 0.0, 0.03}
+
+
+def test_start_wind_pilot_and_ground(made):
+    found = made(
+        start={"ahead": 4.0, "climb": -1.0, "heading": 0.5},
+        wind=[2.0, 0.0, 0.0],
+        hold_attitude=True,
+        ground=-1.0,
+        noise={"roll": {"sd": 2, "unit": "mrad"}},
+    )
+    # A trimmed descent at 1 m/s is at -1 m after one second; the row at that moment may be there.
+    assert len(found.notes) == 1
+    assert "comes down to -1 m at 1 s" in found.notes[0]
+    c = found.columns
+    assert c["time"].size in (50, 51)
+    assert set(c) >= {"x_throttle", "rotor_speed", "dz"}
+    assert not any("wind" in name for name in c)
+    np.testing.assert_allclose(c["dx"], 4.0 * np.cos(0.5), atol=1e-6)
+    np.testing.assert_allclose(c["dy"], 4.0 * np.sin(0.5), atol=1e-6)
+    np.testing.assert_allclose(c["z"], -c["time"], atol=1e-6)
+    assert 1e-3 < np.std(c["roll"]) < 3e-3
+    [run] = found.runs.values()
+    assert np.all(run.inputs.wind_x == 2.0)
+    assert run.times.size == c["time"].size == run.states.z.size
+
+
+def test_what_leaves_the_range_is_told(made):
+    found = made(
+        inputs={"x_throttle": {"kind": "sweep", "amplitude": 0.8, "band": [0.2, 0.4]}},
+        disturbance={"axis": "roll", "sigma_w": 0.1, "tau_w": 1.0},
+    )
+    notes = " / ".join(found.notes)
+    assert "leaves the model's range at" in notes
+    assert "vortex ring" in notes
+    assert "x_throttle is beyond its ends of 0 and 1" in notes
+    assert np.ptp(found.columns["roll"]) > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("simulate", "words"),
+    [
+        ({"start": {"climb": 50}}, ["simulate.start", "no trim of 50 m/s climb exists"]),
+        ({"start": {"climb": -6}}, ["simulate.start", "model's range", "vortex ring"]),
+        ({"inputs": {"x_rol": {"amplitude": 1}}}, ["no input 'x_rol'", "did you mean 'x_roll'"]),
+        ({"noise": {"rol": {"sd": 1}}}, ["no output 'rol'", "did you mean 'roll'"]),
+    ],
+)
+def test_what_cannot_be_flown(made, simulate, words):
+    with pytest.raises(InputError) as e:
+        made(**simulate)
+    for word in ("xcell.yaml", *words):
+        assert word in str(e.value)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [{"start": {}}, {"wind": [0, 0, 0]}, {"hold_attitude": True}, {"ground": -1.0}],
+    ids=lambda key: next(iter(key)),
+)
+def test_keys_of_the_whole_helicopter_alone(made, key):
+    with pytest.raises(InputError, match=rf"simulate.{next(iter(key))}: model roll is not a whole"):
+        made(model="roll", **key)
+
+
+def test_a_vehicle_without_what_the_model_needs(tmp_path):
+    path = tmp_path / "bench.yaml"
+    bench = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
+    content = {"model": "helicopter", "vehicle": bench, "simulate": {"duration": 1, "rate": 50}}
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=r"bench.yaml: vehicle: m, .* missing, model helicopter"):
+        generate.generate(configuration.load(path))
+
+
+def test_a_shipped_manoeuvre_from_the_command_line(tmp_path, capsys):
+    out = tmp_path / "roll.csv"
+    config = ROOT / "configs" / "xcell-roll.yaml"
+    assert main(["simulate", str(config), "--out", str(out)]) == 0
+    assert "wrote 200 samples" in capsys.readouterr().err
+    head, *rows = out.read_text().splitlines()
+    names = head.replace('"', "").split(",")
+    assert names[:6] == ["t", "stick_roll", "stick_pitch", "stick_yaw", "throttle", "phi"]
+    numbers = np.array([[float(v) for v in row.split(",")] for row in rows])
+    table = dict(zip(names, numbers.T, strict=True))
+    assert set(np.round(table["stick_roll"], 9)) == {-0.5, 0.0, 0.5}
+    np.testing.assert_allclose(table["throttle"], 100 * HOVER_THROTTLE, atol=1e-4)
+    # The rate is the angle's slope, both with their noise.
+    slope = np.gradient(table["phi"], table["t"])
+    assert np.corrcoef(slope, table["p"])[0, 1] > 0.95
+    assert 5 < np.ptp(table["phi"]) < 60
