@@ -10,8 +10,6 @@ coefficients.
 
 import ctypes
 import os
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 import scipy.signal
+from kernels import compiled, pointer
 
 from heli_jax import (
     Flight,
@@ -137,14 +136,6 @@ def rls_against_numpy(flight: Flight) -> tuple[float, ...]:
     return ratios(lambda: rls(uj, yj).theta, loop)
 
 
-def compiled_kernel() -> Any:
-    folder = tempfile.mkdtemp()
-    out = Path(folder) / "kernel.so"
-    flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
-    subprocess.run(["gcc", *flags, str(HERE / "kernel.c"), "-o", str(out), "-lm"], check=True)
-    return ctypes.CDLL(str(out))
-
-
 def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Array]:
     """Mean-square misfit of each vehicle, in blocks, nothing else kept."""
     u = models.roll_on_stand.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"]))
@@ -170,13 +161,10 @@ def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Arr
 
 
 def simulation_against_c(flight: Flight, solver: str) -> tuple[float, ...]:
-    kernel = compiled_kernel()
+    kernel = compiled("kernel.c")
     Ixx = np.linspace(0.5, 2.0, BATCH) * float(VEHICLE.Ixx)
     u, y = flight.inputs["x_roll"], flight.outputs["roll"]
     cost = np.zeros(BATCH)
-
-    def pointer(a: np.ndarray) -> Any:
-        return a.ctypes.data_as(ctypes.c_void_p)
 
     size = ctypes.c_size_t
     if solver == "exact":

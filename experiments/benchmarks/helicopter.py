@@ -1,0 +1,320 @@
+"""Speed of the whole helicopter against C and SciPy, side by side in one run.
+
+The consistent model from hover, 10 s at 50 Hz, RK4 with 4 steps a sample, small steps of all
+sticks: against the same equations in C and in SciPy, and its derivatives against itself.
+
+Everything is on one core, by the affinity of the process before JAX starts, so that JAX has one
+thread as the C kernel has. Times are CPU seconds of the process, in which other load on the machine
+counts least; each pair is run in turn, and the figures are the medians of the times and of the
+ratios. Compilation is from the trace to the machine code.
+"""
+
+import ctypes
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from kernels import compiled, pointer
+from scipy.integrate import solve_ivp
+
+from heli_jax import accumulate, load_vehicle, models, simulate, trim
+from heli_jax.naming import asdict, replace
+
+jax.config.update("jax_enable_x64", True)
+VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "x-cell-60.yaml")
+MODEL = models.helicopter("consistent")
+N, DT, SUBSTEPS, VEHICLES, BLOCK = 500, 0.02, 4, 1024, 128
+IXX = np.linspace(0.8, 1.25, VEHICLES) * float(VEHICLE.Ixx)
+STICK_STEPS = {"x_roll": 2e-4, "x_pitch": 2e-4, "x_yaw": 0.02, "x_throttle": 0.01}
+FREE = (
+    "Ixx", "Iyy", "Izz", "If", "m", "a", "a_T", "hr", "K_theta0", "K_theta0T", "K_throttle", "Sx",
+)  # fmt: skip
+IN_C = (
+    "Iyy", "Izz", "Ir", "m", "g", "rho", "R", "c", "a", "B", "Cd0", "hr", "lr", "R_T", "c_T", "a_T",
+    "L_T", "K_Omega", "K_theta0", "K_theta0T", "K_throttle", "If", "R1", "R2",
+    "L1", "L2", "L3", "L4", "L5", "Sx", "Sy", "Sz",
+)  # fmt: skip
+"""The vehicle's constants in the order of the C kernel's."""
+
+
+class Run(NamedTuple):
+    """What all programs are given."""
+
+    start: Any
+    """the state in hover"""
+    inputs: Any
+    """the sticks of hover with steps of half a second, one stick after another; arrays (N,)"""
+
+
+def hover_and_steps() -> Run:
+    at, k = trim(MODEL, VEHICLE), np.arange(N)
+    sign = np.where(k // 100 % 2 == 0, 1.0, -1.0)
+    steps = {
+        n: jnp.asarray(float(getattr(at.inputs, n)) + size * sign * (k // 25 % 4 == i))
+        for i, (n, size) in enumerate(STICK_STEPS.items())
+    }
+    return Run(jax.tree.map(jnp.asarray, at.state), MODEL.Inputs(**steps))
+
+
+def compile_time(f: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
+    """The compiled function and how long it took [s]."""
+    begin = time.process_time()
+    program = jax.jit(f).lower(*args).compile()
+    return program, time.process_time() - begin
+
+
+def in_turn(
+    ours: Callable[[], Any], theirs: Callable[[], Any], runs: int
+) -> tuple[float, float, float]:
+    """Medians of both times [s], taken in turn, and of their ratio."""
+    times = []
+    for f in [ours, theirs] * (runs + 1):
+        begin = time.process_time()
+        jax.block_until_ready(f())
+        times.append(time.process_time() - begin)
+    a, b = np.reshape(times, (-1, 2))[1:].T
+    return float(np.median(a)), float(np.median(b)), float(np.median(a / b))
+
+
+# The batch.
+
+
+def batch(run: Run) -> Callable[[Array], Array]:
+    """Sum of roll^2 of vehicles that differ in Ixx, in blocks, nothing else kept."""
+
+    def one(Ixx: Array) -> Array:
+        total, _ = accumulate(
+            MODEL,
+            replace(VEHICLE, Ixx=Ixx),
+            run.inputs,
+            lambda total, out, _: total + out.roll**2,
+            jnp.zeros(()),
+            dt=jnp.asarray(DT),
+            initial_state=run.start,
+            solver="rk4",
+            substeps=SUBSTEPS,
+            adjoint=diffrax.ForwardMode(),
+        )
+        return total
+
+    return lambda Ixx: jax.lax.map(one, Ixx, batch_size=BLOCK)
+
+
+def in_c(run: Run) -> Callable[[], np.ndarray]:
+    kernel = compiled("helicopter.c")
+    vehicle = np.array([float(getattr(VEHICLE, n)) for n in IN_C])
+    start = np.array([float(v) for v in run.start])
+    sticks = np.ascontiguousarray(np.stack([np.asarray(u) for u in run.inputs], axis=1))
+    cost, size = np.zeros(VEHICLES), ctypes.c_size_t
+
+    def call() -> np.ndarray:
+        kernel.run(
+            pointer(vehicle), pointer(IXX), pointer(start), pointer(sticks), pointer(cost),
+            size(VEHICLES), size(N), ctypes.c_double(DT), ctypes.c_int(SUBSTEPS),
+        )  # fmt: skip
+        return cost
+
+    return call
+
+
+# SciPy: the same equations once more, with plain Python's numbers, the fastest way for one vehicle.
+
+
+def induced_velocity(V2: float, W: float, T0: float, b: float) -> float:
+    """The Newton steps of the package's inflow."""
+    sign = -1.0 if T0 < 0 else 1.0
+    c, t = sign * W, sign * T0
+    q = 2 * c + b
+    root = math.sqrt(q * q + 8 * t) + 1e-8
+    axial = 2 * t / (q + root) if q > 0 else 0.25 * (root - q)
+    x = min(axial, t / (2 * math.sqrt(V2 + 1e-16) + b))
+    for _ in range(5):
+        w = c + x
+        s2 = V2 + w * w + 1e-16
+        s = math.sqrt(s2)
+        slope = 2 * (s2 + x * w) + b * s
+        x -= s * (2 * x * s + b * x - t) / (slope if slope > 0 else 2 * s2 + b * s)
+        x = max(x, 0.0)
+    return sign * x
+
+
+def right_hand_side(v: dict[str, float]) -> Callable[..., list[float]]:
+    """rates(t, state, sticks) of a vehicle, its factors computed beforehand."""
+    sin, cos, sqrt, pi, rho, B, R = math.sin, math.cos, math.sqrt, math.pi, v["rho"], v["B"], v["R"]
+    half = v["a"] * v["c"] / (pi * R)
+    half_T, RK = v["a_T"] * v["c_T"] / (pi * v["R_T"]), v["R_T"] * v["K_Omega"]
+    per_speed, lift = 0.5 * half * B**2 * R, half * B**3 / 3 * R**2 * v["K_theta0"]
+    per_speed_T, lift_T = 0.5 * half_T * B**2 * RK, half_T * B**3 / 3 * RK**2 * v["K_theta0T"]
+    area, area_T = rho * pi * R**2, rho * pi * v["R_T"] ** 2
+    drag_Q, scale_Q = rho * R**4 * v["c"] * v["Cd0"] / 4, area * R * half
+    lift_Q, B2 = B**3 / 3 * R * v["K_theta0"], B**2
+    hub = rho * v["a"] * v["c"] * R**4 / 8
+    bar = rho * v["a"] * v["c"] * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
+    link = v["L1"] * (v["L2"] + v["L3"])
+    by_stick, by_bar = v["L3"] / link, v["L2"] * v["L4"] / link
+    Ixx, Iyy, Izz, Ir, m, g = v["Ixx"], v["Iyy"], v["Izz"], v["Ir"], v["m"], v["g"]
+    hr, lr, L_T, L5, K, drag = v["hr"], v["lr"], v["L_T"], v["L5"], v["K_throttle"], rho / 2 / m
+    Sx, Sy, Sz = v["Sx"], v["Sy"], v["Sz"]
+
+    def rates(t: float, state: Any, sticks: list[float]) -> list[float]:
+        _, _, _, phi, theta, psi, dx, dy, dz, df, dt, ds, roll_bar, pitch_bar, Om = state.tolist()
+        x_roll, x_pitch, x_yaw, x_throttle = sticks
+        sf, cf, st, ct, sp, cp = sin(phi), cos(phi), sin(theta), cos(theta), sin(psi), cos(psi)
+        ahead, aside = dx * cp + dy * sp, dy * cp - dx * sp
+        below = ahead * st - dz * ct
+        u, vb, w = ahead * ct + dz * st, aside * cf + below * sf, below * cf - aside * sf
+        p, q, r = df - ds * st, dt * cf + ds * ct * sf, ds * ct * cf - dt * sf
+        roll, pitch = by_stick * x_roll + by_bar * roll_bar, by_stick * x_pitch + by_bar * pitch_bar
+        uh, vh, W, b = u - hr * q, vb + hr * p - lr * r, -(w + lr * q), per_speed * Om
+        edge = uh * pitch - vh * roll
+        T0 = lift * x_throttle * Om * Om + b * (edge - W)
+        vi = induced_velocity(uh * uh + vh * vh, W, T0, b)
+        T, flow = area * (T0 - b * vi), W + vi
+        lifting = lift_Q * Om * x_throttle - B2 / 2 * flow + B2 / 4 * edge
+        torque = drag_Q * Om * Om + scale_Q * flow * lifting
+        W, b = L_T * r - vb, per_speed_T * Om
+        T0 = lift_T * x_yaw * Om * Om - b * W
+        T_T = area_T * (T0 - b * induced_velocity(u * u + (w + L_T * q) ** 2, W, T0, b))
+        dp = (hub * Om * (Om * roll - p) - (Izz - Iyy) * q * r) / Ixx
+        dq = (hub * Om * (Om * pitch - q) - T * lr - (Ixx - Izz) * r * p) / Iyy
+        dr = (L_T * T_T + Ir * K * x_throttle - (Iyy - Ixx) * p * q) / Izz
+        dds = (dq * sf + dr * cf + df * dt + ds * dt * st) / ct
+        pull, slow = T / m, drag * sqrt(u * u + vb * vb + w * w)
+        fu, fv, fw = slow * Sx * u, slow * Sy * vb, slow * Sz * w + pull
+        aside, below = fv * cf - fw * sf, fv * sf + fw * cf
+        ahead = fu * ct + below * st
+        return [
+            dx, dy, dz, df, dt, ds,
+            aside * sp - ahead * cp, -ahead * sp - aside * cp, below * ct - fu * st - g,
+            dp + dds * st + ds * dt * ct, dq * cf - dr * sf - df * ds * ct, dds,
+            bar * Om * (x_roll / L5 - roll_bar) - p, bar * Om * (x_pitch / L5 - pitch_bar) - q,
+            K * x_throttle - torque / Ir,
+        ]  # fmt: skip
+
+    return rates
+
+
+def first_vehicle() -> dict[str, float]:
+    return {n: float(v) for n, v in asdict(VEHICLE).items()} | {"Ixx": float(IXX[0])}
+
+
+def check_right_hand_side(run: Run) -> None:
+    rng, rates = np.random.default_rng(0), right_hand_side(first_vehicle())
+    vehicle = replace(VEHICLE, Ixx=jnp.asarray(IXX[0]))
+    for _ in range(20):
+        x = np.array([float(v) for v in run.start]) + 0.3 * rng.standard_normal(len(run.start))
+        u = [float(v[0]) for v in run.inputs]
+        found = MODEL.vector_field(vehicle, MODEL.State(*jnp.asarray(x)), MODEL.Inputs(*u))
+        np.testing.assert_allclose(rates(0.0, x, u), np.array(found), rtol=1e-9, atol=1e-9)
+
+
+def by_samples(run: Run) -> float:
+    """Sum of roll^2, one call of solve_ivp a sample, as an input held for it wants."""
+    rates, x = right_hand_side(first_vehicle()), np.array([float(v) for v in run.start])
+    sticks = np.stack([np.asarray(u) for u in run.inputs], axis=1).tolist()
+    cost = x[3] ** 2
+    for u in sticks[:-1]:
+        x = solve_ivp(rates, (0.0, DT), x, method="RK45", rtol=1e-6, args=(u,)).y[:, -1]
+        cost += x[3] ** 2
+    return float(cost)
+
+
+def by_one_call(run: Run) -> float:
+    """Sum of roll^2, one call with steps of at most a sample, the sticks looked up by time."""
+    rates, x = right_hand_side(first_vehicle()), np.array([float(v) for v in run.start])
+    sticks = np.stack([np.asarray(u) for u in run.inputs], axis=1).tolist()
+    times = DT * np.arange(N)
+
+    def looked_up(t: float, state: Any) -> list[float]:
+        return rates(t, state, sticks[int(t / DT)])
+
+    ends = (0.0, float(times[-1]))
+    found = solve_ivp(looked_up, ends, x, method="RK45", rtol=1e-6, max_step=DT, t_eval=times)
+    return float(np.sum(found.y[3] ** 2))
+
+
+# Derivatives.
+
+
+def outputs(run: Run) -> Callable[[Array], Array]:
+    """The outputs (13, N) of a vehicle as a function of twelve of its parameters."""
+
+    def of(values: Array) -> Array:
+        vehicle = replace(VEHICLE, **dict(zip(FREE, values, strict=True)))
+        found = simulate(
+            MODEL, vehicle, run.inputs, dt=jnp.asarray(DT), initial_state=run.start,
+            solver="rk4", substeps=SUBSTEPS, adjoint=diffrax.ForwardMode(),
+        )  # fmt: skip
+        return jnp.stack(found.outputs)
+
+    return of
+
+
+def check_derivative(
+    forward: Callable[[Array], Array], jacobian: Callable[[Array], Array], z: Array
+) -> None:
+    """The column of m against a central difference."""
+    h = 1e-5 * z * (np.array(FREE) == "m")
+    wanted = (forward(z + h) - forward(z - h)) / (2 * h.sum())
+    found = jacobian(z)[:, :, FREE.index("m")]
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5 * float(jnp.abs(wanted).max()))
+
+
+def main() -> None:
+    run = hover_and_steps()
+    rows: list[tuple[str, tuple[float, float, float], str]] = []
+    seconds: dict[str, float] = {}
+
+    Ixx, size = jnp.asarray(IXX), f"{VEHICLES} vehicles"
+    ours, seconds[f"{size}, sum of roll^2"] = compile_time(batch(run), Ixx)
+    theirs = in_c(run)
+    np.testing.assert_allclose(ours(Ixx), theirs(), rtol=1e-9)
+    rows.append((f"{size} / C", in_turn(lambda: ours(Ixx), theirs, 9), "<= 3"))
+
+    check_right_hand_side(run)
+    for name, alone in (("a sample", by_samples), ("a run", by_one_call)):
+        np.testing.assert_allclose(alone(run), ours(Ixx)[0], rtol=1e-3)
+        a, b, ratio = in_turn(lambda: ours(Ixx), lambda alone=alone: alone(run), 5)
+        scaled = (a, VEHICLES * b, ratio / VEHICLES)
+        rows.append((f"{size} / as many solve_ivp, one call {name}", scaled, "<= 0.002"))
+
+    z = jnp.asarray([float(getattr(VEHICLE, n)) for n in FREE])
+    zs = z * jnp.linspace(0.98, 1.02, BLOCK)[:, None]
+    one = outputs(run)
+    for name, f, slope, at in (
+        ("1 vehicle", one, jax.jacfwd(one), z),
+        (f"{BLOCK} vehicles", jax.vmap(one), jax.vmap(jax.jacfwd(one)), zs),
+    ):
+        forward, seconds[f"{name}, outputs"] = compile_time(f, at)
+        jacobian, seconds[f"{name}, outputs' Jacobian"] = compile_time(slope, at)
+        if at is z:
+            check_derivative(forward, jacobian, z)
+        times = in_turn(lambda f=jacobian, at=at: f(at), lambda f=forward, at=at: f(at), 9)
+        rows.append((f"Jacobian, {len(FREE)} parameters, {name} / outputs", times, "<= 15"))
+
+    evaluations = VEHICLES * (N - 1) * SUBSTEPS * 4
+    print(f"{N} samples, {SUBSTEPS} steps each, blocks of {BLOCK}, one core, jax {jax.__version__}")
+    print(f"{'':53s} {'ours [ms]':>10s} {'other [ms]':>11s} {'ratio':>8s}  wanted")
+    for name, (a, b, ratio), wanted in rows:
+        print(f"{name:53s} {1e3 * a:10.2f} {1e3 * b:11.2f} {ratio:8.4f}  {wanted}")
+    (_, (a, b, _), _), *_ = rows
+    each = f"{1e9 * a / evaluations:.0f} ns, in C {1e9 * b / evaluations:.0f} ns"
+    print(f"one right-hand side: {each}")
+    print(f"{'compilation':53s} {'[s]':>10s} {'':11s} {'':8s}  wanted")
+    for name, value in seconds.items():
+        print(f"{name:53s} {value:10.1f} {'':11s} {'':8s}  <= 20")
+
+
+if __name__ == "__main__":
+    main()

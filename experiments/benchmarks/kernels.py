@@ -1,0 +1,23 @@
+"""C kernels beside these scripts: compiled when they are needed, and called with NumPy arrays."""
+
+import ctypes
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
+
+
+def compiled(source: str) -> Any:
+    """The library of a C file of this folder."""
+    out = Path(tempfile.mkdtemp()) / "kernel.so"
+    file = Path(__file__).parent / source
+    subprocess.run(["gcc", *FLAGS, str(file), "-o", str(out), "-lm"], check=True)
+    return ctypes.CDLL(str(out))
+
+
+def pointer(a: np.ndarray) -> Any:
+    return a.ctypes.data_as(ctypes.c_void_p)
