@@ -43,7 +43,7 @@ def read_flight(
         known: parameters that differ in this run, SI.
         hold_out: whether the run serves for validation alone.
         name: what to call the run.
-        moving_inputs: whether an input that never moves is refused.
+        moving_inputs: whether a run in which no input ever moves is refused.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.
@@ -77,20 +77,22 @@ def read_flight(
 
 
 def require_moving_inputs(flight: Flight) -> None:
-    """Refuse a flight in which an input never moves: its effect cannot be learnt.
+    """Refuse a flight in which no input moves: nothing can be learnt from it.
 
     Raises:
-        InputError: naming the input and the value it keeps.
+        InputError: naming the first input and the value it keeps.
     """
     path = flight.source.path if flight.source else flight.name or "flight"
-    for name, values in flight.inputs.items():
-        if values.min() == values.max():
-            raise wrong(
-                path,
-                f"stays at {values[0]:.6g} (SI) for all of {flight.duration:.6g} s, so nothing"
-                " can be learnt from it; wanted is an input that moves",
-                f"input {name!r}",
-            )
+    if any(values.min() != values.max() for values in flight.inputs.values()):
+        return
+    name, values = next(iter(flight.inputs.items()))
+    others = " as do the others" if len(flight.inputs) > 1 else ""
+    raise wrong(
+        path,
+        f"stays at {values[0]:.6g} (SI) for all of {flight.duration:.6g} s{others}, so nothing"
+        " can be learnt from it; wanted is an input that moves",
+        f"input {name!r}",
+    )
 
 
 @dataclass(frozen=True, eq=False)

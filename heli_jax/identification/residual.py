@@ -18,7 +18,6 @@ from heli_jax.identification.kalman import Innovations, innovations
 from heli_jax.identification.layout import Data, FlightData, Layout, Noise, Unknowns, unpack
 from heli_jax.identification.sparsity import seeded, spread_out
 from heli_jax.simulation.simulate import Trajectory, simulate
-from heli_jax.simulation.solvers import RK4
 
 _FLOOR = 1e-3
 """The likelihood's row stays real however far the noise falls; the next round has another level."""
@@ -66,15 +65,13 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
 def _simulated_one(
     layout: Layout, params: Any, inputs: Any, dt: Any, state: Any, shift: Any
 ) -> Trajectory:
-    # The stages as a loop: with a large model it compiles in a quarter of the time.
-    rk4 = not layout.model.linear and layout.solver in (None, "rk4")
     return simulate(
         layout.model,
         params,
         inputs,
         dt=dt,
         initial_state=state,
-        solver=RK4(rolled=True) if rk4 else layout.solver,
+        solver=layout.solver,
         substeps=layout.substeps,
         delay=shift,
         block=layout.block,

@@ -207,6 +207,10 @@ def _start(model: Model, params: Any, initial_state: Any, inputs: Any, dt: Any) 
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
 
 
+_LARGE = 8
+"""States beyond which the stages of RK4 are a loop: 5 % slower, a quarter of the compilation."""
+
+
 def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.AbstractSolver:
     if solver is None:
         solver = "exact" if model.linear else "rk4"
@@ -215,7 +219,7 @@ def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.Abstra
             raise ValueError(f"model {model.name!r} is not linear: use solver='rk4' or another")
         return Exact()
     if solver == "rk4":
-        return RK4()
+        return RK4(rolled=len(naming.names(model.State)) > _LARGE)
     if isinstance(solver, dfx.AbstractSolver):
         return solver
     raise ValueError(f"unknown solver {solver!r}: use 'exact', 'rk4' or a diffrax solver")
