@@ -70,6 +70,13 @@ def _parser() -> argparse.ArgumentParser:
     simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
     with_config(simulate)
     simulate.add_argument("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)")
+    simulate.add_argument(
+        "--view",
+        nargs="?",
+        const="",
+        metavar="HTML",
+        help="also a page with figures and the flight in 3D (default: beside --out)",
+    )
     info = command("info", _info, "signals, rates, duration and gaps of a log")
     info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
     info.add_argument("--time", metavar="NAME", help="the column of time stamps")
@@ -198,20 +205,30 @@ def _simulate(options: argparse.Namespace) -> int:
     out = Path(options.out) if options.out else None
     if out is not None and out.suffix.lower() not in (".csv", ".parquet"):
         raise InputError(f"--out {out}: wanted is a name ending in .csv or .parquet")
+    view = None
+    if options.view is not None:
+        beside = (out or Path(Path(options.config).name)).with_suffix(".html")
+        view = Path(options.view) if options.view else beside
+        if view.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"--view {view}: wanted is a name ending in .html")
     _prepare_jax()
     from heli_jax import config as configuration
     from heli_jax import generate, output
 
     experiment = configuration.load(options.config, options.set)
     if experiment.config.simulate is not None:
-        table = generate.generate(experiment)
+        simulated = generate.generate(experiment)
     else:
-        table = generate.follow(experiment)
-    for note in table.notes:
+        simulated = generate.follow(experiment)
+    for note in simulated.notes:
         _say(f"{options.config}: {note}")
-    output.write_table(out, table.columns)
+    output.write_table(out, simulated.columns)
     if out is not None:
-        _say(f"wrote {len(next(iter(table.columns.values())))} samples to {out}")
+        _say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
+    if view is not None:
+        output.write_view(view, experiment, simulated)
+        whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
+        _say(f"wrote {view}{whole}")
     return DONE
 
 

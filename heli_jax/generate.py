@@ -32,17 +32,24 @@ _LONGEST_STEP = 0.005
 _MIDDLE = 1e-14
 
 
-class Table(NamedTuple):
+class Simulated(NamedTuple):
     """Columns of simulated runs under the names and in the units of a log."""
 
     columns: dict[str, np.ndarray]
+    model: Model
+    """what was simulated, with wind where there is some, and without the disturbance"""
     runs: dict[str, Trajectory]
     """the runs by name, without noise, in SI, as NumPy arrays"""
     notes: tuple[str, ...]
     """what is to be said of them, a sentence each"""
 
+    @property
+    def whole(self) -> bool:
+        """Whether it was a whole helicopter that flew."""
+        return is_whole(self.model)
 
-def generate(experiment: Experiment) -> Table:
+
+def generate(experiment: Experiment) -> Simulated:
     """The run of the configuration's `simulate`, with noise and disturbance.
 
     Its columns have the names and units of the first flight's `signals`, so that the same
@@ -63,7 +70,9 @@ def generate(experiment: Experiment) -> Table:
         raise InputError(f"{experiment.path}: disturbance: simulate needs its sigma_w and tau_w")
     _check_outputs(experiment, wanted, where)
     driven = _inputs(experiment, wanted, n, rng, where)
-    run = _run(experiment, wanted, n, driven, where)
+    _check_whole(experiment, wanted, where)
+    plain = in_wind(experiment) if wanted.wind is not None else experiment
+    run = _run(plain, wanted, n, driven, where)
     if not bool(run.finite):
         raise InputError(f"{where}: {_diverged(experiment, run)}")
     notes = _notes(experiment, run)
@@ -77,7 +86,7 @@ def generate(experiment: Experiment) -> Table:
         outputs[name] = outputs[name] + draws[: outputs[name].size]
     acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
-    return Table(columns, {experiment.path.stem: run}, notes)
+    return Simulated(columns, plain.model, {experiment.path.stem: run}, notes)
 
 
 def _check_outputs(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
@@ -98,25 +107,23 @@ def _run(
     where: str,
 ) -> Trajectory:
     """The run as NumPy arrays, without measurement noise."""
-    _check_whole(experiment, wanted, where)
-    plain = in_wind(experiment) if wanted.wind is not None else experiment
-    missing = needed_but_missing(plain.model, plain.vehicle.params)
+    missing = needed_but_missing(experiment.model, experiment.vehicle.params)
     if missing:
         raise InputError(
             f"{experiment.path}: vehicle: {', '.join(missing)} missing, model "
             f"{experiment.model.name} needs {'it' if len(missing) == 1 else 'them'}"
         )
-    model, params = disturbed(plain)
+    model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
-    if is_whole(plain.model):
-        begin = _begin(plain, wanted, where)
+    if is_whole(experiment.model):
+        begin = _begin(experiment, wanted, where)
         start = _extended(model, begin.state)
         trimmed = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
         # What trim leaves of a stick in the middle, 1e-79, is for no reader of a log.
         trimmed = {k: v if abs(v) > _MIDDLE else 0.0 for k, v in trimmed.items()}
         driven = {k: v + driven.get(k, np.zeros(n)) for k, v in trimmed.items()}
         if wanted.hold_attitude:
-            pilot = _pilot(plain, begin, where)
+            pilot = _pilot(experiment, begin, where)
         if wanted.ground is not None:
             ends = {"ground": events.ground(wanted.ground)}
 
@@ -226,7 +233,7 @@ def _until(run: Trajectory, ended: float) -> Trajectory:
     return run._replace(times=times, states=states, outputs=outputs, inputs=inputs, outside=outside)
 
 
-def follow(experiment: Experiment) -> Table:
+def follow(experiment: Experiment) -> Simulated:
     """The model driven by the inputs of the configuration's flights, in SI.
 
     Raises:
@@ -244,7 +251,7 @@ def follow(experiment: Experiment) -> Table:
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
         runs[f"{len(runs) + 1}: {flight.name}"] = jax.device_get(run)._replace(times=flight.times)
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    return Table(columns, runs, ())
+    return Simulated(columns, model, runs, ())
 
 
 def _inputs(

@@ -1,10 +1,12 @@
 """What the commands print and write."""
 
+import contextlib
 import math
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +22,9 @@ from heli_jax.identification.problem import Problem
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+
+if TYPE_CHECKING:
+    from heli_jax.generate import Simulated
 
 
 def write_fit(
@@ -177,13 +182,33 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
     if out is None:
         tables.write_table(sys.stdout.buffer, columns)
         return
+    with _whole(out, "--out") as temporary:
+        tables.write_table(temporary, columns)
+
+
+def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simulated") -> None:
+    """The page of what was simulated at `out`, which appears whole or not at all.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    from heli_jax.report.view import write_view as write
+
+    title, params = experiment.path.stem, experiment.vehicle.params
+    with _whole(out, "--view") as temporary:
+        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes)
+
+
+@contextlib.contextmanager
+def _whole(out: Path, option: str) -> Iterator[Path]:
+    """A place beside `out` to write to, which becomes `out` at the end."""
     temporary = out.with_name(f".{out.stem}.part{out.suffix}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        tables.write_table(temporary, columns)
+        yield temporary
         temporary.replace(out)
     except OSError as e:
-        raise InputError(f"--out {out}: cannot be written ({e.strerror or e})") from e
+        raise InputError(f"{option} {out}: cannot be written ({e.strerror or e})") from e
     finally:
         temporary.unlink(missing_ok=True)
 

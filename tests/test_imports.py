@@ -108,6 +108,7 @@ def test_nothing_imports_the_command_line(name):
         ("lineax", {"identification"}),
         ("pydantic", {"config.py"}),
         ("matplotlib", {"report"}),
+        ("plotly", {"report"}),
         ("yaml", {"yaml_file.py", "output.py"}),
         ("pint", {"units.py"}),
         ("jinja2", {"report"}),

@@ -157,6 +157,19 @@ def plain_log_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def svg(draw: Callable[[], Figure | None]) -> tuple[str, bytes] | None:
+    """Draw a figure in the style: its first title and the SVG; None where there is none."""
+    with matplotlib.rc_context(STYLE):
+        made = draw()
+        return None if made is None else (made.axes[0].get_title("left"), _svg(made))
+
+
+def _svg(made: Figure) -> bytes:
+    buffer = io.BytesIO()
+    made.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
 def save(draw: Callable[[], Figure | None], path: Path) -> tuple[str, bytes] | None:
     """Draw a figure in the style and write `path`.svg and `path`.png.
 
@@ -166,8 +179,7 @@ def save(draw: Callable[[], Figure | None], path: Path) -> tuple[str, bytes] | N
         made = draw()
         if made is None:
             return None
-        svg = io.BytesIO()
-        made.savefig(svg, format="svg", metadata={"Date": None})
+        data = _svg(made)
         made.savefig(path.with_suffix(".png"), dpi=_DPI)
-    path.with_suffix(".svg").write_bytes(svg.getvalue())
-    return made.axes[0].get_title("left"), svg.getvalue()
+    path.with_suffix(".svg").write_bytes(data)
+    return made.axes[0].get_title("left"), data

@@ -1,0 +1,246 @@
+"""A flight in 3D: a plotly figure with the path and a machine that flies along it."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from heli_jax.report import style
+from heli_jax.simulation.trajectory import Trajectory
+
+MOST_FRAMES = 200
+"""moments that are shown at most"""
+_PATH_POINTS = 2000
+_SMALLEST = 0.1
+"""rotor diameter over the length of the path: a smaller machine is drawn larger"""
+_AROUND = 16
+_DIGITS = 4
+_LIGHT = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.1}
+_VIEWS = {
+    "from the side": {"x": 0.3, "y": -1.9, "z": 0.5},
+    "from behind": {"x": -1.9, "y": 0.0, "z": 0.6},
+    "from above": {"x": -0.01, "y": 0.0, "z": 2.3},
+    "three-quarter": {"x": -1.3, "y": -1.3, "z": 0.9},
+}
+
+type Points = Float[np.ndarray, "n 3"]
+
+
+def frames_of(n: int) -> np.ndarray:
+    """Which of n samples are shown: all, or at most `MOST_FRAMES` evenly among them."""
+    return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_FRAMES))).astype(int))
+
+
+def size_of(run: Trajectory, R: float) -> float:
+    """How many times its size the machine is drawn, so that it can be seen on a long path."""
+    path = _path(run.states)
+    length = float(np.max(np.ptp(path, axis=0)))
+    return float(np.ceil(max(1.0, _SMALLEST * length / (2.0 * R))))
+
+
+def attitude(states: Any) -> Rotation:
+    """The turns from body axes (forward, right, down) to x, y and down."""
+    angles = [np.asarray(getattr(states, n)) for n in ("psi", "theta", "phi")]
+    return Rotation.from_euler("ZYX", np.stack(angles, axis=-1))
+
+
+def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
+    """A shape in body axes (forward, right, down) in the figure: forward, left and up.
+
+    Those are right-handed, as a figure wants it; x, y and z, with y to the right, are not.
+    """
+    return turn.apply(shape) * np.array([1.0, -1.0, -1.0]) + at
+
+
+def animation(run: Trajectory, params: Any) -> dict[str, Any]:
+    """The flight as a plotly figure, in plain data: data, layout and frames.
+
+    `run` is of a whole helicopter with NumPy arrays, `params` its Helicopter.
+    """
+    path, turns = _path(run.states), attitude(run.states)
+    R = float(params.R)
+    size = size_of(run, R)
+    pod, disk, outline = (size * p for p in (_pod(R), _disk(params), _outline(params)))
+    shown = frames_of(path.shape[0])
+
+    def moving(k: int) -> list[dict[str, Any]]:
+        flown = path[shown[shown <= k]]
+        parts = [placed(p, turns[k], path[k]) for p in (pod, disk, outline)]
+        kinds = ("scatter3d", "mesh3d", "mesh3d", "scatter3d")
+        return [{"type": kind, **_xyz(p)} for kind, p in zip(kinds, (flown, *parts), strict=True)]
+
+    bounds = _bounds(path, 2.2 * size * R)
+    shadow = path.copy()
+    shadow[:, 2] = bounds[0, 2] + 0.005 * np.ptp(bounds[:, 2])  # on the floor it would be cut
+    still = np.unique(np.linspace(0, path.shape[0] - 1, _PATH_POINTS).astype(int))
+    line = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "showlegend": False}
+    # Traces 2 to 5 are those that the frames move.
+    first = moving(int(shown[0]))
+    data = [
+        {**line, **_xyz(shadow[still]), "line": {"color": "#C4C4C4", "width": 3}},
+        {**line, **_xyz(path[still]), "line": {"color": style.PALE, "width": 2}},
+        {**line, **first[0], "line": {"color": style.BLUE, "width": 5}},
+        {**_mesh(first[1], _pod_faces()), "color": style.VERMILLION, "lighting": _LIGHT},
+        {**_mesh(first[2], _disk_faces()), "color": style.GREY, "opacity": 0.45},
+        {**line, **first[3], "line": {"color": style.BLACK, "width": 4}},
+    ]
+    times = np.asarray(run.times)[shown]
+    frames = [{"name": str(k), "data": moving(int(k)), "traces": [2, 3, 4, 5]} for k in shown]
+    names = {f["name"]: f"{t:.2f}" for f, t in zip(frames, times, strict=True)}
+    pace = 1000.0 * float(times[-1] - times[0]) / max(1, len(times) - 1)
+    return {"data": data, "layout": _layout(bounds, names, pace), "frames": frames}
+
+
+def _path(states: Any) -> Points:
+    """The positions in the figure's axes: forward, left and up."""
+    x, y, z = (np.asarray(getattr(states, n), np.float64) for n in ("x", "y", "z"))
+    return np.stack([x, -y, z], axis=1)
+
+
+def _xyz(points: Points) -> dict[str, list[float | None]]:
+    """Columns of a trace; NaN, which breaks a line, as None."""
+    columns = np.round(points, _DIGITS).T.tolist()
+    return {
+        name: [None if v != v else v for v in column]
+        for name, column in zip("xyz", columns, strict=True)
+    }
+
+
+def _mesh(points: dict[str, Any], faces: np.ndarray) -> dict[str, Any]:
+    i, j, k = faces.T.tolist()
+    return {"hoverinfo": "skip", **points, "i": i, "j": j, "k": k}
+
+
+def _circle(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    return radius * np.cos(angle), radius * np.sin(angle)
+
+
+def _pod(R: float) -> Points:
+    """The fuselage: an ellipsoid of rings between two ends, nose first."""
+    a, b = _circle(1.0)
+    rings = [
+        np.stack([np.full(_AROUND, np.cos(s)), a * np.sin(s), b * np.sin(s)], axis=1)
+        for s in np.linspace(0.0, np.pi, 7)[1:-1]
+    ]
+    ends = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    return np.concatenate([ends, *rings]) * R * np.array([0.62, 0.2, 0.24])
+
+
+def _pod_faces() -> np.ndarray:
+    faces, here, rings = [], np.arange(_AROUND), 5
+    after = (here + 1) % _AROUND
+    for ring in range(rings - 1):
+        low, high = 2 + ring * _AROUND, 2 + (ring + 1) * _AROUND
+        faces.append(np.stack([low + here, low + after, high + here], axis=1))
+        faces.append(np.stack([high + here, low + after, high + after], axis=1))
+    last = 2 + (rings - 1) * _AROUND
+    faces.append(np.stack([0 * here, 2 + here, 2 + after], axis=1))
+    faces.append(np.stack([0 * here + 1, last + here, last + after], axis=1))
+    return np.concatenate(faces)
+
+
+def _disk(p: Any) -> Points:
+    a, b = _circle(float(p.R))
+    rim = np.stack([a, b, np.zeros(_AROUND)], axis=1)
+    return np.concatenate([np.zeros((1, 3)), rim]) + _hub(p)
+
+
+def _disk_faces() -> np.ndarray:
+    here = np.arange(_AROUND)
+    return np.stack([0 * here, 1 + here, 1 + (here + 1) % _AROUND], axis=1)
+
+
+def _hub(p: Any) -> np.ndarray:
+    return np.array([-float(p.lr), 0.0, -max(float(p.hr), 0.3 * float(p.R))])
+
+
+def _outline(p: Any) -> Points:
+    """Mast, tail boom with the tail rotor, fin and skids, as lines broken by NaN."""
+    R, tail, hub = float(p.R), float(p.L_T), _hub(p)
+    a, b = _circle(float(p.R_T))
+    wheel = np.stack([a - tail, np.zeros(_AROUND), b], axis=1)
+    low, wide = 0.42 * R, 0.25 * R
+    skids = [[[0.5 * R, s * wide, low], [-0.4 * R, s * wide, low]] for s in (-1.0, 1.0)]
+    legs = [[[x * R, -wide, low], [x * R, 0.0, 0.15 * R], [x * R, wide, low]] for x in (0.25, -0.2)]
+    rim = _disk(p)[1:]
+    parts = [
+        [[hub[0], 0.0, 0.0], hub],
+        [[0.0, 0.0, 0.0], [-tail, 0.0, 0.0], [-tail - 0.1 * R, 0.0, -0.25 * R]],
+        np.concatenate([wheel, wheel[:1]]),
+        np.concatenate([rim, rim[:1]]),
+        *skids,
+        *legs,
+    ]
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([np.concatenate([np.asarray(part), gap]) for part in parts])
+
+
+def _bounds(path: Points, margin: float) -> Float[np.ndarray, "2 3"]:
+    return np.stack([path.min(axis=0) - margin, path.max(axis=0) + margin])
+
+
+def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str, Any]:
+    """`names` are the frames' with their times as text, `pace` the time between two [ms]."""
+    spans = bounds[1] - bounds[0]
+    ratio = spans / np.max(spans) * 1.5
+    y = _ticks(-bounds[1, 1], -bounds[0, 1])
+    mirrored = {"tickvals": (-y).tolist(), "ticktext": [f"{v:g}" for v in y]}
+    scene: dict[str, Any] = {
+        "aspectmode": "manual",
+        "aspectratio": dict(zip("xyz", np.round(ratio, 5).tolist(), strict=True)),
+        "camera": {"eye": _VIEWS["three-quarter"]},
+        "dragmode": "orbit",
+        "uirevision": "kept",
+    }
+    titles = {"x": "x forward [m]", "y": "y to the right [m]", "z": "height z [m]"}
+    for i, (name, title) in enumerate(titles.items()):
+        scene[f"{name}axis"] = {
+            "title": {"text": title},
+            "range": bounds[:, i].tolist(),
+            "backgroundcolor": "#F6F6F6",
+            "showbackground": True,
+            "gridcolor": "#DDDDDD",
+            "zeroline": False,
+            **(mirrored if name == "y" else {"nticks": 7}),
+        }
+    at_once = {"mode": "immediate", "transition": {"duration": 0}}
+    play = {**at_once, "frame": {"duration": pace, "redraw": True}, "fromcurrent": True}
+    jump = {**at_once, "frame": {"duration": 0, "redraw": True}}
+    steps = [
+        {"label": text, "method": "animate", "args": [[name], jump]} for name, text in names.items()
+    ]
+    buttons = [
+        {"label": "play", "method": "animate", "args": [None, play]},
+        {"label": "pause", "method": "animate", "args": [[None], jump]},
+    ]
+    views = [
+        {"label": name, "method": "relayout", "args": [{"scene.camera": {"eye": eye}}]}
+        for name, eye in _VIEWS.items()
+    ]
+    row = {"type": "buttons", "direction": "right", "yanchor": "top", "showactive": False}
+    return {
+        "height": 620,
+        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
+        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
+        "scene": scene,
+        "uirevision": "kept",
+        "updatemenus": [
+            {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 30}},
+            {**row, "buttons": views, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},
+        ],
+        "sliders": [
+            {
+                "steps": steps, "x": 0.2, "len": 0.78, "y": 0.0, "pad": {"t": 10},
+                "font": {"size": 10}, "currentvalue": {"prefix": "time ", "suffix": " s"},
+            }
+        ],
+    }  # fmt: skip
+
+
+def _ticks(low: float, high: float) -> np.ndarray:
+    """About five round numbers between two."""
+    step = 10.0 ** np.floor(np.log10((high - low) / 5.0))
+    step *= next(f for f in (1.0, 2.0, 5.0, 10.0) if (high - low) / (f * step) <= 7.0)
+    return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1.0) + 0.0

@@ -1,0 +1,112 @@
+"""Figures of a manoeuvre: plain data in, matplotlib Axes out, as in `heli_jax.report.figures`."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.report import style
+from heli_jax.report.figures import Panels
+from heli_jax.report.style import line, subtitle
+from heli_jax.simulation.trajectory import Trajectory
+
+_APART = "rotor_speed"
+"""the one output that would press others of its unit flat"""
+_KINDS = {
+    "m": "position",
+    "m/s": "velocity",
+    "rad": "attitude",
+    "rad/s": "rates",
+}
+_LENGTHS = (("m", 1.0), ("mm", 1e3), ("µm", 1e6))
+_HEIGHT = 1.25
+_LEGEND = 1.05
+
+
+def motion(run: Trajectory, model: Model, *, figure: Figure | None = None) -> Panels:
+    """The outputs over time, those of a unit together: position, velocity, attitude, rates.
+
+    Shaded where the model's range was left.
+    """
+    groups = _by_unit(model.Outputs, [n for n in naming.names(model.Outputs) if n != _APART])
+    axes = _panels(len(groups), figure)
+    for ax, (unit, names) in zip(axes, groups, strict=True):
+        _lines(ax, run.times, {n: getattr(run.outputs, n) for n in names})
+        kind = _KINDS.get(unit or "", names[0]) if len(names) > 1 else names[0]
+        ax.set_ylabel(style.label(kind, unit))
+    return _finished(axes, run, f"Motion of {model.name}")
+
+
+def sticks(run: Trajectory, model: Model, *, figure: Figure | None = None) -> Panels:
+    """The inputs as they acted, and the rotor's speed where the model has it."""
+    groups = _by_unit(model.Inputs, list(naming.names(model.Inputs)))
+    rotor = _APART in naming.names(model.Outputs)
+    axes = _panels(len(groups) + rotor, figure)
+    for ax, (unit, names) in zip(axes, groups, strict=False):
+        values = {n: np.asarray(getattr(run.inputs, n)) for n in names}
+        if unit == "m":
+            unit, values = _short(values)
+        _lines(ax, run.times, values, drawstyle="steps-post")
+        kind = "wind" if names[0].startswith("wind") else "sticks"
+        ax.set_ylabel(style.label(kind if len(names) > 1 else names[0], unit))
+    if rotor:
+        _lines(axes[-1], run.times, {_APART: getattr(run.outputs, _APART)})
+        axes[-1].set_ylabel(style.label("rotor speed", naming.unit(model.Outputs, _APART)))
+    return _finished(axes, run, f"Sticks of {model.name}")
+
+
+def _by_unit(record: type, names: list[str]) -> list[tuple[str | None, list[str]]]:
+    """The names of each unit, in the record's order; a field without one stands for itself."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(naming.unit(record, name) or f"no unit: {name}", []).append(name)
+    return [(naming.unit(record, group[0]), group) for group in found.values()]
+
+
+def _short(values: dict[str, np.ndarray]) -> tuple[str, dict[str, np.ndarray]]:
+    """Lengths [m] in the unit that suits them: a stick moves by millimetres."""
+    largest = max(float(np.max(np.abs(v), initial=0.0)) for v in values.values())
+    unit, factor = next((u for u in _LENGTHS if largest * u[1] >= 0.1), ("m", 1.0))
+    return unit, {name: factor * v for name, v in values.items()}
+
+
+def _panels(n: int, figure: Figure | None) -> Panels:
+    """Panels below each other, with room for a legend at the right."""
+    made = style.figure(1.1 + _HEIGHT * n) if figure is None else figure
+    axes = made.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+    if figure is None:
+        style.place(made, n, right=_LEGEND, gap=0.18)
+    made.align_ylabels(axes)
+    return tuple(axes)
+
+
+def _lines(ax: Axes, times: Any, values: dict[str, Any], **how: Any) -> None:
+    for (name, y), color in zip(values.items(), itertools.cycle(style.CYCLE), strict=False):
+        line(ax, times, y, color=color, lw=1.1, label=name, **how)
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2, borderaxespad=0.4)
+
+
+def _finished(axes: Panels, run: Trajectory, title: str) -> Panels:
+    t = np.asarray(run.times)
+    axes[0].set_title(title, loc="left")
+    axes[-1].set_xlabel("time [s]")
+    axes[0].set_xlim(t[0], t[-1] if t.size > 1 else t[0] + 1.0)
+    left = [name for name, out in run.outside.items() if np.any(out)]
+    if left:
+        subtitle(axes[0], f"shaded where the model's range is left: {', '.join(left)}")
+        outside = np.any([np.asarray(run.outside[name]) for name in left], axis=0)
+        for begin, end in _stretches(outside):
+            last = t[min(end, t.size - 1)]
+            for ax in axes:
+                ax.axvspan(t[begin], last, color=style.ORANGE, alpha=0.22, lw=0, zorder=0)
+    return axes
+
+
+def _stretches(where: np.ndarray) -> list[tuple[int, int]]:
+    """[begin, end) of each stretch of True in (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,108 @@
+"""A simulated manoeuvre as a page: its figures, and the flight in 3D, in one file."""
+
+import base64
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import markupsafe
+from matplotlib.figure import Figure
+
+from heli_jax.analysis.trim import is_whole
+from heli_jax.dynamics.model import Model
+from heli_jax.report import manoeuvre, style
+from heli_jax.report.animation import animation, size_of
+from heli_jax.report.html import MOST_FLIGHTS, Picture
+from heli_jax.simulation.trajectory import Trajectory
+
+_HERE = Path(__file__).parent
+# Unless told otherwise plotly offers a button that uploads the data.
+_SETTINGS = {
+    "displaylogo": False,
+    "responsive": True,
+    "showSendToCloud": False,
+    "plotlyServerURL": "",
+}
+
+
+class Shown(NamedTuple):
+    """A run as the page holds it."""
+
+    name: str
+    pictures: list[Picture]
+    flight: markupsafe.Markup | None
+    """the flight in 3D, of a whole helicopter"""
+    size: float
+    """how many times its size the machine is drawn there"""
+
+
+def write_view(
+    path: Path,
+    runs: Mapping[str, Trajectory],
+    model: Model,
+    params: Any,
+    title: str,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write the page of some runs of a model, with NumPy arrays, by their names.
+
+    It refers to nothing outside itself, and titles and names are escaped.
+
+    Raises:
+        OSError: the place cannot be written to.
+    """
+    whole = is_whole(model)
+    shown = []
+    for name, run in list(runs.items())[:MOST_FLIGHTS]:
+        flight = _flight(run, params, len(shown)) if whole else None
+        size = size_of(run, float(params.R)) if whole else 1.0
+        shown.append(Shown(name, _pictures(run, model), flight, size))
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("view.html.j2").render(
+        title=title,
+        model=model,
+        notes=notes,
+        runs=shown,
+        whole=whole,
+        unshown=max(0, len(runs) - MOST_FLIGHTS),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _pictures(run: Trajectory, model: Model) -> list[Picture]:
+    found = []
+    for function in (manoeuvre.motion, manoeuvre.sticks):
+        drawn = style.svg(functools.partial(_figure, function, run, model))
+        if drawn is not None:
+            data = base64.b64encode(drawn[1]).decode("ascii")
+            found.append(Picture(function.__name__, drawn[0], data))
+    return found
+
+
+def _figure(function: Any, run: Trajectory, model: Model) -> Figure:
+    return function(run, model)[0].figure
+
+
+def _flight(run: Trajectory, params: Any, before: int) -> markupsafe.Markup:
+    """The 3D figure; the first one brings plotly's own program with it."""
+    import plotly.io
+
+    text = plotly.io.to_html(
+        animation(run, params),
+        config=_SETTINGS,
+        include_plotlyjs=before == 0,
+        full_html=False,
+        auto_play=False,
+        default_height="620px",
+        validate=False,
+        div_id=f"flight{before + 1}",
+    )
+    return markupsafe.Markup(text)

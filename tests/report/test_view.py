@@ -1,0 +1,157 @@
+"""The page of a manoeuvre: whole in itself, escaped, and a machine that is turned the right way."""
+
+import re
+from types import SimpleNamespace
+
+import diffrax as dfx
+import jax
+import numpy as np
+import pytest
+
+from heli_jax import models
+from heli_jax.dynamics.helicopter import HelicopterInputs, HelicopterOutputs
+from heli_jax.report import animation, manoeuvre
+from heli_jax.report.view import write_view
+from heli_jax.simulation.trajectory import Trajectory
+from heli_jax.vehicle import load_vehicle
+from tests.report.conftest import SCRIPT
+from tests.report.test_html import Links, words
+
+HELICOPTER = models.by_name("helicopter")
+
+
+def flown(n=300, dt=0.02, **states):
+    """A run of n samples with these states, zero elsewhere."""
+    zero = np.zeros(n)
+    times = dt * np.arange(n)
+    out = times > times[n // 2]
+    x = HELICOPTER.State(
+        **{f: np.broadcast_to(states.get(f, zero), n) for f in HELICOPTER.State._fields}
+    )
+    inputs = HelicopterInputs(1e-3 * np.sin(times), zero, zero - 0.5, zero + 0.5)
+    outputs = HelicopterOutputs(
+        x.phi, x.theta, x.psi, x.dphi, x.dtheta, x.dpsi, x.x, x.y, x.z, x.dx, x.dy, x.dz, x.Omega
+    )
+    ok = dfx.RESULTS.successful
+    outside = {"vortex ring": out, "slow rotor": zero > 0}
+    return Trajectory(times, x, outputs, inputs, ok, np.asarray(True), outside, np.inf, -1)
+
+
+@pytest.fixture(scope="module")
+def xcell(vehicles_folder):
+    return load_vehicle(vehicles_folder / "x-cell-60.yaml")
+
+
+@pytest.mark.parametrize(
+    ("angle", "part", "wanted"),
+    [
+        ("theta", [1, 0, 0], [np.cos(0.3), 0, np.sin(0.3)]),  # nose up
+        ("phi", [0, 1, 0], [0, -np.cos(0.3), -np.sin(0.3)]),  # right side down
+        ("psi", [1, 0, 0], [np.cos(0.3), -np.sin(0.3), 0]),  # nose right; the figure's y is left
+    ],
+)
+def test_the_shape_turns_as_the_machine_does(angle, part, wanted):
+    states = SimpleNamespace(**{"phi": 0.0, "theta": 0.0, "psi": 0.0, angle: 0.3})
+    shape = animation.placed(np.array([part], float), animation.attitude(states), np.zeros(3))
+    np.testing.assert_allclose(shape[0], wanted, atol=1e-12)
+
+
+def test_the_mast_points_where_the_thrust_does(xcell):
+    """All three angles at once, against the model's own accelerations."""
+    at = {"phi": 0.4, "theta": -0.3, "psi": 1.1, "Omega": float(xcell.Omega)}
+    x = HELICOPTER.State(**{f: at.get(f, 0.0) for f in HELICOPTER.State._fields})
+    rates = HELICOPTER.vector_field(xcell, x, HelicopterInputs(0.0, 0.0, 0.0, 0.5))
+    pull = np.array([rates.dx, rates.dy, rates.dz + xcell.g])
+    up = animation.placed(
+        np.array([[0.0, 0.0, -1.0]]), animation.attitude(SimpleNamespace(**at)), np.zeros(3)
+    )[0]
+    np.testing.assert_allclose(up * [1, -1, 1], pull / np.linalg.norm(pull), atol=1e-9)
+
+
+def test_frames_follow_the_run(xcell):
+    import plotly.graph_objects as go
+
+    t = 0.02 * np.arange(1000)
+    run = flown(1000, x=2.0 * t, y=0.5 * t, z=0.1 * t, phi=0.2 * np.sin(t))
+    made = animation.animation(run, xcell)
+    go.Figure(made)  # plotly knows every name in it
+    assert len(made["frames"]) == animation.MOST_FRAMES
+    scene = made["layout"]["scene"]
+    spans = {a: np.ptp(scene[f"{a}axis"]["range"]) for a in "xyz"}
+    ratio = {a: scene["aspectratio"][a] / spans[a] for a in "xyz"}
+    assert ratio["x"] == pytest.approx(ratio["y"], rel=1e-3)
+    assert ratio["x"] == pytest.approx(ratio["z"], rel=1e-3)
+    last = made["frames"][-1]
+    steps = made["layout"]["sliders"][0]["steps"]
+    assert (steps[-1]["label"], steps[-1]["args"][0]) == ("19.98", [last["name"]])
+    assert len({f["name"] for f in made["frames"]}) == len(steps)
+    path = last["data"][0]
+    assert (path["x"][-1], path["y"][-1]) == pytest.approx((2 * t[-1], -0.5 * t[-1]), abs=1e-3)
+    assert len(made["frames"][10]["data"][0]["x"]) == 11
+    low, high = scene["yaxis"]["range"]
+    for at, text in zip(scene["yaxis"]["tickvals"], scene["yaxis"]["ticktext"], strict=True):
+        assert low <= at <= high
+        assert float(text) == pytest.approx(-at)
+    disk = np.array([made["data"][4][a] for a in "xyz"]).T
+    radius = np.linalg.norm(disk[1:] - disk[0], axis=1)
+    assert radius == pytest.approx(animation.size_of(run, float(xcell.R)) * float(xcell.R), 1e-3)
+
+
+@pytest.mark.parametrize("n", [2, 3, 199, 200, 201, 5000])
+def test_frames_thin_the_record(n):
+    found = animation.frames_of(n)
+    assert (found[0], found[-1]) == (0, n - 1)
+    assert found.size == min(n, animation.MOST_FRAMES)
+
+
+def test_figures_show_everything_and_shade_what_was_left():
+    t = 0.02 * np.arange(300)
+    run = flown(z=np.sin(t), Omega=150 + t)
+    for axes, labels in (
+        (manoeuvre.motion(run, HELICOPTER), ["attitude", "rates", "position", "velocity"]),
+        (manoeuvre.sticks(run, HELICOPTER), ["sticks [mm]", "sticks [–]", "rotor speed [rad/s]"]),
+    ):
+        assert len(axes) == len(labels)
+        for ax, text in zip(axes, labels, strict=True):
+            assert text in ax.get_ylabel()
+            [shade] = ax.patches
+            low, high = shade.get_extents().transformed(ax.transData.inverted()).intervalx
+            assert (low, high) == pytest.approx((t[151], t[-1]))
+    drawn = [line.get_label() for ax in axes for line in ax.get_lines()]
+    assert drawn == ["x_roll", "x_pitch", "x_yaw", "x_throttle", "rotor_speed"]
+    assert np.max(axes[0].get_lines()[0].get_ydata()) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_page_holds_everything_itself_and_escapes(tmp_path, xcell):
+    run = flown(z=0.1 * np.arange(300))
+    path = tmp_path / "view.html"
+    note = f"the run leaves {SCRIPT}"
+    write_view(path, {SCRIPT: run, "two": run}, HELICOPTER, xcell, f"x {SCRIPT}", [note])
+    text = path.read_text(encoding="utf-8")
+    links = Links(text)
+    assert links.found
+    assert all(v.startswith("data:image/svg+xml;base64,") for v in links.found)
+    assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=[\"']?https?:", text)
+    assert "<script>alert(1)</script>" not in text
+    assert f"<title>x {SCRIPT.replace('<', '&lt;').replace('>', '&gt;')}</title>" in text
+    assert text.count('"showSendToCloud": false') == 2
+    assert text.count("Plotly.newPlot(") >= 2
+    assert len(text) < 9_000_000  # plotly's own program once, not twice
+
+
+def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
+    t = 0.02 * np.arange(50)
+    model = models.roll
+    states = model.State(**dict.fromkeys(model.State._fields, np.sin(t)))
+    inputs = model.Inputs(x_roll=3e-6 * np.cos(t))
+    outputs = jax.vmap(lambda x, u: model.output(bench30, x, u))(states, inputs)
+    ok = dfx.RESULTS.successful
+    run = Trajectory(t, states, outputs, inputs, ok, np.asarray(True), {}, np.inf, -1)
+    path = tmp_path / "view.html"
+    write_view(path, {"roll": run}, model, bench30, "roll")
+    text = path.read_text(encoding="utf-8")
+    assert "script" not in Links(text).tags
+    assert Links(text).tags.count("img") == 2
+    assert "needs the whole helicopter" in words(text)
+    [ax] = manoeuvre.sticks(run, model)
+    assert ax.get_ylabel() == "x_roll [µm]"
