@@ -77,7 +77,7 @@ def generate(experiment: Experiment) -> Simulated:
         raise InputError(f"{where}: {_diverged(experiment, run)}")
     notes = _notes(experiment, run)
     if np.isfinite(run.ended):
-        run = _until(run, float(run.ended))
+        run = run.first(int(np.searchsorted(run.times, run.ended, side="right")))
     outputs = {k: np.asarray(v) for k, v in naming.asdict(run.outputs).items()}
     for name, noise in wanted.noise.items():
         si = naming.unit(experiment.model.Outputs, name) or "1"
@@ -187,12 +187,16 @@ def _extended(model: Model, state: Any) -> Any:
 def _diverged(experiment: Experiment, run: Trajectory) -> str:
     if not is_whole(experiment.model):
         return "the run is not finite: the model is unstable with this vehicle"
-    good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
-    first = float(run.times[np.argmin(good)])
     return (
-        f"the run is not finite from {first:g} s on, wanted is a shorter duration, gentler inputs "
-        "or hold_attitude: true"
+        f"the run is not finite from {_lost(run):g} s on, wanted is a shorter duration, gentler "
+        "inputs or hold_attitude: true"
     )
+
+
+def _lost(run: Trajectory) -> float:
+    """When a run ceases to be finite [s]."""
+    good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
+    return float(run.times[np.argmin(good)])
 
 
 def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
@@ -225,14 +229,6 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _until(run: Trajectory, ended: float) -> Trajectory:
-    """The samples of a run up to a time [s]."""
-    n = int(np.searchsorted(run.times, ended, side="right"))
-    parts = (run.times, run.states, run.outputs, run.inputs, run.outside)
-    times, states, outputs, inputs, outside = jax.tree.map(lambda v: v[:n], parts)
-    return run._replace(times=times, states=states, outputs=outputs, inputs=inputs, outside=outside)
-
-
 def follow(experiment: Experiment) -> Simulated:
     """The model driven by the inputs of the configuration's flights, in SI.
 
@@ -242,6 +238,7 @@ def follow(experiment: Experiment) -> Simulated:
     model = experiment.model
     parts: list[dict[str, Any]] = []
     runs: dict[str, Trajectory] = {}
+    notes: list[str] = []
     gain = experiment.config.fit is not None and experiment.config.fit.nuisance.input_gain
     for flight in read_flights(experiment, gain=gain, moving_inputs=False):
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
@@ -249,9 +246,13 @@ def follow(experiment: Experiment) -> Simulated:
         outputs = {n: np.asarray(v) for n, v in naming.asdict(run.outputs).items()}
         label = np.array([flight.name] * flight.n_samples)
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
-        runs[f"{len(runs) + 1}: {flight.name}"] = jax.device_get(run)._replace(times=flight.times)
+        run = jax.device_get(run)._replace(times=flight.times)
+        runs[f"{len(runs) + 1}: {flight.name}"] = run
+        notes += [f"{flight.name}: {note}" for note in _notes(experiment, run)]
+        if not run.finite:
+            notes.append(f"{flight.name}: the run is not finite from {_lost(run):g} s on")
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    return Simulated(columns, model, runs, ())
+    return Simulated(columns, model, runs, tuple(notes))
 
 
 def _inputs(

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jinja2
 import markupsafe
+import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax.analysis.trim import is_whole
@@ -17,6 +19,8 @@ from heli_jax.report.animation import animation, size_of
 from heli_jax.report.html import MOST_FLIGHTS, Picture
 from heli_jax.simulation.trajectory import Trajectory
 
+_HUGE = 1e9
+"""what no state of a machine reaches, and no figure can draw"""
 _HERE = Path(__file__).parent
 # Unless told otherwise plotly offers a button that uploads the data.
 _SETTINGS = {
@@ -55,9 +59,13 @@ def write_view(
     """
     whole = is_whole(model)
     shown = []
-    for name, run in list(runs.items())[:MOST_FLIGHTS]:
-        flight = _flight(run, params, len(shown)) if whole else None
-        size = size_of(run, float(params.R)) if whole else 1.0
+    for name, whole_run in list(runs.items())[:MOST_FLIGHTS]:
+        run = _finite(whole_run)
+        flight, size = None, 1.0
+        if whole and _good(run).all():
+            first = all(one.flight is None for one in shown)
+            flight = _flight(run, params, len(shown) + 1, first)
+            size = size_of(run, float(params.R))
         shown.append(Shown(name, _pictures(run, model), flight, size))
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_HERE),
@@ -77,6 +85,18 @@ def write_view(
     path.write_text(page, encoding="utf-8")
 
 
+def _good(run: Trajectory) -> np.ndarray:
+    """Which samples can be drawn."""
+    leaves = jax.tree.leaves((run.states, run.outputs))
+    return np.all([np.abs(np.asarray(v)) < _HUGE for v in leaves], axis=0)
+
+
+def _finite(run: Trajectory) -> Trajectory:
+    """The run up to where it ceases to be finite; two samples at least."""
+    good = _good(run)
+    return run if good.all() else run.first(max(2, int(np.argmin(good))))
+
+
 def _pictures(run: Trajectory, model: Model) -> list[Picture]:
     found = []
     for function in (manoeuvre.motion, manoeuvre.sticks):
@@ -91,18 +111,18 @@ def _figure(function: Any, run: Trajectory, model: Model) -> Figure:
     return function(run, model)[0].figure
 
 
-def _flight(run: Trajectory, params: Any, before: int) -> markupsafe.Markup:
+def _flight(run: Trajectory, params: Any, number: int, first: bool) -> markupsafe.Markup:
     """The 3D figure; the first one brings plotly's own program with it."""
     import plotly.io
 
     text = plotly.io.to_html(
         animation(run, params),
         config=_SETTINGS,
-        include_plotlyjs=before == 0,
+        include_plotlyjs=first,
         full_html=False,
         auto_play=False,
         default_height="620px",
         validate=False,
-        div_id=f"flight{before + 1}",
+        div_id=f"flight{number}",
     )
     return markupsafe.Markup(text)

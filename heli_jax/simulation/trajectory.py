@@ -50,3 +50,11 @@ class Trajectory(NamedTuple):
             code = jnp.where(jnp.any(out, axis=-1), 2, code)
         code = jnp.where(self.finite, code, 3)
         return jnp.where(self.result == dfx.RESULTS.successful, code, jnp.maximum(code, 4))
+
+    def first(self, n: int) -> "Trajectory":
+        """The first n samples of it."""
+        parts = (self.times, self.states, self.outputs, self.inputs, self.outside)
+        times, states, outputs, inputs, outside = jax.tree.map(lambda v: v[:n], parts)
+        return self._replace(
+            times=times, states=states, outputs=outputs, inputs=inputs, outside=outside
+        )

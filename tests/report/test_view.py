@@ -139,6 +139,14 @@ def test_page_holds_everything_itself_and_escapes(tmp_path, xcell):
     assert len(text) < 9_000_000  # plotly's own program once, not twice
 
 
+def test_a_run_that_diverges_is_drawn_as_far_as_it_goes(tmp_path, xcell):
+    z = np.where(np.arange(300) < 100, 0.1 * np.arange(300), np.nan)
+    path = tmp_path / "view.html"
+    runs = {"never": flown(z=np.full(300, np.nan)), "lost": flown(z=z)}
+    write_view(path, runs, HELICOPTER, xcell, "lost")
+    assert path.read_text(encoding="utf-8").count('"traces":[2,3,4,5]') == 100
+
+
 def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
     t = 0.02 * np.arange(50)
     model = models.roll
