@@ -41,6 +41,16 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("same")
 
 
+def pytest_collection_modifyitems(items):
+    """On the small machines of CI the few tests that compile for a minute are left out."""
+    if os.environ.get("CI") != "true":
+        return
+    left_out = pytest.mark.skip(reason="compiles for a minute or more: run where CI is not set")
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(left_out)
+
+
 @pytest.fixture(scope="session")
 def vehicles_folder():
     return Path(__file__).parents[1] / "configs" / "vehicles"

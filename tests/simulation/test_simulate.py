@@ -205,7 +205,6 @@ def cost_of(weights, **how):
     return cost
 
 
-@pytest.mark.slow
 def test_forward_reverse_and_finite_differences_agree(slopes):
     weights, logs, wanted = slopes
     forward = np.asarray(jax.jit(jax.jacfwd(cost_of(weights)))(jnp.asarray(logs)))
@@ -215,7 +214,6 @@ def test_forward_reverse_and_finite_differences_agree(slopes):
     np.testing.assert_allclose(forward, wanted, rtol=1e-6, atol=1e-6 * size)
 
 
-@pytest.mark.slow
 def test_checkpointed_reverse_mode_through_rk4(slopes):
     weights, logs, wanted = slopes
     how = {"solver": "rk4", "substeps": 16, "adjoint": dfx.RecursiveCheckpointAdjoint()}
@@ -253,7 +251,6 @@ def test_many_equal_one_by_one_and_the_broken_break_alone(fleet, solver, substep
             close(np.asarray(many.states.phi[k]), recurrence(v, np.asarray(u), X0)[:, 0], 1e-9)
 
 
-@pytest.mark.slow
 def test_adaptive_dopri8_in_a_batch_with_a_broken_machine(fleet):
     machines, batch = fleet
     batch = jax.tree.map(lambda x: x[:3] if jnp.ndim(x) else x, batch)
