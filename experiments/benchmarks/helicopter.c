@@ -4,7 +4,7 @@
 #include <math.h>
 #include <stddef.h>
 
-#define LANES 8
+#define LANES 16
 #define STATES 15
 #define NEWTON 5
 #define REST 1e-8

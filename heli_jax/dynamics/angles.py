@@ -1,4 +1,4 @@
-"""Sine and cosine of one angle together, faster than one after the other."""
+"""Sine and cosine of an angle, faster than XLA's where a loop over time asks for many."""
 
 import math
 from typing import Any
@@ -10,38 +10,41 @@ from heli_jax.naming import Scalar
 
 _RIGHT_ANGLE = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624871116645580e-21)
 """pi/2 in three parts; the first two have so few digits that their multiples are exact (fdlibm)."""
+_TERMS = 10
+"""of Taylor's series of the sine beyond x: the last digit up to a right angle"""
 
 
 @jax.custom_jvp
 def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of x [rad], in a third of the time of jnp.sin and jnp.cos.
+    """Sine and cosine of x [rad], to the last digit up to 1e6 rad.
 
-    To the last digit up to 1e6 rad: Taylor's series about the nearest multiple of pi/2.
+    Each is the sine of what is left of x after the nearest half turn, or for the cosine the
+    nearest half turn and right angle, with its sign. In double precision this takes a fraction of
+    the time of jnp.sin and jnp.cos; in any other it is them.
     """
     x = jnp.asarray(x)
     if x.dtype != jnp.float64:
         return jnp.sin(x), jnp.cos(x)
-    right_angles = jnp.round(x * (2.0 / math.pi))
+    k = jnp.round(x * (1.0 / math.pi))
+    m = jnp.round(x * (1.0 / math.pi) - 0.5)
+    return _sign(k) * _sine_past(x, 2.0 * k), -_sign(m) * _sine_past(x, 2.0 * m + 1.0)
+
+
+def _sign(k: Scalar) -> Scalar:
+    """1 for even k and -1 for odd."""
+    half = 0.5 * k
+    return 1.0 - 4.0 * (half - jnp.floor(half))
+
+
+def _sine_past(x: Scalar, right_angles: Scalar) -> Scalar:
+    """The sine of x less so many right angles, which is a right angle or less."""
     r = x
     for part in _RIGHT_ANGLE:
         r = r - right_angles * part
-    r2 = r * r
-    sin, cos = r * _series(r2, 3), 1.0 - 0.5 * r2 * _series(r2, 4)
-    quadrant = right_angles.astype(jnp.int32)
-    odd = quadrant & 1 != 0
-    s, c = jnp.where(odd, cos, sin), jnp.where(odd, sin, cos)
-    return jnp.where(quadrant & 2 != 0, -s, s), jnp.where(quadrant + 1 & 2 != 0, -c, c)
-
-
-def _series(r2: Scalar, n: int) -> Scalar:
-    r"""$1 - \frac{r^2}{(n-1)n}\left(1 - \frac{r^2}{(n+1)(n+2)}(1 - \dots)\right)$, 7 brackets.
-
-    The last digit of a sine (n = 3) and of a cosine (n = 4) for r up to pi/4.
-    """
-    total = 1.0
-    for k in range(n + 12, n - 1, -2):
-        total = 1.0 - r2 * total * (1.0 / (k * (k - 1)))
-    return total
+    r2, total = r * r, 0.0
+    for n in range(_TERMS, 0, -1):
+        total = total * r2 + (-1.0) ** n / math.factorial(2 * n + 1)
+    return r + (r * r2) * total
 
 
 @sincos.defjvp

@@ -383,6 +383,8 @@ def angular_accelerations(
     return ddphi, ddtheta, ddpsi
 
 
+# A solver asks for the rates some twenty times: under jit they are traced once.
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def _field(how: Corrections, State: type, p: Helicopter, s: Any, u: Any) -> Any:
     m = motion(how, s, u)
     air = _once(flow(how, p, s, u, m))
