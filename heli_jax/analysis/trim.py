@@ -74,8 +74,10 @@ def trim(
     if missing:
         raise ValueError(f"trim: {', '.join(missing)} missing, model {model.name} needs it")
     best: Trim | None = None
-    condition = Condition(*(jnp.asarray(v, jnp.result_type(float)) for v in condition))
-    air = tuple(jnp.asarray(v, jnp.result_type(float)) for v in wind)
+    # Arrays of one kind, so that all vehicles are served by one compiled program.
+    params, condition, air = jax.tree.map(
+        lambda v: jnp.asarray(v, jnp.result_type(float)), (params, condition, tuple(wind))
+    )
     rng = np.random.default_rng(0)
     spread = np.zeros(len(_unknowns(model)))
     for _ in range(_TRIES):
