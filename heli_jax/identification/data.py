@@ -31,7 +31,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
         return np.array(values, dtype)
 
     numbers = Data(
-        base={n: jnp.asarray(v) for n, v in naming.asdict(problem.vehicle).items()},
+        base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
         sign=column([float(np.sign(f.start)) or 1.0 for f in frees]),
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),

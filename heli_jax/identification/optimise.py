@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.layout import Data, Layout, Noise, Reached
-from heli_jax.identification.residual import evaluate
+from heli_jax.identification.residual import differentiate
 
 
 class Optimum(NamedTuple):
@@ -101,6 +101,121 @@ def _scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> _Scaling:
     return _Scaling(jnp.where(usable, _COLUMN * level / jnp.where(usable, norms, 1.0), 0.0), level)
 
 
+class _Terms(NamedTuple):
+    """What stays the same throughout one run."""
+
+    z0: Float[Array, " q"]
+    units: _Scaling
+    anchor: Float[Array, " q"]
+    """one over the sd of the tie to the start, 0 without"""
+    watched: Bool[Array, " q"]
+
+
+class _Rows(NamedTuple):
+    """The residuals about one point, as the optimiser sees them: r + J (xi - at)."""
+
+    at: Float[Array, " q"]
+    r: Float[Array, " k"]
+    J: Float[Array, "k q"]
+
+
+class _State(NamedTuple):
+    """Where a run stands."""
+
+    xi: Float[Array, " q"]
+    solver: Any
+    done: Any
+    fine: Any
+    """whether it is done because it arrived"""
+
+
+def _linear(xi: Array, rows: _Rows) -> tuple[Array, None]:
+    return rows.r + jnp.sum(rows.J * (xi - rows.at)[None, :], axis=1), None
+
+
+_HOW: dict[str, Any] = {"jac": "bwd"}
+"""a Jacobian of numbers, which can be handed from step to step"""
+
+
+def _solver(terms: _Terms) -> _LevenbergMarquardt:
+    # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
+    # and smaller gains drown in the rounding of the sum of squares.
+    # A disturbance that is hardly there may wander on where it changes nothing else.
+    return _LevenbergMarquardt(1e-9, 1e-3 / (_COLUMN * terms.units.level), terms.watched)
+
+
+def _compressed(terms: _Terms, r: Float[Array, " n"], J: Float[Array, "n q"]) -> Array:
+    # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
+    # decomposition of [r J]: as many rows as unknowns, and one. The optimiser sees these rows; the
+    # first is the size of r, the others are zero but for their derivatives.
+    columns = jnp.concatenate([r[:, None], J * terms.units.unit[None, :]], axis=1)
+    R = jnp.linalg.qr(columns / terms.units.level, mode="r")
+    return R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
+
+
+def _rows(terms: _Terms, R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
+    # Where the data leave a direction of the parameters open, the weakest of anchors keeps them
+    # from drifting along it.
+    held = -terms.units.unit * xi * terms.anchor / terms.units.level
+    pull = -jnp.diag(terms.anchor * terms.units.unit) / terms.units.level
+    return _Rows(xi, jnp.concatenate([R[:, 0], held]), jnp.concatenate([R[:, 1:], pull]))
+
+
+def _begin(terms: _Terms) -> _State:
+    q = terms.z0.shape[0]
+    xi = jnp.zeros_like(terms.z0)
+    rows = _rows(terms, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
+    seen = jax.eval_shape(lambda: _linear(xi, rows)[0])
+    solver = _solver(terms).init(_linear, xi, rows, _HOW, seen, None, frozenset())
+    return _State(xi, solver, jnp.asarray(False), jnp.asarray(False))
+
+
+def _advance(terms: _Terms, state: _State, R: Float[Array, "k k"]) -> _State:
+    """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
+    rows, solver = _rows(terms, R, state.solver.y_eval), _solver(terms)
+    xi, new, _ = solver.step(_linear, state.xi, rows, _HOW, state.solver, frozenset())
+    done, result = solver.terminate(_linear, xi, rows, _HOW, new, frozenset())
+    fine = result == optx.RESULTS.successful
+    moved = _State(xi, new, done | ~fine, done & fine)
+    return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), moved, state)
+
+
+def _point(terms: _Terms, xi: Array) -> Array:
+    return terms.z0 + terms.units.unit * xi
+
+
+# Compiled apart from the residuals: the same for all problems of as many unknowns and rows.
+_one = tuple(jax.jit(f) for f in (_compressed, _begin, _advance, _point))
+_many = tuple(jax.jit(jax.vmap(f)) for f in (_compressed, _begin, _advance, _point))
+
+
+def _descend(
+    slopes: Callable[[Array], tuple[Array, Array]],
+    terms: _Terms,
+    first: tuple[Array, Array],
+    count: np.ndarray | int,
+    max_steps: int,
+    how: tuple[Any, ...],
+) -> Optimum:
+    """Step until arrived, from residuals and Jacobian at the start; `slopes` gives them elsewhere.
+
+    The residuals are evaluated by the one program that evaluates them for everything else: it
+    takes longer to compile than to run.
+    """
+    compressed, begin, advance, point = how
+    state, (r, J) = begin(terms), first
+    for k in range(max_steps):
+        state = advance(terms, state, compressed(terms, r, J))
+        if k + 1 == max_steps or bool(np.all(state.done)):
+            break
+        r, J = slopes(point(terms, state.solver.y_eval))
+    z, rows = point(terms, state.xi), state.solver.f_info.residual
+    cost = jnp.sum(jnp.square(rows), axis=-1) * terms.units.level**2
+    cost = cost / jnp.asarray(count, cost.dtype)
+    fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z), axis=-1)
+    return Optimum(z, cost, state.solver.num_steps, state.fine & fine)
+
+
 def optimise(
     layout: Layout,
     data: Data,
@@ -108,72 +223,25 @@ def optimise(
     z0: Float[Array, " q"],
     max_steps: int = 200,
 ) -> Optimum:
-    """The least-squares optimum from z0; compiled once per layout and shapes."""
-    first = evaluate(layout, data, noise, z0)
-    return _optimise(layout, data, noise, z0, _scaling(first.r, first.J), max_steps)
+    """The least-squares optimum from z0."""
+    first = differentiate(layout, data, noise, z0)
+    terms = _Terms(z0, _scaling(first.r, first.J), _anchor(layout, z0), _watched(layout))
+
+    def slopes(z: Array) -> tuple[Array, Array]:
+        e = differentiate(layout, data, noise, z)
+        return e.r, e.J
+
+    count = residuals_count(data)
+    return _descend(slopes, terms, (first.r, first.J), count, max_steps, _one)
 
 
 @eqx.filter_jit
-def _optimise(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    z0: Float[Array, " q"],
-    units: _Scaling,
-    max_steps: int,
-) -> Optimum:
-    # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
-    # decomposition of [r J]: as many rows as unknowns, and one. The optimiser sees these rows; the
-    # first is the size of r, the others are zero but for their derivatives.
-    # Where the data leave a direction of the parameters open, the weakest of anchors keeps them
-    # from drifting along it.
-    free = jnp.arange(layout.size) < len(layout.free)
-    anchor = jnp.where(free, 1.0 / _ANCHOR, 0.0).astype(z0.dtype)
+def _slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, "b q"]) -> Any:
+    def one(data: Data, z: Array) -> tuple[Array, Array]:
+        e = differentiate(layout, data, noise, z)
+        return e.r, e.J
 
-    def reached(xi: Array) -> Array:
-        return z0 + units.unit * xi
-
-    def triangle(xi: Array) -> tuple[Array, Array]:
-        e = evaluate(layout, data, noise, reached(xi))
-        columns = jnp.concatenate([e.r[:, None], e.J * units.unit[None, :]], axis=1) / units.level
-        R = jnp.linalg.qr(columns, mode="r")
-        R = R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
-        held = (z0 - reached(xi)) * anchor, -jnp.diag(anchor * units.unit)
-        return (
-            jnp.concatenate([R[:, 0], held[0] / units.level]),
-            jnp.concatenate([R[:, 1:], held[1] / units.level]),
-        )
-
-    @jax.custom_jvp
-    def rows(xi: Array) -> Array:
-        return triangle(xi)[0]
-
-    @rows.defjvp
-    def rows_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        r, J = triangle(primals[0])
-        return r, J @ tangents[0]
-
-    def fn(xi: Array, _: Any) -> Array:
-        return rows(xi)
-
-    solution = optx.least_squares(
-        fn,
-        # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
-        # and smaller gains drown in the rounding of the sum of squares.
-        # A disturbance that is hardly there may wander on where it changes nothing else.
-        _LevenbergMarquardt(1e-9, 1e-3 / (_COLUMN * units.level), _watched(layout)),
-        jnp.zeros_like(z0),
-        max_steps=max_steps,
-        throw=False,
-        options={"jac": "fwd"},
-    )
-    z = reached(solution.value)
-    seen = [jnp.isfinite(y) for flight in data.flights for y in flight.outputs.values()]
-    count = jnp.sum(jnp.concatenate(seen)).astype(z.dtype)
-    cost = 2.0 * solution.state.f_info.as_min() * units.level**2 / count
-    fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z))
-    converged = (solution.result == optx.RESULTS.successful) & fine
-    return Optimum(z, cost, solution.stats["num_steps"], converged)
+    return jax.vmap(one)(data, z)
 
 
 def optimise_many(
@@ -191,20 +259,32 @@ def optimise_many(
     `data` makes the numbers of one run out of its slice of `each`; the unknown at `hold` stays at
     its start.
     """
-    first = evaluate(reached.layout, reached.data, reached.noise, reached.z)
+    layout, noise = reached.layout, reached.noise
+    first = differentiate(layout, reached.data, noise, reached.z)
     units = _scaling(first.r, first.J)
     if hold is not None:
         units = units._replace(unit=units.unit.at[hold].set(0.0))
-    layout, noise = reached.layout, reached.noise
+    k, batch = starts.shape[0], min(batch, starts.shape[0])
+    found = []
+    for i in range(0, k, batch):
+        # The last ones again where the batch is not full.
+        at = np.minimum(np.arange(i, i + batch), k - 1)
+        z0 = starts[at]
+        numbers = jax.vmap(data)(jax.tree.map(lambda v, at=at: v[at], each))
+        terms = jax.vmap(lambda z: _Terms(z, units, _anchor(layout, z), _watched(layout)))(z0)
 
-    @eqx.filter_jit
-    def run(starts: Array, each: Any, noise: Noise, units: _Scaling) -> Optimum:
-        def one(pair: tuple[Array, Any]) -> Optimum:
-            return _optimise(layout, data(pair[1]), noise, pair[0], units, max_steps)
+        def slopes(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
+            return _slopes(layout, numbers, noise, z)
 
-        return jax.lax.map(one, (starts, each), batch_size=min(batch, starts.shape[0]))
+        count = residuals_count(numbers) // batch
+        ends = _descend(slopes, terms, slopes(z0), count, max_steps, _many)
+        found.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
+    return jax.tree.map(lambda *v: np.concatenate(v), *found)
 
-    return jax.device_get(run(starts, each, noise, units))
+
+def _anchor(layout: Layout, z0: Array) -> Array:
+    free = np.arange(layout.size) < len(layout.free)
+    return jnp.asarray(np.where(free, 1.0 / _ANCHOR, 0.0), z0.dtype)
 
 
 def _watched(layout: Layout) -> Array:

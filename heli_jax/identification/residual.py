@@ -232,15 +232,8 @@ def _raw(data: Data, u: Unknowns, runs: tuple[Run, ...]) -> tuple[dict[str, Any]
     )
 
 
-def _simulated(u: Unknowns, runs: tuple[Run, ...]) -> tuple[dict[str, Any], ...]:
-    return tuple(
-        {n: bias[n] + getattr(run.outputs, n) for n in bias}
-        for run, bias in zip(runs, u.biases, strict=True)
-    )
-
-
-class Evaluation(NamedTuple):
-    """Everything that one differentiated run tells."""
+class Shown(NamedTuple):
+    """The simulation beside the measurements."""
 
     simulated: tuple[dict[str, Any], ...]
     """with the bias, SI, by flight and output"""
@@ -248,12 +241,30 @@ class Evaluation(NamedTuple):
     """measured - simulated, SI, by flight and output; NaN where nothing is measured"""
     state_rms: tuple[dict[str, Any], ...]
     """root mean square of each simulated state, by flight"""
-    innovations: tuple[Innovations, ...]
-    """by flight; none with output error"""
+
+
+class Slopes(NamedTuple):
+    """Residuals and their derivative at one point."""
+
     r: Any
     """(n,) whitened residuals with prior rows"""
     J: Any
     """(n, q) derivative of r by z"""
+    innovations: tuple[Innovations, ...]
+    """by flight; none with output error"""
+    shown: Shown | None
+    """what output error simulates on its way"""
+
+
+class Evaluation(NamedTuple):
+    """Everything that one point tells."""
+
+    simulated: tuple[dict[str, Any], ...]
+    raw: tuple[dict[str, Any], ...]
+    state_rms: tuple[dict[str, Any], ...]
+    innovations: tuple[Innovations, ...]
+    r: Any
+    J: Any
     named: Any
     """values of the named unknowns"""
     slopes: Any
@@ -261,8 +272,8 @@ class Evaluation(NamedTuple):
 
 
 @eqx.filter_jit
-def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
-    """Residuals, their Jacobian in forward mode, and the named unknowns, in one pass.
+def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
+    """Residuals and their Jacobian in forward mode, in one pass.
 
     The residual: measured - bias - simulated over sd for all flights and outputs (output error),
     or the whitened innovations (filter error), then the priors' rows (value - mean) / sd, then
@@ -271,22 +282,13 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
 
     def rows(z: Array) -> tuple[Array, Any]:
         u = unpack(layout, data, z)
-        runs, found = None, ()
         if layout.filtered:
             found = filtered(layout, data, noise, u)
-        else:
-            runs = predict(layout, data, u)
-        if runs is None:
             r = _rows(layout, data, noise, z, found)
-        else:
-            raw, jumps = _raw(data, u, runs), _jumps(layout, data, u, runs)
-            r = _rows(layout, data, noise, z, raw, jumps)
-        return r, (r, runs, found)
-
-    def named(z: Array) -> Array:
-        u = unpack(layout, data, z)
-        shift = () if u.shift is None else (u.shift,)
-        return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
+            return r, (r, None, found)
+        runs = predict(layout, data, u)
+        r = _rows(layout, data, noise, z, _raw(data, u, runs), _jumps(layout, data, u, runs))
+        return r, (r, runs, ())
 
     seeds = seeded(layout)
     if seeds is None:
@@ -299,19 +301,40 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
         directions = jnp.asarray(seeds.T, z.dtype)
         r, J, (_, runs, found) = jax.vmap(along, out_axes=(None, -1, None))(directions)
         J = spread_out(layout, data, J)
-    slopes = jnp.diagonal(jax.jacfwd(named)(z))
+    shown = None if runs is None else _compared(data, unpack(layout, data, z), runs)
+    return Slopes(r, J, found, shown)
+
+
+def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
+    """`differentiate`, the simulation, and the named unknowns."""
+    at = differentiate(layout, data, noise, z)
+    shown = _shown(layout, data, z) if at.shown is None else at.shown
+    named, slopes = _named(layout, data, z)
+    return Evaluation(*shown, at.innovations, at.r, at.J, named, slopes)
+
+
+@eqx.filter_jit
+def _shown(layout: Layout, data: Data, z: Array) -> Shown:
     u = unpack(layout, data, z)
-    runs = predict(layout, data, u) if runs is None else runs
-    return Evaluation(
-        _simulated(u, runs),
-        _raw(data, u, runs),
-        tuple(_rms(run.states) for run in runs),
-        found,
-        r,
-        J,
-        named(z),
-        slopes,
+    return _compared(data, u, predict(layout, data, u))
+
+
+@eqx.filter_jit
+def _named(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
+    def named(z: Array) -> Array:
+        u = unpack(layout, data, z)
+        shift = () if u.shift is None else (u.shift,)
+        return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
+
+    return named(z), jnp.diagonal(jax.jacfwd(named)(z))
+
+
+def _compared(data: Data, u: Unknowns, runs: tuple[Run, ...]) -> Shown:
+    simulated = tuple(
+        {n: bias[n] + getattr(run.outputs, n) for n in bias}
+        for run, bias in zip(runs, u.biases, strict=True)
     )
+    return Shown(simulated, _raw(data, u, runs), tuple(_rms(run.states) for run in runs))
 
 
 def _rms(states: Any) -> dict[str, Any]:
