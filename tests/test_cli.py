@@ -313,7 +313,6 @@ def test_missing_samples(bench, capsys):
     assert "output 'roll' is missing in 80 % of its samples" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_comparison_by_configuration(bench, capsys):
     def as_in_test_choice(content):  # so that what was compiled for one serves the other
         content["simulate"]["duration"] = 40

@@ -33,7 +33,6 @@ def test_nine_parameters_are_recovered_with_throttle(heave):
     assert a.sd < 0.02 * 6.0
 
 
-@pytest.mark.slow
 def test_without_throttle_the_pair_is_named(heave):
     found = heave["identify"](heave["records"](0.002))
     assert max(abs(e) for e in errors(heave, found).values()) < 4

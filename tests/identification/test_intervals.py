@@ -27,7 +27,6 @@ def white():
     return made()
 
 
-@pytest.mark.slow
 def test_on_white_noise_all_agree(white):
     bayes = importlib.util.find_spec("blackjax") is not None
     found = intervals(white, profiles=list(FREE), runs=300, draws=300 if bayes else 0)

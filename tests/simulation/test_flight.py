@@ -149,7 +149,6 @@ def test_rk4_is_dopri8(variant, substeps, xcell):
         )
 
 
-@pytest.mark.slow
 def test_two_seconds_are_scipys(xcell, hover):
     """One flight against solve_ivp with the second program's derivatives."""
     model, n = models.helicopter(), 50
