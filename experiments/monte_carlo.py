@@ -24,8 +24,9 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.baseline import baseline
 from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import deviations
-from heli_jax.identification.layout import Noise, layout_of, start_vector
+from heli_jax.identification.layout import Noise, layout_of
 from heli_jax.identification.noise import evaluation, levelled
+from heli_jax.identification.start import start_vector
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.inputs import random_steps
 

@@ -95,8 +95,9 @@ def test_imports_point_one_way(name):
 
 @pytest.mark.parametrize("name", ["config", "generate", "output"])
 def test_nothing_imports_the_command_line(name):
-    path = ROOT / f"{name}.py"
-    assert "cli" not in {other for other, _ in inner(path)}
+    mine = [p for p in FILES if part(p) == name]
+    assert mine
+    assert "cli" not in {other for path in mine for other, _ in inner(path)}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_nothing_imports_the_command_line(name):
         ("diffrax", {"simulation", "identification/residual.py"}),
         ("optimistix", {"identification", "analysis/trim.py"}),
         ("lineax", {"identification"}),
-        ("pydantic", {"config.py"}),
+        ("pydantic", {"config"}),
         ("matplotlib", {"report"}),
         ("plotly", {"report"}),
         ("yaml", {"yaml_file.py", "output.py"}),

@@ -15,10 +15,10 @@ from heli_jax.identification.layout import (
     Layout,
     Noise,
     layout_of,
-    start_vector,
 )
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import evaluate
+from heli_jax.identification.start import start_vector
 
 
 def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
@@ -48,7 +48,8 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
 def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:
     model = problem.model
     inputs = {n: np.asarray(flight.inputs[n], dtype) for n in naming.names(model.Inputs)}
-    outputs = {n: np.asarray(y, dtype) for n, y in flight.outputs.items()}
+    # By name, as JAX orders them in everything that is compiled.
+    outputs = {n: np.asarray(y, dtype) for n, y in sorted(flight.outputs.items())}
     return FlightData(
         dt=np.asarray(flight.dt, dtype),
         inputs=model.Inputs(**inputs),

@@ -166,5 +166,7 @@ def flight_nuisances(
 
 
 def labels(flights: tuple[Flight, ...]) -> list[str]:
-    """What to call each flight."""
-    return [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
+    """What to call each flight; of several with one name the second and further have a number."""
+    names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
+    before = [names[:i].count(name) for i, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]

@@ -14,7 +14,6 @@ from heli_jax.identification.layout import (
     Layout,
     Noise,
     layout_of,
-    start_vector,
     unpack,
 )
 from heli_jax.identification.noise import (
@@ -28,6 +27,7 @@ from heli_jax.identification.outcome import Ran, assemble, noise_by_name, signal
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, StartRow, Status
+from heli_jax.identification.start import start_vector
 
 __all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, spread_of
-from heli_jax.simulation.discretize import expm, process_noise, product, van_loan
+from heli_jax.simulation.discretize import moved, process_noise, product
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
 
@@ -221,12 +221,8 @@ def _local(
 
     def along(carry: tuple[Array, Array], h: Array, u: Any) -> tuple[Array, Array]:
         x, P = carry
-        A = jax.jacfwd(rates)(x, u)
-        n = A.shape[0]
-        M = jnp.zeros((n + 1, n + 1), dtype).at[:n, :n].set(A).at[:n, n].set(rates(x, u))
-        E = expm(M * h)
-        Phi = E[:n, :n]
-        return x + E[:n, n], product(product(Phi, P), Phi.T) + van_loan(A, g, h)
+        step = moved(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
+        return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
 
     def move(x: Array, P: Array, sample: Any) -> tuple[Array, Array]:
         carry = (x, P)

@@ -57,7 +57,7 @@ class Whiteness(NamedTuple):
 
     white: bool
     p_value: float
-    """of the Ljung-Box test over `lags` lags"""
+    """of the Ljung-Box test over `lags` lags, for all signals that were judged together"""
     lags: int
     outside: float
     """share of the lags outside the 99 % band"""
@@ -95,8 +95,12 @@ def lags_for(n: int) -> int:
     return max(1, min(n // 4, 500))
 
 
-def whiteness(residual: np.ndarray) -> Whiteness:
-    """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured."""
+def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
+    """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured.
+
+    `together` is how many signals are judged side by side: the p value is multiplied by it
+    (Bonferroni), so that one in a hundred white records fails, not one in a hundred signals.
+    """
     n = int(np.count_nonzero(~np.isnan(residual)))
     lags = lags_for(n)
     r = autocorrelation(residual, lags)[1:]
@@ -106,7 +110,9 @@ def whiteness(residual: np.ndarray) -> Whiteness:
     q_short = n * (n + 2) * np.sum(r[:short] ** 2 / (n - np.arange(1, short + 1)))
     p = min(
         1.0,
-        2.0 * min(scipy.special.chdtrc(lags, statistic), scipy.special.chdtrc(short, q_short)),
+        2.0
+        * together
+        * min(scipy.special.chdtrc(lags, statistic), scipy.special.chdtrc(short, q_short)),
     )
     outside = float(np.mean(np.abs(r) > 2.5758 / np.sqrt(n)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0]))

@@ -54,7 +54,7 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
         pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
         guesses = [{n: pooled[n] for n in guess} for guess in guesses]
     sd = tuple(
-        {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in flight.outputs}
+        {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in sorted(flight.outputs)}
         for flight, guess in zip(flights, guesses, strict=True)
     )
     return Noise(sd, np.zeros((), dtype))
@@ -135,7 +135,8 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
         found = found._replace(ratio=ratio)
     if not bool(best.converged):
         [best] = search.run(noise, best.z[None, :])
-        found = settle(search, noise, best)._replace(trace=found.trace, ratio=found.ratio)
+        again = settle(search, noise, best)
+        found = again._replace(trace=(*found.trace, *again.trace), ratio=found.ratio)
     return found
 
 

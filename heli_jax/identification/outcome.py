@@ -23,7 +23,7 @@ from heli_jax.identification.estimates import (
 )
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, start_vector, unpack
+from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -39,6 +39,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.search import Search, table
+from heli_jax.identification.start import start_vector
 
 
 class Ran(NamedTuple):
@@ -230,19 +231,25 @@ def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, n: int, ill: bool
 
 def _variances(e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
     """Of the innovations over the measurement noise's, by flight and output."""
-    given = (s for one in e.innovations for s in one.variance.values())
-    return [np.asarray(s) / sd**2 for s, sd in zip(given, sds.values(), strict=True)]
+    names = dict.fromkeys(key.rpartition("/")[0] for key in sds)
+    return [
+        np.asarray(s) / sds[f"{label}/{n}"] ** 2
+        for label, one in zip(names, e.innovations, strict=True)
+        for n, s in one.variance.items()
+    ]
 
 
 def _whiteness(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
     """Of the innovations where there are some, else of the residuals."""
-    if not e.innovations:
-        return {f"{s.flight}/{n}": whiteness(s.residual(n)) for s in signals for n in s.measured}
-    return {
-        f"{s.flight}/{n}": whiteness(error / np.sqrt(one.variance[n]))
-        for s, one in zip(signals, e.innovations, strict=True)
-        for n, error in one.error.items()
-    }
+    if e.innovations:
+        errors = {
+            f"{s.flight}/{n}": error / np.sqrt(one.variance[n])
+            for s, one in zip(signals, e.innovations, strict=True)
+            for n, error in one.error.items()
+        }
+    else:
+        errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+    return {name: whiteness(error, len(errors)) for name, error in errors.items()}
 
 
 def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:

@@ -90,14 +90,16 @@ def _agreement(signals: Signals, output: str) -> str:
     return f"{output}, {signals.flight}: {how}{vaf}"
 
 
-def residual_correlation(signals: Signals, output: str, *, figure: Figure | None = None) -> Panels:
+def residual_correlation(
+    signals: Signals, output: str, *, together: int = 1, figure: Figure | None = None
+) -> Panels:
     """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
     input, with 99 % bands."""
     residual, dt = signals.error(output), _dt(signals)
     n, lags = residual.size, lags_for(residual.size)
     names = list(signals.inputs)
     axes = _panels(figure, 2.4 + 1.6 * len(names), [1.2, *[1.0] * len(names)], sharex=False)
-    w = whiteness(residual)
+    w = whiteness(residual, together)
     found = "white" if w.white else "not white"
     what = "Residual" if signals.innovations is None else "Innovations"
     r = autocorrelation(residual, lags)[1:]

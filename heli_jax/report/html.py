@@ -78,7 +78,7 @@ def _drawings(
             drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
             if not s.hold_out:
                 drawings[f"residual{part}_{output}"] = _drawing(
-                    figures.residual_correlation, s, output
+                    figures.residual_correlation, s, output, together=len(fit.whiteness)
                 )
     if fit.signals[0].inputs:
         drawings["bode"] = _bode(fit, problem, baseline)
@@ -100,9 +100,9 @@ def _parts(flights: list[str]) -> list[str]:
     ]
 
 
-def _drawing(function: Callable[..., figures.Panels], *args: Any) -> Draw:
+def _drawing(function: Callable[..., figures.Panels], *args: Any, **how: Any) -> Draw:
     def draw() -> Figure | None:
-        axes = function(*args)
+        axes = function(*args, **how)
         return axes[0].figure if axes else None  # type: ignore[return-value]
 
     return draw

@@ -1,5 +1,6 @@
 """Exact discretisation of a linear model under a zero-order hold."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,20 +26,78 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """
     d = _balance(jax.lax.stop_gradient(M))
     X = M * (d[None, :] / d[:, None])
-    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(X), axis=0)))
-    s = jnp.ceil(jnp.log2(jnp.maximum(norm, _THETA) / _THETA))
+    s = _halvings(X)
     X = X * jnp.exp2(-s)
     eye = jnp.eye(M.shape[0], dtype=M.dtype)
     # Loops rather than unrolled sums: they run as fast and compile in half the time.
     degrees = jnp.arange(_DEGREE, 0, -1, dtype=M.dtype)
     E, _ = jax.lax.scan(lambda E, k: (eye + product(X, E) / k, None), eye, degrees)
-
-    def square(i: Array, E: Array) -> Array:
-        return jax.lax.cond(i < s, lambda E: product(E, E), lambda E: E, E)
-
-    E = jax.lax.fori_loop(0, _SQUARINGS, square, E)
-    E = jnp.where(s <= _SQUARINGS, E, jnp.nan)
+    E = _doubled(s, lambda E: product(E, E), E)
     return E * (d[:, None] / d[None, :])
+
+
+def _halvings(X: Float[Array, "n n"]) -> Float[Array, ""]:
+    """How often to halve X for the polynomial to be exact."""
+    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(X), axis=0)))
+    return jnp.ceil(jnp.log2(jnp.maximum(norm, _THETA) / _THETA))
+
+
+def _doubled(s: Float[Array, ""], double: Callable[[Any], Any], first: Any) -> Any:
+    """`double` applied s times; NaN where that is too often."""
+
+    def step(i: Array, value: Any) -> Any:
+        return jax.lax.cond(i < s, double, lambda value: value, value)
+
+    last = jax.lax.fori_loop(0, _SQUARINGS, step, first)
+    return jax.tree.map(lambda v: jnp.where(s <= _SQUARINGS, v, jnp.nan), last)
+
+
+class Moved(NamedTuple):
+    """What a step of x' = A x + f + g w does to x."""
+
+    Phi: Float[Array, "n n"]
+    """e^{A h}"""
+    shift: Float[Array, " n"]
+    """what f adds"""
+    Q: Float[Array, "n n"]
+    """covariance that w adds"""
+
+
+def moved(A: Float[Array, "n n"], f: Float[Array, " n"], g: Float[Array, " n"], h: Any) -> Moved:
+    """A step of h [s] of x' = A x + f + g w, with a white noise w of unit intensity a state.
+
+    The series of a fraction of the step, doubled until it is whole. The integrals are those that
+    Van Loan (1978) takes from exponentials of larger matrices; these hold e^{-A h}, and no digit
+    of them is left where a mode decays fast. Where the norm is past what `expm` takes the result
+    is NaN.
+    """
+    d = _balance(jax.lax.stop_gradient(A))
+    X = A * (d[None, :] / d[:, None]) * h
+    s = _halvings(X)
+    X, h = X * jnp.exp2(-s), h * jnp.exp2(-s)
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+
+    def term(carry: Any, k: Array) -> Any:
+        (P, m, M), total = carry
+        XM = product(X, M)
+        new = (
+            product(X, P) / k,
+            jnp.sum(X * m[None, :], axis=1) / (k + 1.0),
+            (XM + XM.T) / (k + 1.0),
+        )
+        return (new, jax.tree.map(jnp.add, total, new)), None
+
+    first = (eye, h * f / d, jnp.diag(h * jnp.square(g / d)))
+    degrees = jnp.arange(1, _DEGREE + 1, dtype=A.dtype)
+    (_, total), _ = jax.lax.scan(term, (first, first), degrees)
+
+    def double(whole: Any) -> Any:
+        P, m, M = whole
+        through = product(product(P, M), P.T)
+        return product(P, P), m + jnp.sum(P * m[None, :], axis=1), M + 0.5 * (through + through.T)
+
+    P, m, M = _doubled(s, double, total)
+    return Moved(P * (d[:, None] / d[None, :]), d * m, M * (d[:, None] * d[None, :]))
 
 
 def product(X: Float[Array, "n n"], Y: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -102,21 +161,8 @@ def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
     A = jacobians(model, params).A
     if model.noise is None:
         return jnp.zeros(A.shape, A.dtype)
-    G = jnp.stack([jnp.asarray(g, A.dtype) for g in jax.tree.leaves(model.noise(params))])
-    return van_loan(A, G, dt)
-
-
-def van_loan(A: Float[Array, "n n"], g: Float[Array, " n"], dt: Any) -> Float[Array, "n n"]:
-    """Covariance after dt [s] of x' = A x + g w with white noise w of unit intensity, from zero.
-
-    Each state has its own w. Source: Van Loan (1978).
-    """
-    n = A.shape[0]
-    M = jnp.zeros((2 * n, 2 * n), A.dtype)
-    M = M.at[:n, :n].set(-A).at[:n, n:].set(jnp.diag(g**2)).at[n:, n:].set(A.T)
-    E = expm(M * jnp.asarray(dt, A.dtype))
-    Q = E[n:, n:].T @ E[:n, n:]
-    return 0.5 * (Q + Q.T)
+    g = jnp.stack([jnp.asarray(g, A.dtype) for g in jax.tree.leaves(model.noise(params))])
+    return moved(A, jnp.zeros_like(g), g, jnp.asarray(dt, A.dtype)).Q
 
 
 def square_root(Q: Float[Array, "n n"]) -> Float[Array, "n n"]:

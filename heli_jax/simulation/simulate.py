@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import blockwise, columns, matrix
-from heli_jax.simulation.discretize import discretize, process_noise, square_root, van_loan
+from heli_jax.simulation.discretize import discretize, moved, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.solvers import (
     RK4,
@@ -318,7 +318,7 @@ def _kick(
     assert model.noise is not None
     given = naming.asdict(model.noise(params))
     g = jnp.stack([jnp.asarray(given[n], x.dtype) for n in names])
-    L = square_root(van_loan(jax.jacfwd(rates)(x), g, dt))
+    L = square_root(moved(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
     new = x + L @ jnp.stack(draws)
     return model.State(**{n: new[i] for i, n in enumerate(names)})
 

@@ -9,9 +9,10 @@ import pytest
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax.identification.data import data_of
-from heli_jax.identification.layout import layout_of, start_vector
+from heli_jax.identification.layout import layout_of
 from heli_jax.identification.noise import first_noise
 from heli_jax.identification.residual import evaluate, rows_of
+from heli_jax.identification.start import start_vector
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4)}
@@ -28,6 +29,14 @@ def problem(flights=1, **how):
 )
 def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     one = problem(2, window=1.0, continuity=continuity, nuisance=nuisance)
+    # Two outputs, and not in the order of their names.
+    flights = [
+        dataclasses.replace(
+            f, outputs={"roll_rate": np.gradient(f.outputs["roll"], f.dt), **f.outputs}
+        )
+        for f in one.flights
+    ]
+    one = dataclasses.replace(one, flights=flights)
     layout, data = layout_of(one, one.training), data_of(one, one.training)
     assert layout.windows == ((4, 50), (5, 48))
     noise = first_noise(one, one.training)
@@ -42,7 +51,7 @@ def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     np.testing.assert_allclose(e.r, near[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(e.J, wanted, rtol=1e-5, atol=1e-7 * np.abs(wanted).max())
     jumps = 0 if continuity is None else 4 * (3 + 4)
-    assert e.r.size == 200 + 240 + jumps + 2 + (layout.size - layout.weak)
+    assert e.r.size == 2 * (200 + 240) + jumps + 2 + (layout.size - layout.weak)
 
 
 def test_windows_that_hang_together_are_one_run():

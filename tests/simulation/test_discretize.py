@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 
 from heli_jax import Helicopter, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.simulation.discretize import discretize, expm, process_noise, square_root
+from heli_jax.simulation.discretize import (
+    discretize,
+    expm,
+    moved,
+    process_noise,
+    square_root,
+)
 from tests.dynamics.paper import BENCH, matrices, scattered
 
 fast = jax.jit(expm)
@@ -44,6 +50,42 @@ def test_stiff_and_stable(rates, seed):
     found = fast(jnp.asarray(V @ np.diag(rates) @ V.T))
     wanted = V @ np.diag(np.exp(rates)) @ V.T
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-14 * (10.0 + np.abs(rates).max()))
+
+
+step = jax.jit(moved)
+
+
+@given(st.integers(0, 10**6), st.floats(-6.0, 2.0), st.lists(st.integers(-9, 9), min_size=5))
+def test_a_step_is_the_exponentials(seed, size, powers):
+    """Mean and covariance against exponentials of the augmented matrices, in wild units too."""
+    rng = np.random.default_rng(seed)
+    d = 2.0 ** np.resize(powers, 5)
+    A = (dense(seed) * d[:, None] / d[None, :]) * 10.0**size
+    f, g = d * rng.standard_normal(5), d * rng.standard_normal(5)
+    h = 1.0 / np.linalg.norm(A / d[:, None] * d[None, :], 2) * rng.uniform(0.01, 3.0)
+    found = step(*(jnp.asarray(v) for v in (A, f, g, h)))
+    M = np.block([[A, f[:, None]], [np.zeros((1, 6))]])
+    E = scipy.linalg.expm(M / np.append(d, 1.0)[:, None] * np.append(d, 1.0)[None, :] * h)
+    np.testing.assert_allclose(
+        found.Phi / d[:, None] * d[None, :], E[:5, :5], atol=1e-12 * np.abs(E).max()
+    )
+    np.testing.assert_allclose(found.shift / d, E[:5, 5], atol=1e-12 * np.abs(E[:5, 5]).max())
+    G = np.diag(g / d) ** 2
+    V = np.block([[-A / d[:, None] * d[None, :], G], [np.zeros((5, 5)), (A / d[:, None] * d).T]])
+    F = scipy.linalg.expm(V * h)
+    Q = F[5:, 5:].T @ F[:5, 5:]
+    np.testing.assert_allclose(found.Q / d[:, None] / d[None, :], Q, atol=1e-11 * np.abs(Q).max())
+
+
+def test_a_step_of_a_stiff_system():
+    A = np.array([[-1e4, 0.0], [1.0, -2.0]])
+    found = step(*(jnp.asarray(v) for v in (A, np.array([1e4, 0.0]), np.array([3.0, 0.0]), 0.02)))
+    assert float(found.Q[0, 0]) == pytest.approx(9.0 / 2e4, rel=1e-10)
+    assert float(found.shift[0]) == pytest.approx(1.0, rel=1e-10)
+    # The second state sees the first as white noise of 3/1e4, but for its lag.
+    wanted = (3.0 / 1e4) ** 2 * (1.0 - np.exp(-0.08)) / 4.0
+    assert float(found.Q[1, 1]) == pytest.approx(wanted, rel=0.02)
+    assert np.all(np.linalg.eigvalsh(found.Q) > 0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,21 @@
+"""Experiment configurations: YAML, validated, and the problems that they describe."""
+
+from heli_jax.config.experiment import Experiment, in_wind, load, resolved
+from heli_jax.config.logs import read_flights, signals
+from heli_jax.config.problems import disturbed, problem, rivals
+from heli_jax.config.schema import Config, SimulateConfig, StickConfig
+
+__all__ = [
+    "Config",
+    "Experiment",
+    "SimulateConfig",
+    "StickConfig",
+    "disturbed",
+    "in_wind",
+    "load",
+    "problem",
+    "read_flights",
+    "resolved",
+    "rivals",
+    "signals",
+]

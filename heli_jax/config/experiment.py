@@ -1,0 +1,180 @@
+"""An experiment: a configuration read and validated, with what it names at hand."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pydantic
+from pydantic import BaseModel
+
+from heli_jax import models
+from heli_jax.config.schema import Config
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError, nearest
+from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
+from heli_jax.yaml_file import parse_value, read_mapping
+
+
+class Experiment(NamedTuple):
+    """A validated configuration with what it names at hand."""
+
+    config: Config
+    path: Path
+    """the file it came from; its folder is where relative paths begin"""
+    model: Model
+    vehicle: Vehicle
+
+
+def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
+    """Read and validate a configuration, its model and its vehicle; no log is opened yet.
+
+    `overrides` are `key.path=value` texts.
+
+    Raises:
+        InputError: anything in the file or an override is wrong.
+    """
+    path = Path(path)
+    content = read_mapping(path)
+    for text in overrides:
+        _override(content, text)
+    config = _validated(content, str(path))
+    model = _model(config, path)
+    vehicle = _vehicle(config, path, model)
+    return Experiment(config, path, model, vehicle)
+
+
+def _model(config: Config, path: Path) -> Model:
+    folder = path.absolute().parent
+    model = models.by_name(config.model, f"{path}: model", folder)
+    if config.corrections is None:
+        return model
+    where = f"{path}: corrections"
+    return models.by_name(config.model, where, folder, corrections=config.corrections)
+
+
+def in_wind(experiment: Experiment) -> Experiment:
+    """The experiment with a model that has the wind as inputs.
+
+    Raises:
+        InputError: the model takes no wind.
+    """
+    config, path = experiment.config, experiment.path
+    model = models.by_name(
+        config.model,
+        f"{path}: simulate.wind",
+        path.absolute().parent,
+        corrections=config.corrections,
+        wind=True,
+    )
+    return experiment._replace(model=model)
+
+
+def _override(content: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    where = f"--set {text!r:.80}"
+    if not equals or not key.strip():
+        raise InputError(f"{where}: wanted is key.path=value")
+    *above, last = key.strip().split(".")
+    at: Any = content
+    for name in above:
+        at = _child(at, name, where)
+    if isinstance(at, list):
+        at[_index(at, last, where)] = parse_value(value, where)
+    elif isinstance(at, dict):
+        at[last] = parse_value(value, where)
+    else:
+        raise InputError(f"{where}: {'.'.join(above)} holds no keys to set")
+
+
+def _child(at: Any, name: str, where: str) -> Any:
+    if isinstance(at, list):
+        return at[_index(at, name, where)]
+    if isinstance(at, dict):
+        return at.setdefault(name, {})
+    raise InputError(f"{where}: there is nothing below the key before {name!r}")
+
+
+def _index(at: list[Any], name: str, where: str) -> int:
+    if not name.isdigit() or int(name) >= len(at):
+        raise InputError(f"{where}: found {name!r}, wanted is a number from 0 to {len(at) - 1}")
+    return int(name)
+
+
+def _validated(content: dict[str, Any], where: str) -> Config:
+    try:
+        return Config.model_validate(content)
+    except pydantic.ValidationError as e:
+        # An unknown key is the likeliest cause of the others, so it is told first.
+        errors = sorted(e.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        raise InputError(f"{where}: {_sentence(errors[0])}") from None
+
+
+def _sentence(error: Any) -> str:
+    place = _place(error["loc"])
+    found = error.get("input")
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(error["loc"])
+        return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
+    if error["type"] == "missing":
+        return f"{place}: missing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    message = message[0].lower() + message[1:]
+    if isinstance(found, dict | list) or error["type"] == "value_error":
+        return f"{place}: {message}"
+    return f"{place}: found {found!r:.60}, {message.replace('input should be', 'wanted is')}"
+
+
+def _place(loc: tuple[Any, ...]) -> str:
+    text = ""
+    for part in loc:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        elif part not in ("str", "dict[str,any]"):
+            text += f".{part}" if text else str(part)
+    return text or "the configuration"
+
+
+def _known_keys(loc: tuple[Any, ...]) -> list[str]:
+    """The keys of the section that an unknown key stands in."""
+    section: Any = Config
+    for part in loc[:-1]:
+        if isinstance(part, int):
+            continue
+        fields = getattr(section, "model_fields", None)
+        if fields is None or part not in fields:
+            continue
+        section = _section(fields[part].annotation) or section
+    return list(section.model_fields)
+
+
+def _section(annotation: Any) -> Any:
+    """The configuration class within an annotation such as list[FlightConfig] | None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        found = _section(inner)
+        if found is not None:
+            return found
+    return None
+
+
+def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
+    if isinstance(config.vehicle, str):
+        return read_vehicle(path.parent / config.vehicle, model.Params)
+    return vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
+
+
+def resolved(experiment: Experiment) -> dict[str, Any]:
+    """The configuration written out so that it runs again from anywhere.
+
+    Paths of logs become absolute; the vehicle stands in it with units and sources.
+    """
+    config, path = experiment.config, experiment.path
+    content = config.model_dump(mode="json", exclude_none=True)
+    for flight in content.get("flights", []):
+        flight["log"] = str((path.parent / flight["log"]).resolve())
+    content["vehicle"] = {
+        name: {"value": c.value, "unit": c.unit, "source": c.source}
+        for name, c in experiment.vehicle.constants.items()
+    }
+    return content

@@ -1,0 +1,137 @@
+"""The problem that a configuration describes."""
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+
+from heli_jax import models, naming, units
+from heli_jax.config.experiment import Experiment
+from heli_jax.config.logs import read_flights
+from heli_jax.config.schema import FitConfig
+from heli_jax.dynamics.disturbance import disturbable, with_disturbance
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError, nearest
+from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
+
+if TYPE_CHECKING:
+    from heli_jax.identification.choice import Alternatives
+
+
+def problem(experiment: Experiment) -> Problem:
+    """The problem that a configuration's `fit` describes, its logs read.
+
+    Raises:
+        InputError: no fit or no flight, a log that cannot be read, or parts that do not fit.
+    """
+    config, path = experiment.config, experiment.path
+    if config.fit is None:
+        raise InputError(f"{path}: fit: missing, wanted is fit.free with a parameter to estimate")
+    if not config.fit.free:
+        raise InputError(f"{path}: fit.free: nothing is free, wanted is a parameter to estimate")
+    _check_intervals(config.fit, path)
+    nuisance = Nuisance(**config.fit.nuisance.model_dump())
+    flights = read_flights(experiment, gain=nuisance.input_gain)
+    free = {
+        name: Free(f.start, f.lower, f.upper, Prior(f.prior.mean, f.prior.sd) if f.prior else None)
+        for name, f in config.fit.free.items()
+    }
+    model, params, fixed = experiment.model, experiment.vehicle.params, ()
+    if config.fit.method == "filter-error":
+        if config.disturbance is None:
+            raise InputError(
+                f"{path}: fit.method: filter-error needs a disturbance, wanted is "
+                "disturbance: {axis: roll, poles: 1}"
+            )
+        model, params = disturbed(experiment)
+        fixed = tuple(config.disturbance.fixed)
+    try:
+        return Problem(
+            model,
+            params,
+            flights,
+            free,
+            nuisance,
+            gain_units=_gain_units(experiment) if nuisance.input_gain else {},
+            method=config.fit.method,
+            fixed_noise=fixed,
+            window=None if config.fit.shooting is None else config.fit.shooting.window,
+            continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
+        )
+    except ValueError as e:
+        raise InputError(
+            f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}"
+        ) from e
+
+
+def _check_intervals(wanted: FitConfig, path: Path) -> None:
+    """Refuse before the fit what could not be done after it."""
+    for name in wanted.intervals.profile:
+        if name not in wanted.free:
+            raise InputError(
+                f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, wanted.free)}"
+            )
+    if wanted.intervals.nuts and importlib.util.find_spec("blackjax") is None:
+        raise InputError(
+            f"{path}: fit.intervals.nuts: blackjax is not installed, wanted is the extra bayes: "
+            "pip install 'heli_jax[bayes]'"
+        )
+    if wanted.intervals.bootstrap and wanted.nuisance.time_shift:
+        raise InputError(
+            f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, wanted is "
+            "one of the two"
+        )
+
+
+def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
+    """The models that a configuration's `compare` puts beside the fitted one.
+
+    Raises:
+        InputError: no axis of the model can be disturbed.
+    """
+    from heli_jax.identification.choice import alternatives  # not before it is needed: slow
+
+    model, wanted = experiment.model, experiment.config.disturbance
+    axes = disturbable(model)
+    if not axes:
+        raise InputError(
+            f"{experiment.path}: fit.compare: model {model.name} has no axis to disturb, wanted is "
+            "one with roll, pitch or yaw"
+        )
+    axis = wanted.axis if wanted is not None else axes[0]
+    bare = {"roll-on-stand": "roll", "pitch-on-stand": "pitch"}.get(model.name)
+    stand = models.by_name(bare) if bare and "kappa" in fitted.free else None
+    return alternatives(fitted, model, axis, without_stand=stand)
+
+
+def disturbed(experiment: Experiment) -> tuple[Model, Any]:
+    """The model with the configuration's disturbance, and its parameters.
+
+    Raises:
+        InputError: the model has no such axis.
+    """
+    model, params, wanted = (
+        experiment.model,
+        experiment.vehicle.params,
+        experiment.config.disturbance,
+    )
+    if wanted is None:
+        return model, params
+    try:
+        model = with_disturbance(model, wanted.axis, wanted.poles)
+    except ValueError as e:
+        raise InputError(f"{experiment.path}: disturbance: {e}") from e
+    given = {"sigma_w": wanted.sigma_w, "tau_w": wanted.tau_w}
+    extra = {n: jnp.asarray(v) for n, v in given.items() if v is not None}
+    return model, model.Params(**{**naming.asdict(params), **extra})
+
+
+def _gain_units(experiment: Experiment) -> dict[str, str]:
+    """The unit that each input's gain carries: 1 where the log's unit is of the right kind."""
+    out = {}
+    for name, one in experiment.config.flights[0].signals.inputs.items():
+        si = naming.unit(experiment.model.Inputs, name)
+        plain = one.unit is not None and units.is_plain(one.unit)
+        out[name] = si if si and plain and not units.is_plain(si) else "1"
+    return out

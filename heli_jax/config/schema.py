@@ -1,0 +1,203 @@
+"""What may stand in a configuration: its sections, their keys and their bounds."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
+
+from heli_jax.identification.problem import Method
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TimeConfig(_Strict):
+    signal: str
+    unit: str = "s"
+
+
+class InputConfig(_Strict):
+    signal: str
+    unit: str | None = None
+
+
+class OutputConfig(_Strict):
+    signal: str
+    unit: str | None = None
+    sd: Positive | None = None
+
+
+class SignalsConfig(_Strict):
+    time: TimeConfig
+    inputs: dict[str, InputConfig]
+    outputs: dict[str, OutputConfig]
+
+
+class FlightConfig(_Strict):
+    log: str
+    signals: SignalsConfig
+    name: str | None = None
+    rate: Positive | None = None
+    window: tuple[Finite, Finite] | None = None
+    hold_out: bool = False
+    known: dict[str, Finite] = {}
+
+
+class PriorConfig(_Strict):
+    mean: Finite
+    sd: Positive
+
+
+class FreeConfig(_Strict):
+    start: Finite
+    lower: Finite | None = None
+    upper: Finite | None = None
+    prior: PriorConfig | None = None
+
+
+class NuisanceConfig(_Strict):
+    initial_state: bool = True
+    bias: bool = True
+    time_shift: bool = False
+    input_gain: bool = False
+
+
+class IntervalsConfig(_Strict):
+    """Intervals beside the Gaussian one."""
+
+    profile: list[str] = []
+    """free parameters whose profile likelihood is wanted"""
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """made records to refit; 0 for none"""
+    nuts: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """draws of each of four chains (extra `bayes`); 0 for none"""
+
+
+class ShootingConfig(_Strict):
+    """Multiple shooting: windows with initial states of their own."""
+
+    window: Positive
+    """length [s]"""
+    continuity: Positive | None = None
+    """sd of the jump of each state between windows, as a part of what it does; null: free"""
+
+
+class FitConfig(_Strict):
+    method: Method = "output-error"
+    free: dict[str, FreeConfig]
+    nuisance: NuisanceConfig = NuisanceConfig()
+    shooting: ShootingConfig | None = None
+    starts: Annotated[int, Field(ge=1, le=10_000)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    max_steps: Annotated[int, Field(ge=1)] = 200
+    compare: bool = False
+    """whether to fit the alternatives too: no disturbance, one pole, two poles; without stand"""
+    intervals: IntervalsConfig = IntervalsConfig()
+
+
+class RLSConfig(_Strict):
+    order: Annotated[int, Field(ge=1, le=20)] = 4
+    forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class DisturbanceConfig(_Strict):
+    """A random acceleration on one axis: simulation draws it, filter error estimates it."""
+
+    axis: Literal["roll", "pitch", "yaw"]
+    poles: Literal[1, 2] = 1
+    sigma_w: Positive | None = None
+    """standard deviation [rad/s^2]: needed to simulate, a start for filter error"""
+    tau_w: Positive | None = None
+    """correlation time [s]: needed to simulate, a start for filter error"""
+    fixed: list[Literal["sigma_w", "tau_w", "sigma_y"]] = []
+    """what filter error takes as it stands here; sigma_y: the noise that the outputs state (sd)"""
+
+    @model_validator(mode="after")
+    def _fixed_given(self) -> "DisturbanceConfig":
+        for name in ("sigma_w", "tau_w"):
+            if name in self.fixed and getattr(self, name) is None:
+                raise ValueError(f"{name} is fixed but not given, wanted is its value")
+        return self
+
+
+class StickConfig(_Strict):
+    """How one input moves in a simulation."""
+
+    kind: Literal["random-steps", "3-2-1-1", "sweep", "neutral"] = "random-steps"
+    amplitude: Positive
+    unit: str | None = None
+    hold: tuple[Positive, Positive] = (0.3, 2.0)
+    """shortest and longest step of random-steps [s]"""
+    step: Positive = 0.3
+    """unit length of 3-2-1-1 [s]"""
+    pause: Positive = 2.0
+    """neutral between two 3-2-1-1 [s]"""
+    band: tuple[Positive, Positive] = (0.05, 5.0)
+    """first and last frequency of a sweep [Hz]"""
+
+
+class NoiseConfig(_Strict):
+    sd: Positive
+    unit: str | None = None
+
+
+class StartConfig(_Strict):
+    """The steady flight in which a run of the whole helicopter begins."""
+
+    ahead: Finite = 0.0
+    """speed over the ground along the heading [m/s]"""
+    aside: Finite = 0.0
+    """to the right of it [m/s]"""
+    climb: Finite = 0.0
+    """[m/s]"""
+    heading: Finite = 0.0
+    """psi [rad]"""
+
+
+class SimulateConfig(_Strict):
+    """A run that the project makes itself.
+
+    The whole helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
+    start, wind, hold_attitude and ground are for it alone.
+    """
+
+    duration: Positive
+    rate: Positive
+    inputs: dict[str, StickConfig] = {}
+    noise: dict[str, NoiseConfig] = {}
+    seed: Annotated[int, Field(ge=0)] = 0
+    start: StartConfig | None = None
+    """hover unless given"""
+    wind: tuple[Finite, Finite, Finite] | None = None
+    """velocity of the air along x, y and z (up) [m/s]"""
+    hold_attitude: bool = False
+    """whether a pilot's gentle feedback is added to the sticks, so that a long manoeuvre does not
+    diverge (`heli_jax.analysis.pilot`)"""
+    ground: Annotated[float, Field(lt=0, allow_inf_nan=False)] | None = None
+    """height at which the run ends [m]; it begins at a height of zero"""
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "SimulateConfig":
+        if not 8 <= self.duration * self.rate <= 1e8:
+            raise ValueError(
+                f"duration times rate is {self.duration * self.rate:g} samples, wanted are 8 to 1e8"
+            )
+        return self
+
+
+class Config(_Strict):
+    """One experiment."""
+
+    model: str
+    vehicle: str | dict[str, Any]
+    corrections: dict[str, StrictBool] | None = None
+    """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
+    off in place of what the model has; for the whole helicopter only"""
+    flights: list[FlightConfig] = []
+    fit: FitConfig | None = None
+    rls: RLSConfig | None = RLSConfig()
+    disturbance: DisturbanceConfig | None = None
+    simulate: SimulateConfig | None = None
