@@ -59,7 +59,8 @@ def print_fit(
     problem: Problem, fit: Fit, baseline: Baseline | None, further: files.Further, out: Path
 ) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
-    print(f"{fit.status}: {fit.verdict.text}")
+    judged = "judged where it stopped: " if fit.status == "not-converged" else ""
+    print(f"{fit.status}: {judged}{fit.verdict.text}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")

@@ -94,6 +94,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
     notes = [
+        *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
         *_disturbance_notes(settled.ratio if none else None),
         *_filter_notes(layout, noise, e, n, ill),
@@ -193,6 +194,24 @@ _DIGITS = 1e13
 """Variance of an innovation over that of the measurement beyond which float64 has no digits left
 for what the measurement says of the state."""
 _TOLERANCE = 1e-6
+
+
+def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]:
+    """What to do where the optimiser has not arrived."""
+    if bool(best.converged):
+        return []
+    steps = sum(s for s, _ in settled.trace)
+    windows = sum(count for count, _ in layout.windows)
+    remedy = "start nearer, with bounds or several starts, or allow more steps"
+    if windows > len(layout.windows) and layout.continuity is None:
+        remedy = (
+            "tie the windows together (continuity), since a state that no output shows is free in "
+            f"each of them; or {remedy}"
+        )
+    return [
+        f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
+        f"Remedy: {remedy}."
+    ]
 
 
 def _ill_conditioned(layout: Layout, e: Evaluation, sds: dict[str, float]) -> bool:

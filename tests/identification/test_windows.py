@@ -69,6 +69,9 @@ def test_windows_that_hang_together_are_one_run():
         assert abs(loose.value - BENCH[name]) < 4 * loose.sd
     assert apart.signals[0].simulated["roll"].shape == (200,)
     assert "flight 1/initial phi of window 4" in apart.nuisance
+    stopped = fit(problem(window=1.0), max_steps=2)
+    assert stopped.status == "not-converged"
+    assert any("after 2 steps" in n and "tie the windows together" in n for n in stopped.notes)
 
 
 def test_a_flight_held_out_is_cut_as_well():
