@@ -32,6 +32,7 @@ test: .venv/.installed
 
 bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/identification.py
+	$(BIN)/python experiments/benchmarks/helicopter.py
 
 clean:
 	rm -rf .venv runs .pytest_cache .ruff_cache

@@ -1,6 +1,5 @@
 """Runs that a configuration describes and the project makes itself."""
 
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -23,11 +22,8 @@ from heli_jax.dynamics.model import Model, needed_but_missing, zeros
 from heli_jax.errors import InputError, nearest
 from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
-from heli_jax.simulation.simulate import simulate
+from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
-
-_LONGEST_STEP = 0.005
-"""of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
 
 _MIDDLE = 1e-14
 
@@ -134,7 +130,7 @@ def _run(
             u,
             dt=1.0 / wanted.rate,
             initial_state=x,
-            substeps=max(4, math.ceil(1.0 / (wanted.rate * _LONGEST_STEP))),
+            substeps=substeps_for(1.0 / wanted.rate),
             key=jax.random.key(wanted.seed) if experiment.config.disturbance else None,
             feedback=pilot,
             events=ends or None,

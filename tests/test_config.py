@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -37,6 +38,25 @@ def test_the_helicopter_by_name(load, name, model):
     assert found.model.name == model
     assert load(model=name).model is found.model
     assert "beta_roll" in found.model.State._fields
+
+
+def test_a_slow_log_gets_more_steps_a_sample(load, tmp_path):
+    """Steps of 5 ms at most, as `simulate` takes them."""
+    rng = np.random.default_rng(0)
+    log = {"t": 0.05 * np.arange(60), "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
+    text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in zip(*log.values(), strict=True))
+    (tmp_path / "log.csv").write_text(f"t,u,y\n{text}\n")
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": {"x_roll": {"signal": "u", "unit": "mm"}},
+        "outputs": {"roll": {"signal": "y", "unit": "rad"}},
+    }
+    found = load(
+        model="roll",
+        flights=[{"log": "log.csv", "signals": signals}],
+        fit={"free": {"Ixx": {"start": 0.2}}},
+    )
+    assert configuration.problem(found).substeps == 10
 
 
 def test_corrections_switch_on_and_off(load):

@@ -14,6 +14,7 @@ from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
+from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
     from heli_jax.identification.choice import Alternatives
@@ -53,6 +54,7 @@ def problem(experiment: Experiment) -> Problem:
             flights,
             free,
             nuisance,
+            substeps=max(substeps_for(f.dt) for f in flights),
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
             fixed_noise=fixed,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -51,6 +52,15 @@ def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
         raise ValueError(f"inputs have shapes {sorted(shapes)}, wanted is (N,) for all, N >= 2")
     return inputs, dt
+
+
+_LONGEST_STEP = 0.005
+"""of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
+
+
+def substeps_for(dt: float) -> int:
+    """Steps of a fixed-step solver in a sample of dt [s]: four, and more in samples over 20 ms."""
+    return max(4, math.ceil(dt / _LONGEST_STEP - 1e-9))
 
 
 def simulate(
