@@ -3,11 +3,11 @@
     .venv/bin/python experiments/heave_separates_a.py [FOLDER]
 
 Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
-rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. Roll alone knows a only beside the inertias;
-hover and heave know it beside the mass, which a balance gives. Moving the throttle by 3 % tells the
-rotor's inertia from the motor's gain as well; with 0.2 % only their product is known.
-FOLDER (runs/heave) gets results.json and
-page.md.
+rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines none of the
+parameters: nothing shows the rotor's speed, the climb and where the rest of the machine began.
+Position shows the thrust, which knows a beside the mass, and a balance gives that. Moving the
+throttle by 3 % tells the rotor's inertia from the motor's gain as well; with 0.2 % only their
+product is known. FOLDER (runs/heave) gets results.json and page.md.
 """
 
 import json
@@ -118,7 +118,8 @@ def main() -> None:
     page, results = ["# What separates a from the inertias", ""], {}
     for title, (throttle, measured, moved, names) in CASES.items():
         found = identify(records(throttle, measured, moved), names)
-        page += [f"## {title}", "", *table(found), "", found.verdict.text, ""]
+        page += [f"## {title}", "", *table(found), "", f"{found.status}: {found.verdict.text}"]
+        page += [*found.notes, ""]
         results[title] = {
             "status": found.status,
             "condition": found.verdict.condition,
