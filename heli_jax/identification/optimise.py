@@ -92,6 +92,7 @@ class _Scaling(NamedTuple):
     level: Float[Array, ""]
 
 
+@jax.jit
 def _scaling(r0: Float[Array, " n"], J0: Float[Array, "n q"]) -> _Scaling:
     """Columns of equal norm and a cost of order one; an unknown without effect stays put."""
     norms = jnp.linalg.norm(J0, axis=0)
@@ -209,7 +210,38 @@ def _descend(
         if k + 1 == max_steps or bool(np.all(state.done)):
             break
         r, J = slopes(point(terms, state.solver.y_eval))
-    z, rows = point(terms, state.xi), state.solver.f_info.residual
+    return _optimum(terms, state, point(terms, state.xi), count)
+
+
+@eqx.filter_jit
+def _at_once(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    terms: _Terms,
+    first: tuple[Array, Array],
+    max_steps: Array,
+) -> tuple[_State, Array]:
+    """`_descend` from one start in a program of its own, and the point where it ended."""
+
+    def advanced(state: _State, r: Array, J: Array) -> _State:
+        return _advance(terms, state, _compressed(terms, r, J))
+
+    def more(carry: tuple[Array, _State]) -> Array:
+        return (carry[0] < max_steps) & ~carry[1].done
+
+    def step(carry: tuple[Array, _State]) -> tuple[Array, _State]:
+        k, state = carry
+        e = differentiate(layout, data, noise, _point(terms, state.solver.y_eval))
+        return k + 1, advanced(state, e.r, e.J)
+
+    state = advanced(_begin(terms), *first)
+    _, state = jax.lax.while_loop(more, step, (jnp.ones_like(max_steps), state))
+    return state, _point(terms, state.xi)
+
+
+def _optimum(terms: _Terms, state: _State, z: Array, count: np.ndarray | int) -> Optimum:
+    rows = state.solver.f_info.residual
     cost = jnp.sum(jnp.square(rows), axis=-1) * terms.units.level**2
     cost = cost / jnp.asarray(count, cost.dtype)
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z), axis=-1)
@@ -226,12 +258,18 @@ def optimise(
     """The least-squares optimum from z0."""
     first = differentiate(layout, data, noise, z0)
     terms = _Terms(z0, _scaling(first.r, first.J), _anchor(layout, z0), _watched(layout))
+    count = residuals_count(data)
+    if layout.model.linear and not layout.filtered:
+        # Such residuals take no longer to evaluate than a step takes to be called for, and compile
+        # in two seconds.
+        steps = jnp.asarray(max_steps)
+        state, z = _at_once(layout, data, noise, terms, (first.r, first.J), steps)
+        return _optimum(terms, state, z, count)
 
     def slopes(z: Array) -> tuple[Array, Array]:
         e = differentiate(layout, data, noise, z)
         return e.r, e.J
 
-    count = residuals_count(data)
     return _descend(slopes, terms, (first.r, first.J), count, max_steps, _one)
 
 
@@ -289,8 +327,8 @@ def _anchor(layout: Layout, z0: Array) -> Array:
 
 def _watched(layout: Layout) -> Array:
     """The unknowns whose steps say whether the optimiser has arrived."""
-    at = jnp.arange(layout.size)
-    return (at < len(layout.named)) | (at >= layout.weak)
+    at = np.arange(layout.size)
+    return jnp.asarray((at < len(layout.named)) | (at >= layout.weak))
 
 
 def residuals_count(data: Data) -> int:
