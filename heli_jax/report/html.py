@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import jinja2
 from matplotlib.figure import Figure
 
 from heli_jax import naming
@@ -16,13 +15,13 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
 from heli_jax.report.files import Further, versions
+from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
 
 _GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
-_HERE = Path(__file__).parent
 
 
 class Picture(NamedTuple):
@@ -127,14 +126,8 @@ def render(
 ) -> str:
     """The page as text."""
     lines = card.card(problem, fit)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(
+    return filled(
+        "report.html.j2",
         title=title,
         fit=fit,
         problem=problem,

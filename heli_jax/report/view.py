@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jinja2
 import markupsafe
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,11 +16,11 @@ from heli_jax.dynamics.model import Model
 from heli_jax.report import manoeuvre, style
 from heli_jax.report.animation import animation, size_of
 from heli_jax.report.html import MOST_FLIGHTS, Picture
+from heli_jax.report.page import filled
 from heli_jax.simulation.trajectory import Trajectory
 
 _HUGE = 1e9
 """what no state of a machine reaches, and no figure can draw"""
-_HERE = Path(__file__).parent
 # Unless told otherwise plotly offers a button that uploads the data.
 _SETTINGS = {
     "displaylogo": False,
@@ -67,14 +66,8 @@ def write_view(
             flight = _flight(run, params, len(shown) + 1, first)
             size = size_of(run, float(params.R))
         shown.append(Shown(name, _pictures(run, model), flight, size))
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("view.html.j2").render(
+    page = filled(
+        "view.html.j2",
         title=title,
         model=model,
         notes=notes,
