@@ -59,7 +59,7 @@ def innovations(
         delay: as in `simulate`.
         substeps: linearisations a sample, for models that are not linear.
 
-    Source: Kalman (1960); the discretisation by Van Loan (1978); local linearisation by
+    Source: Kalman (1960); the covariance's integral in Van Loan (1978); local linearisation by
     Ozaki (1985).
     """
     x0 = model.initial_state(params) if initial_state is None else initial_state

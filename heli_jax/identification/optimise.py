@@ -257,7 +257,7 @@ def optimise(
 ) -> Optimum:
     """The least-squares optimum from z0."""
     first = differentiate(layout, data, noise, z0)
-    terms = _Terms(z0, _scaling(first.r, first.J), _anchor(layout, z0), _watched(layout))
+    terms = _terms(layout, z0, _scaling(first.r, first.J))
     count = residuals_count(data)
     if layout.model.linear and not layout.filtered:
         # Such residuals take no longer to evaluate than a step takes to be called for, and compile
@@ -309,7 +309,7 @@ def optimise_many(
         at = np.minimum(np.arange(i, i + batch), k - 1)
         z0 = starts[at]
         numbers = jax.vmap(data)(jax.tree.map(lambda v, at=at: v[at], each))
-        terms = jax.vmap(lambda z: _Terms(z, units, _anchor(layout, z), _watched(layout)))(z0)
+        terms = jax.vmap(lambda z: _terms(layout, z, units))(z0)
 
         def slopes(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _slopes(layout, numbers, noise, z)
@@ -320,15 +320,12 @@ def optimise_many(
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
 
 
-def _anchor(layout: Layout, z0: Array) -> Array:
-    free = np.arange(layout.size) < len(layout.free)
-    return jnp.asarray(np.where(free, 1.0 / _ANCHOR, 0.0), z0.dtype)
-
-
-def _watched(layout: Layout) -> Array:
-    """The unknowns whose steps say whether the optimiser has arrived."""
+def _terms(layout: Layout, z0: Array, units: _Scaling) -> _Terms:
     at = np.arange(layout.size)
-    return jnp.asarray((at < len(layout.named)) | (at >= layout.weak))
+    anchor = np.where(at < len(layout.free), 1.0 / _ANCHOR, 0.0)
+    # The unknowns whose steps say whether the optimiser has arrived.
+    watched = (at < len(layout.named)) | (at >= layout.weak)
+    return _Terms(z0, units, jnp.asarray(anchor, z0.dtype), jnp.asarray(watched))
 
 
 def residuals_count(data: Data) -> int:

@@ -89,7 +89,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     held = tuple(f for f in problem.flights if f.hold_out)
     validation = _validation(problem, layout, best.z, noise, held) if held else ()
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
-    ill = _ill_conditioned(layout, e, sds)
+    ill = _ill_conditioned(problem, e, sds)
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
@@ -214,11 +214,11 @@ def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]
     ]
 
 
-def _ill_conditioned(layout: Layout, e: Evaluation, sds: dict[str, float]) -> bool:
+def _ill_conditioned(problem: Problem, e: Evaluation, sds: dict[str, float]) -> bool:
     """Whether the filter has lost its digits: variances that are none, or beyond all digits."""
-    if not layout.filtered:
+    if problem.method != "filter-error":
         return False
-    found = np.concatenate(_variances(e, sds))
+    found = np.concatenate(_variances(problem, e, sds))
     found = found[~np.isnan(found)] if np.isfinite(e.r).all() else found
     return bool(
         not found.size
@@ -248,12 +248,11 @@ def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, n: int, ill: bool
     ]
 
 
-def _variances(e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
+def _variances(problem: Problem, e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
     """Of the innovations over the measurement noise's, by flight and output."""
-    names = dict.fromkeys(key.rpartition("/")[0] for key in sds)
     return [
         np.asarray(s) / sds[f"{label}/{n}"] ** 2
-        for label, one in zip(names, e.innovations, strict=True)
+        for label, one in zip(labels(problem.training), e.innovations, strict=True)
         for n, s in one.variance.items()
     ]
 
