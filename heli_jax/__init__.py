@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from heli_jax.identification.problem import Prior as Prior
     from heli_jax.identification.problem import Problem as Problem
     from heli_jax.identification.rls import rls as rls
-    from heli_jax.simulation.simulate import accumulate as accumulate
+    from heli_jax.simulation.accumulate import accumulate as accumulate
     from heli_jax.simulation.simulate import simulate as simulate
+    from heli_jax.sweeps.run import sweep as sweep
     from heli_jax.vehicle import Helicopter as Helicopter
     from heli_jax.vehicle import load_vehicle as load_vehicle
 
@@ -38,7 +39,8 @@ _HOMES = {
     "Signal": "flights",
     "read_flight": "flights",
     "simulate": "simulation.simulate",
-    "accumulate": "simulation.simulate",
+    "accumulate": "simulation.accumulate",
+    "sweep": "sweeps.run",
     "Problem": "identification.problem",
     "Free": "identification.problem",
     "Prior": "identification.problem",

@@ -1,6 +1,7 @@
 """heli-jax: the command line."""
 
 import argparse
+import contextlib
 import os
 import sys
 import time
@@ -8,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from heli_jax import run_directory
 from heli_jax.errors import InputError
 
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 4, 130
@@ -77,10 +79,35 @@ def _parser() -> argparse.ArgumentParser:
         metavar="HTML",
         help="also a page with figures and the flight in 3D (default: beside --out)",
     )
+    sweep = command("sweep", _sweep, "run a design of many vehicles; results in a Zarr store")
+    with_config(sweep)
+    sweep.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+    sweep.add_argument(
+        "--resume", action="store_true", help="go on where the sweep in --out was ended"
+    )
+    sweep.add_argument(
+        "--devices", type=_count, metavar="N", help="processor cores or GPUs to use (default: all)"
+    )
+    sweep.add_argument("--no-figures", action="store_true", help="draw none: it takes seconds")
+    where = sweep.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=_count, metavar="N", help="compute in N processes of a local dask cluster"
+    )
+    where.add_argument(
+        "--scheduler",
+        metavar="tcp://HOST:8786",
+        help="compute on the workers of this dask scheduler",
+    )
     info = command("info", _info, "signals, rates, duration and gaps of a log")
     info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
     info.add_argument("--time", metavar="NAME", help="the column of time stamps")
     return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, wanted is a number from 1")
+    return int(text)
 
 
 def _say(text: str) -> None:
@@ -93,15 +120,17 @@ def _prepare_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(base) / "heli_jax"))
+        jax.config.update("jax_compilation_cache_dir", str(_cache()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-def _fit(options: argparse.Namespace) -> int:
-    from heli_jax import run_directory
+def _cache() -> Path:
+    """Where what was compiled and measured is kept from one command to the next."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
 
+
+def _fit(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
     config = Path(options.config)
     out = Path(options.out) if options.out else run_directory.default_directory(config)
@@ -230,6 +259,83 @@ def _simulate(options: argparse.Namespace) -> int:
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         _say(f"wrote {view}{whole}")
     return DONE
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    config = Path(options.config)
+    if options.resume and not options.out:
+        raise InputError("--resume: wanted is --out DIR too, the directory of the sweep")
+    out = Path(options.out) if options.out else None
+    if out is not None and not options.resume:
+        run_directory.require_free(out)
+    _prepare_jax()
+    import jax
+
+    from heli_jax.sweeps.cores import cores
+
+    # Each core a device of its own; where there are GPUs they are the devices. Once JAX is in use
+    # their number stays as it is.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", options.devices or cores())
+    from heli_jax import config as configuration
+    from heli_jax import generate, output
+    from heli_jax.sweeps.run import Options, carry_out
+
+    experiment = configuration.load(config, options.set)
+    made = generate.drive(experiment) if configuration.simulates(experiment) else None
+    job = configuration.sweep_job(experiment) if made is None else configuration.sweep_job(*made)
+    wanted = experiment.config.sweep
+    assert wanted is not None
+    out = out or run_directory.default_directory(config)
+    with output.sweep_progress() as progress, _client(options, config) as client:
+        how = Options(
+            resume=options.resume,
+            chunk=wanted.chunk,
+            lanes=wanted.lanes,
+            devices=jax.local_devices()[: options.devices],
+            client=client,
+            memory=_cache() / "lanes.json",
+            progress=progress,
+            say=_say,
+        )
+        try:
+            dataset = carry_out(
+                job,
+                out,
+                how,
+                files={"config.yaml": output.as_yaml(configuration.resolved(experiment))},
+                seed=wanted.seed or 0,
+            )
+        except KeyboardInterrupt:
+            kept = (
+                f"; what is finished is kept: --out {out} --resume goes on" if out.exists() else ""
+            )
+            _say(f"interrupted{kept}")
+            return INTERRUPTED
+        except InputError:
+            raise
+        except ValueError as e:
+            raise InputError(f"{config}: sweep: {e}") from e
+    if not options.no_figures:
+        _say("drawing figures")
+        output.draw_sweep(out, dataset, job)
+    output.print_sweep(out)
+    return DONE
+
+
+def _client(options: argparse.Namespace, config: Path) -> Any:
+    """A dask client where one is asked for."""
+    if options.scheduler is None and options.workers is None:
+        return contextlib.nullcontext()
+    try:
+        from heli_jax.sweeps.cluster import connected
+    except ImportError as e:
+        option = "--workers" if options.scheduler is None else "--scheduler"
+        raise InputError(
+            f"{option}: dask.distributed is not installed, wanted is the extra distributed: "
+            "pip install 'heli_jax[distributed]'"
+        ) from e
+    return connected(options.scheduler, options.workers, config.absolute().parent)
 
 
 def _info(options: argparse.Namespace) -> int:

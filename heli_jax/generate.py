@@ -20,10 +20,12 @@ from heli_jax.config import (
 )
 from heli_jax.dynamics.model import Model, needed_but_missing, zeros
 from heli_jax.errors import InputError, nearest
+from heli_jax.flights.flight import Flight
 from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
+from heli_jax.sweeps.job import Trimmed
 
 _MIDDLE = 1e-14
 
@@ -83,6 +85,44 @@ def generate(experiment: Experiment) -> Simulated:
     acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
     return Simulated(columns, plain.model, {experiment.path.stem: run}, notes)
+
+
+class Made(NamedTuple):
+    """What drives a sweep whose inputs `simulate` makes."""
+
+    experiment: Experiment
+    """with wind in its model where there is some"""
+    flight: Flight
+    trimmed: Trimmed | None
+    """each whole helicopter begins in a trim of its own, with its sticks"""
+    pilot: Pilot | None
+    """who holds the attitude, as for the vehicle of the file"""
+
+
+def drive(experiment: Experiment) -> Made:
+    """The inputs of the configuration's `simulate` for a sweep.
+
+    Raises:
+        InputError: as `generate`, or a ground, which a sweep has not.
+    """
+    wanted = experiment.config.simulate
+    assert wanted is not None
+    where = f"{experiment.path}: simulate"
+    _check_whole(experiment, wanted, where)
+    if wanted.ground is not None:
+        raise InputError(f"{where}.ground: a sweep has none, wanted is a configuration without it")
+    n, rng = round(wanted.duration * wanted.rate), np.random.default_rng(wanted.seed)
+    plain = in_wind(experiment) if wanted.wind is not None else experiment
+    inputs = _inputs(plain, wanted, n, rng, where)
+    flight = Flight(dt=1.0 / wanted.rate, inputs=inputs, outputs={}, name="simulate")
+    if not is_whole(plain.model):
+        return Made(plain, flight, None, None)
+    begin = Condition(**wanted.start.model_dump()) if wanted.start else Condition()
+    trimmed = Trimmed(begin, wanted.wind or (0.0, 0.0, 0.0), of=plain.model)
+    pilot = None
+    if wanted.hold_attitude:
+        pilot = _pilot(plain, _begin(plain, wanted, where), where)
+    return Made(plain, flight, trimmed, pilot)
 
 
 def _check_outputs(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:

@@ -1,8 +1,5 @@
 """The models that ship, and how a configuration's name of a model becomes one."""
 
-import importlib
-import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -11,6 +8,7 @@ from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import on_stand, pitch, roll
 from heli_jax.errors import InputError, nearest
+from heli_jax.import_path import by_path, is_path
 
 roll_on_stand = on_stand(roll)
 pitch_on_stand = on_stand(pitch)
@@ -62,17 +60,10 @@ def by_name(
 
 
 def _imported(name: str, where: str, folder: str | Path | None) -> Model:
-    if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name):
+    if not is_path(name):
         known = [*_SHIPPED, *_HELICOPTERS, "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
-    module_name, attribute = name.split(":")
-    if folder is not None and str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
-    try:
-        module = importlib.import_module(module_name)
-    except (ImportError, SyntaxError) as e:
-        raise InputError(f"{where}: cannot import {module_name!r} for {name!r} ({e})") from e
-    model = getattr(module, attribute, None)
+    model = by_path(name, where, folder)
     if not isinstance(model, Model):
         found = "nothing" if model is None else f"a {type(model).__name__}"
         raise InputError(f"{where}: {name!r} is {found}, wanted is a heli_jax.Model")

@@ -1,10 +1,11 @@
 """What the commands print and write."""
 
 import contextlib
+import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,8 @@ from heli_jax.report.card import card, summary
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
+    from heli_jax.sweeps.job import Job
+    from heli_jax.sweeps.run import Progress
 
 
 def write_fit(
@@ -37,13 +40,10 @@ def write_fit(
     begin: float,
 ) -> None:
     """The run directory: config.yaml, fit.json, signals.csv, report.html, figures/."""
-    import yaml
-
     from heli_jax.report.html import write_report
 
-    resolved = configuration.resolved(experiment)
+    text = as_yaml(configuration.resolved(experiment))
     with run_directory.whole(out) as directory:
-        text = yaml.safe_dump(resolved, sort_keys=False, allow_unicode=True)
         (directory / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(directory / "signals.csv", fit.signals)
         started = time.perf_counter()
@@ -53,6 +53,13 @@ def write_fit(
         fit.timing["report"] = time.perf_counter() - started
         fit.timing["total"] = time.perf_counter() - begin
         files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline, further))
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """Plain data as YAML, in its own order."""
+    import yaml
+
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def print_fit(
@@ -212,6 +219,90 @@ def _whole(out: Path, option: str) -> Iterator[Path]:
         raise InputError(f"{option} {out}: cannot be written ({e.strerror or e})") from e
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def sweep_progress() -> Iterator["Callable[[Progress], None]"]:
+    """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
+    line."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    if not sys.stderr.isatty():
+        yield _Lines()
+        return
+    columns = (TextColumn("sweep"), BarColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=1.0)
+        yield lambda p: bar.update(task, completed=p.done / p.total, description=_progress_words(p))
+
+
+class _Lines:
+    """A line at the first chunk, the last, and every ten seconds between."""
+
+    def __init__(self) -> None:
+        self.last = -math.inf
+
+    def __call__(self, p: "Progress") -> None:
+        now = time.monotonic()
+        if p.done == p.total or now - self.last > 10.0:
+            self.last = now
+            print(f"heli-jax: sweep: {_progress_words(p)}", file=sys.stderr, flush=True)
+
+
+def _progress_words(p: "Progress") -> str:
+    words = f"{p.done} of {p.total} elements"
+    if math.isnan(p.rate):
+        return words
+    words = f"{words}, {p.rate:.3g} a second"
+    if p.done == p.total:
+        return words
+    left = max(0, round(p.remaining))
+    return f"{words}, {left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left"
+
+
+def draw_sweep(out: Path, dataset: Any, job: "Job") -> None:
+    """The figures of a sweep.
+
+    Raises:
+        InputError: the figures cannot be written.
+    """
+    from heli_jax.report.sweeps import write_figures
+    from heli_jax.sweeps.summary import worst
+
+    try:
+        write_figures(out / "figures", dataset, worst(dataset, job))
+    except OSError as e:
+        raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
+
+
+def print_sweep(out: Path) -> None:
+    """The summary of a sweep on standard output."""
+    found = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    counts = {k: v for k, v in found["status"].items() if v}
+    words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
+    print(f"{found['elements']} elements of {found['model']}: {words}")
+    rows = []
+    for name, one in found["results"].items():
+        numbers = [
+            f"{one[k]:.4g}" if k in one else "" for k in ("min", "q05", "median", "q95", "max")
+        ]
+        error = found.get("float32_error", {}).get(name)
+        rows.append((name, *numbers, one.get("unit", ""), "" if error is None else f"{error:.1g}"))
+    head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
+    width = len(head) if "float32_error" in found else len(head) - 1
+    _table(head[:width], [row[:width] for row in rows])
+    for name, worst_ones in found["worst"].items():
+        one = worst_ones[0]
+        at = ", ".join(f"{n} = {v:.4g}" for n, v in one["axes"].items())
+        print(f"worst {name}: element {one['element']}, {at}")
+    timing = found["timing"]
+    if timing["computed_elements"]:
+        print(
+            f"{timing['computed_elements']} elements in {timing['seconds']:.3g} s "
+            f"({timing['elements_per_s']:.3g} a second)"
+        )
+    print(f"store: {out / 'sweep.zarr'}")
 
 
 def print_info(info: Any) -> None:

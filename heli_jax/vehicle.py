@@ -116,6 +116,21 @@ def impossible(params: Mapping[str, float]) -> str | None:
     return None
 
 
+def possible(params: Mapping[str, Any]) -> np.ndarray:
+    """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name, as `impossible`
+    judges one; a value that is not a number is not judged."""
+    fine = np.asarray(True)
+    for name, value in params.items():
+        if name in naming.names(Helicopter) and name not in _MAY_BE_NEGATIVE:
+            v = np.asarray(value)
+            fine = fine & ~(v < 0 if name in _MAY_BE_ZERO else v <= 0)
+    if "R1" in params and "R2" in params:
+        fine = fine & ~(np.asarray(params["R1"]) >= np.asarray(params["R2"]))
+    if "B" in params:
+        fine = fine & ~(np.asarray(params["B"]) > 1)
+    return np.asarray(fine)
+
+
 class Constant(NamedTuple):
     """One constant of a vehicle file as it was written."""
 

@@ -4,6 +4,7 @@ from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import read_flights, signals
 from heli_jax.config.problems import disturbed, problem, rivals
 from heli_jax.config.schema import Config, SimulateConfig, StickConfig
+from heli_jax.config.sweeps import simulates, sweep_job
 
 __all__ = [
     "Config",
@@ -18,4 +19,6 @@ __all__ = [
     "resolved",
     "rivals",
     "signals",
+    "simulates",
+    "sweep_job",
 ]

@@ -1,6 +1,6 @@
 """An experiment: a configuration read and validated, with what it names at hand."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -173,8 +173,19 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     content = config.model_dump(mode="json", exclude_none=True)
     for flight in content.get("flights", []):
         flight["log"] = str((path.parent / flight["log"]).resolve())
+    for design in _designs(content.get("sweep")):
+        if "file" in design:
+            design["file"] = str((path.parent / design["file"]).resolve())
     content["vehicle"] = {
         name: {"value": c.value, "unit": c.unit, "source": c.source}
         for name, c in experiment.vehicle.constants.items()
     }
     return content
+
+
+def _designs(design: dict[str, Any] | None) -> Iterator[dict[str, Any]]:
+    """A design's section and those in it."""
+    if design is not None:
+        yield design
+        for part in design.get("of", []):
+            yield from _designs(part)

@@ -188,6 +188,73 @@ class SimulateConfig(_Strict):
         return self
 
 
+class AxisConfig(_Strict):
+    """The values of one axis: from lower to upper, a list, or a column of the table."""
+
+    lower: Finite | None = None
+    upper: Finite | None = None
+    scale: Literal["linear", "log"] = "linear"
+    n: int | None = None
+    """points, for a grid or a list"""
+    values: list[Finite] | None = None
+    column: str | None = None
+    """of the table; the axis's name unless given"""
+    unit: str | None = None
+    """of these numbers; the model's SI unit unless given"""
+
+
+class DesignConfig(_Strict):
+    """Which values the axes take, element by element."""
+
+    design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
+    n: int | None = None
+    """elements, for lhs and sobol"""
+    axes: dict[str, AxisConfig] = {}
+    of: list["DesignConfig"] = []
+    """the designs of a product or a zip"""
+    file: str | None = None
+    """a table: .csv, .txt, .tsv or .parquet"""
+    seed: Annotated[int, Field(ge=0)] | None = None
+    """of lhs and sobol; the sweep's and the place among its designs unless given"""
+
+
+class ReduceConfig(_Strict):
+    """A result of each run."""
+
+    how: str
+    """a name, or package.module:function of one's own"""
+    signal: str | None = None
+    input: str | None = None
+    gain: Finite = 1.0
+
+
+class TrajectoriesConfig(_Strict):
+    """Runs to keep."""
+
+    signals: list[str]
+    every: int = 1
+    """samples from one kept to the next"""
+
+
+class SweepConfig(DesignConfig):
+    """Many runs: a design, what is kept of each run, and how it is computed."""
+
+    reduce: dict[str, ReduceConfig] = {}
+    trajectories: TrajectoriesConfig | None = None
+    inputs: Literal["flights", "simulate"] | None = None
+    """where the inputs come from; the flights unless there are none"""
+    start: StartConfig | None = None
+    """the steady flight in which each element of a whole helicopter begins, the flights' sticks as
+    they are; what `simulate` makes begins as it says there"""
+    solver: str | None = None
+    substeps: int | None = None
+    precision: Literal["float64", "float32"] = "float64"
+    chunk: int | None = None
+    """elements written at a time"""
+    lanes: int | None = None
+    """elements computed side by side on a device"""
+
+
 class Config(_Strict):
     """One experiment."""
 
@@ -201,3 +268,4 @@ class Config(_Strict):
     rls: RLSConfig | None = RLSConfig()
     disturbance: DisturbanceConfig | None = None
     simulate: SimulateConfig | None = None
+    sweep: SweepConfig | None = None

@@ -18,7 +18,6 @@ from heli_jax.simulation.discretize import discretize, moved, process_noise, squ
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.solvers import (
     RK4,
-    Accumulating,
     Adaptive,
     Exact,
     Fed,
@@ -117,9 +116,9 @@ def simulate(
     """
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
-    x0 = _start(model, params, initial_state, inputs, dt)
+    x0 = start_state(model, params, initial_state, inputs, dt)
     adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
-    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, delay, controller)
+    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, delay, controller)
     if isinstance(method, Adaptive):
         method = dataclasses.replace(method, adjoint=adjoint, max_steps=max_steps)
         if key is not None:
@@ -147,7 +146,8 @@ def simulate(
         acting = acting_inputs(inputs, dt, delay, n)
     if feedback is not None:
         acting = jax.vmap(feedback)(states, inputs)
-    times = jnp.arange(n, dtype=jnp.result_type(float)) * dt
+    step = jnp.asarray(dt, jnp.result_type(dt) if hasattr(dt, "dtype") else float)
+    times = jnp.arange(n, dtype=step.dtype) * step
     end = NO_END
     if events:
         states, end = stopped(model, params, events, times, states, acting)
@@ -160,55 +160,7 @@ def simulate(
     return Trajectory(times, states, outputs, acting, result, finite, outside, *end)
 
 
-def accumulate(
-    model: Model,
-    params: Any,
-    flight: Any,
-    update: Callable[[Any, Any, Any], Any],
-    start: Any,
-    *,
-    data: Any = (),
-    dt: Any = None,
-    initial_state: Any = None,
-    solver: str | dfx.AbstractSolver | None = None,
-    substeps: int = 4,
-    adjoint: dfx.AbstractAdjoint | None = None,
-) -> tuple[Any, dfx.RESULTS]:
-    """Reduce a run to a value without keeping it: for large batches.
-
-    At every sample value = update(value, outputs, data at that sample), from `start`; `data` is
-    a pytree of arrays (N,) such as the measured outputs. Other arguments as `simulate`.
-
-    Returns:
-        The final value and diffrax's result.
-    """
-    inputs, dt = held_inputs(model, flight, dt)
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    x0 = _start(model, params, initial_state, inputs, dt)
-    dtype = jax.tree.leaves(x0)[0].dtype
-    method, held, term = _per_sample(model, params, inputs, dt, solver, substeps, None, None)
-
-    def per_sample(value: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
-        return update(value, model.output(params, state, inputs_now), data_now)
-
-    sol = dfx.diffeqsolve(
-        term,
-        Accumulating(method, per_sample),
-        t0=jnp.zeros((), dtype),
-        t1=jnp.asarray(n - 1, dtype),
-        dt0=jnp.ones((), dtype),
-        y0=(x0, start),
-        args=(held, data),
-        saveat=dfx.SaveAt(t1=True),
-        max_steps=n - 1,
-        adjoint=dfx.DirectAdjoint() if adjoint is None else adjoint,
-        throw=False,
-    )
-    state, value = jax.tree.map(lambda v: v[0], sol.ys)
-    return per_sample(value, state, at(inputs, n - 1), at(data, n - 1)), sol.result
-
-
-def _start(model: Model, params: Any, initial_state: Any, inputs: Any, dt: Any) -> Any:
+def start_state(model: Model, params: Any, initial_state: Any, inputs: Any, dt: Any) -> Any:
     """The initial state in the dtype that the parameters and inputs give together."""
     state = model.initial_state(params) if initial_state is None else initial_state
     leaves = (*jax.tree.leaves(params), *jax.tree.leaves(inputs))
@@ -242,7 +194,7 @@ def split_delay(delay: Any, dt: Any) -> tuple[Any, Any]:
     return whole.astype(int), samples - whole
 
 
-def _per_sample(
+def per_sample(
     model: Model,
     params: Any,
     inputs: Any,
@@ -258,7 +210,7 @@ def _per_sample(
         raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
     parts = None if delay is None else split_delay(delay, dt)
 
-    term = _term(model)
+    term = term_of(model)
     dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         late = None if parts is None else parts[1] * dt
@@ -275,7 +227,7 @@ def held_columns(
     model: Model, params: Any, inputs: Any, dt: Any, delay: Any
 ) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
     """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k."""
-    _, held, _ = _per_sample(model, params, inputs, dt, "exact", 1, delay, None)
+    _, held, _ = per_sample(model, params, inputs, dt, "exact", 1, delay, None)
     assert held.discrete is not None
     B, U = columns(held)
     n = U.shape[0]
@@ -333,7 +285,7 @@ def _kick(
     return model.State(**{n: new[i] for i, n in enumerate(names)})
 
 
-def _term(model: Model) -> dfx.ODETerm:
+def term_of(model: Model) -> dfx.ODETerm:
     """The vector field, per second, within one sample.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.

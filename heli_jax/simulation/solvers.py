@@ -4,6 +4,7 @@ A Runge-Kutta method that reads the input by time sees the next sample in its la
 of first order. Here the input of an interval is picked once and held while the step is made.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from heli_jax.errors import nearest
 from heli_jax.simulation.discretize import Discrete
 
 
@@ -310,3 +312,29 @@ class Accumulating(_Around):
         state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
         y1 = (state, value)
         return y1, None, {"y0": y0, "y1": y1}, None, result
+
+
+def solver_named(name: str) -> str | dfx.AbstractSolver:
+    """ "exact", "rk4", or a diffrax solver of fixed steps by its name there, such as "Tsit5".
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    if name in ("exact", "rk4"):
+        return name
+    found = getattr(dfx, name, None)
+    if isinstance(found, type) and issubclass(found, dfx.AbstractSolver):
+        try:
+            return found()
+        except TypeError:  # an abstract one, or one that has to be given something
+            pass
+    known = [n for n in dir(dfx) if _is_solver(getattr(dfx, n))]
+    raise ValueError(f"solver: unknown solver {name!r}{nearest(name, ['exact', 'rk4', *known])}")
+
+
+def _is_solver(found: Any) -> bool:
+    return (
+        isinstance(found, type)
+        and issubclass(found, dfx.AbstractSolver)
+        and not inspect.isabstract(found)
+    )

@@ -1,0 +1,171 @@
+"""A sweep that is killed again and again ends with the numbers of one that never was.
+
+`python experiments/sweep_survives.py 20` runs `heli-jax sweep` to its end, then the same sweep with
+20 `kill -9` at random moments, each followed by `--resume`; then on two dask workers, one of which
+is killed in the middle. It compares every bit of the stores, and looks whether a finished chunk was
+ever written again. About four minutes on two cores.
+"""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import zarr
+
+CONFIG = """
+model: roll-on-stand
+vehicle: {vehicle}
+simulate:
+  duration: {duration}
+  rate: 50
+  inputs: {{x_roll: {{amplitude: 3.0, unit: um}}}}
+sweep:
+  design: sobol
+  n: {n}
+  axes:
+    Ixx: {{lower: 0.01, upper: 0.1, scale: log}}
+    If: {{lower: 1.0e-4, upper: 1.0e-3, scale: log}}
+  reduce:
+    rms_roll: {{signal: roll, how: rms}}
+    last_roll: {{signal: roll, how: final}}
+  solver: rk4
+  chunk: {chunk}
+  lanes: 64
+"""
+VEHICLE = Path(__file__).parents[1] / "configs" / "vehicles" / "bench-30.yaml"
+
+
+class Survived(NamedTuple):
+    """What the kills did."""
+
+    kills: int
+    hit: int
+    """of them, those that hit a sweep between its first and its last chunk"""
+    resumed: int
+    """times that the sweep had to be started after the first"""
+    rewritten: int
+    """finished chunks that were written again"""
+    equal: bool
+    """whether every array equals that of the run without kills"""
+
+
+def configuration(folder: Path, n: int = 40960, chunk: int = 512, duration: float = 60.0) -> Path:
+    path = folder / "sweep.yaml"
+    path.write_text(CONFIG.format(vehicle=VEHICLE, n=n, chunk=chunk, duration=duration))
+    return path
+
+
+def command(config: Path, out: Path, *more: str) -> list[str]:
+    program = [sys.executable, "-m", "heli_jax.cli", "sweep", str(config), "--out", str(out)]
+    return [*program, "--resume", "--no-figures", *more]
+
+
+def finished(out: Path) -> dict[str, tuple[int, int]]:
+    """The files of the finished chunks' status, and what changes when one is written again."""
+    found = {}
+    for path in (out / "sweep.zarr" / "status" / "c").glob("*"):
+        if path.suffix != ".partial":
+            stat = path.stat()
+            found[path.name] = (stat.st_mtime_ns, stat.st_ino)
+    return found
+
+
+def same(a: Path, b: Path) -> bool:
+    """Whether two stores hold the same bits."""
+    one, other = zarr.open_group(str(a), mode="r"), zarr.open_group(str(b), mode="r")
+    left: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in one.arrays()}
+    right: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in other.arrays()}
+    return left == right
+
+
+def kills(config: Path, whole: Path, out: Path, times: int, seed: int = 0) -> Survived:
+    """Kill the sweep `times` times, half of them once some chunks more are done, half at any time
+    from its start on; then let it end."""
+    rng, chunks = random.Random(seed), len(finished(whole))
+    hit = rewritten = starts = 0
+    done: dict[str, tuple[int, int]] = {}
+
+    def checked() -> None:
+        nonlocal done, rewritten
+        now = finished(out)
+        rewritten += sum(now.get(name) != mark for name, mark in done.items())
+        done = now
+
+    for k in range(times):
+        with subprocess.Popen(command(config, out), stderr=subprocess.DEVNULL) as run:
+            starts += 1
+            wanted = len(done) + rng.randint(1, max(1, chunks // times))
+            until = time.monotonic() + (rng.uniform(0.0, 8.0) if k % 2 else 120.0)
+            while run.poll() is None and time.monotonic() < until:
+                if k % 2 == 0 and len(finished(out)) >= wanted:
+                    break
+                time.sleep(0.002)
+            time.sleep(rng.uniform(0.0, 0.05))
+            run.send_signal(signal.SIGKILL)
+        checked()
+        hit += 0 < len(done) < chunks
+    starts += 1
+    subprocess.run(
+        command(config, out), check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
+    checked()
+    equal = same(whole / "sweep.zarr", out / "sweep.zarr")
+    return Survived(times, hit, starts - 1, rewritten, equal)
+
+
+def worker_killed(config: Path, whole: Path, out: Path) -> bool:
+    """On two dask workers, one killed after some chunks: whether the bits are the same."""
+    with subprocess.Popen(command(config, out, "--workers", "2"), stderr=subprocess.DEVNULL) as run:
+        while run.poll() is None and len(finished(out)) < 5:
+            time.sleep(0.002)
+        os.kill(workers_of(run.pid)[0], signal.SIGKILL)
+    if run.returncode != 0:
+        return False
+    return same(whole / "sweep.zarr", out / "sweep.zarr")
+
+
+def workers_of(pid: int) -> list[int]:
+    """The dask worker processes that a process started, by Linux's process table."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+            line = (stat.parent / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and b"spawn_main" in line:
+            found.append(int(stat.parent.name))
+    return sorted(found)
+
+
+def main() -> None:
+    times = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    folder = Path(tempfile.mkdtemp(prefix="heli_jax-survives-"))
+    try:
+        config = configuration(folder)
+        begin = time.perf_counter()
+        subprocess.run(command(config, folder / "whole"), check=True)
+        print(f"without a kill: {time.perf_counter() - begin:.1f} s")
+        found = kills(config, folder / "whole", folder / "killed", times)
+        print(
+            f"{found.kills} kills, {found.hit} of them between the first chunk and the last, "
+            f"{found.resumed} resumed: bits {'equal' if found.equal else 'DIFFER'}, "
+            f"{found.rewritten} finished chunks written again"
+        )
+        equal = worker_killed(config, folder / "whole", folder / "dask")
+        print(f"two dask workers, one killed: bits {'equal' if equal else 'DIFFER'}")
+        raise SystemExit(0 if found.equal and equal and not found.rewritten else 1)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()

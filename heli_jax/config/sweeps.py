@@ -1,0 +1,224 @@
+"""The sweep that a configuration describes."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax import naming, units
+from heli_jax.analysis.trim import Condition
+from heli_jax.config.experiment import Experiment
+from heli_jax.config.logs import read_flights
+from heli_jax.config.problems import disturbed
+from heli_jax.config.schema import AxisConfig, DesignConfig, ReduceConfig, SweepConfig
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.table import open_table
+from heli_jax.import_path import by_path, is_path
+from heli_jax.sweeps import design as designs
+from heli_jax.sweeps.design import Between, Design
+from heli_jax.sweeps.job import Job, Trajectories, Trimmed, job
+from heli_jax.sweeps.reducers import HOWS, LINEAR, Reduce, Streaming
+
+_DRAWN = ("seed", "sigma_w", "tau_w")
+"""axes that are of the disturbance"""
+
+
+def simulates(experiment: Experiment) -> bool:
+    """Whether the sweep's inputs are those that `simulate` makes.
+
+    Raises:
+        InputError: there is no sweep, or nothing to take the inputs from.
+    """
+    config, path = experiment.config, experiment.path
+    if config.sweep is None:
+        raise InputError(f"{path}: sweep: missing, wanted is a design with axes and results")
+    source = config.sweep.inputs or ("flights" if config.flights else "simulate")
+    if source == "flights" and not config.flights:
+        raise InputError(f"{path}: sweep.inputs: there are no flights, wanted is at least one log")
+    if source == "simulate" and config.simulate is None:
+        raise InputError(
+            f"{path}: sweep: no inputs, wanted are flights, or simulate, which makes some"
+        )
+    return source == "simulate"
+
+
+def sweep_job(
+    experiment: Experiment,
+    made: Flight | None = None,
+    trimmed: Trimmed | None = None,
+    pilot: Any = None,
+) -> Job:
+    """The sweep of a configuration, checked; its logs and tables are read.
+
+    `made` is the flight that `simulate` makes, with the beginning and the pilot that belong to it.
+
+    Raises:
+        InputError: something of it cannot be; the sentence says what and where.
+    """
+    wanted, path = experiment.config.sweep, experiment.path
+    assert wanted is not None
+    where = f"{path}: sweep"
+    model, params = _model(experiment, wanted)
+    reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in wanted.reduce.items()}
+    kept = wanted.trajectories
+    flights = (made,) if made is not None else read_flights(experiment, moving_inputs=False)
+    if wanted.start is not None:
+        if made is not None:
+            raise InputError(f"{where}.start: wanted is simulate.start, which makes the inputs")
+        trimmed = Trimmed(Condition(**wanted.start.model_dump()), sticks=False, of=experiment.model)
+    try:
+        return job(
+            model,
+            params,
+            flights,
+            _design(wanted, model, path, wanted.seed or 0),
+            reduce,
+            solver=wanted.solver,
+            substeps=wanted.substeps,
+            precision=wanted.precision,
+            trajectories=None if kept is None else Trajectories(tuple(kept.signals), kept.every),
+            trimmed=trimmed,
+            pilot=pilot,
+        )
+    except InputError:
+        raise
+    except ValueError as e:
+        outside = str(e).startswith("vehicle:")
+        raise InputError(f"{path if outside else where}: {e}") from e
+
+
+def _model(experiment: Experiment, wanted: SweepConfig) -> tuple[Model, Any]:
+    """The model, with the disturbance where an axis is one of its."""
+    plain = naming.names(experiment.model.Params)
+    drawn = [n for n in _axes(wanted) if n in _DRAWN and n not in plain]
+    if not drawn or experiment.config.disturbance is None:
+        return experiment.model, experiment.vehicle.params
+    where, given = f"{experiment.path}: disturbance", experiment.config.disturbance
+    for name in ("sigma_w", "tau_w"):
+        if getattr(given, name) is None and name not in drawn:
+            raise InputError(f"{where}.{name}: missing, wanted is a number to draw it with")
+    if "seed" not in drawn:
+        raise InputError(
+            f"{experiment.path}: sweep.axes.{drawn[0]}: nothing is drawn without an axis seed, "
+            "wanted is seed: {values: [0]} too"
+        )
+    return disturbed(experiment)
+
+
+def _axes(one: DesignConfig) -> list[str]:
+    return [*one.axes, *(n for part in one.of for n in _axes(part))]
+
+
+def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
+    """The design that a section describes; ValueError where it cannot be."""
+    seed = seed if one.seed is None else one.seed
+    if one.design in ("product", "zip"):
+        _refuse(one, ("axes", "n", "file"), f"a {one.design} has designs in 'of'")
+        parts = [_design(part, model, path, seed + i) for i, part in enumerate(one.of)]
+        made: Callable[..., Design] = {"product": designs.product, "zip": designs.zipped}[
+            one.design
+        ]
+        return made(*parts)
+    _refuse(one, ("of",), f"only product and zip have it, not {one.design}")
+    if one.design == "table":
+        _refuse(one, ("n",), "a table has its rows")
+        return _table(one, model, path)
+    _refuse(one, ("file",), f"only a table has it, not {one.design}")
+    if one.design in ("lhs", "sobol"):
+        if one.n is None:
+            raise ValueError(f"n: missing, wanted is how many elements {one.design} makes")
+        between = {n: _between(n, a, model, path) for n, a in one.axes.items()}
+        return {"lhs": designs.lhs, "sobol": designs.sobol}[one.design](between, one.n, seed)
+    _refuse(one, ("n",), f"a {one.design} has its axes' points: wanted is n in an axis")
+    axes = {n: _points(n, a, model, path) for n, a in one.axes.items()}
+    return {"grid": designs.grid, "list": designs.listed}[one.design](axes)
+
+
+def _refuse(one: DesignConfig, keys: tuple[str, ...], why: str) -> None:
+    for key in keys:
+        if getattr(one, key):
+            raise ValueError(f"{key}: {why}")
+
+
+def _between(name: str, axis: AxisConfig, model: Model, path: Path) -> Between:
+    for key in ("values", "column", "n"):
+        if getattr(axis, key) is not None:
+            raise ValueError(f"axes.{name}.{key}: wanted are lower and upper here")
+    if axis.lower is None or axis.upper is None:
+        raise ValueError(f"axes.{name}: wanted are lower and upper")
+    scale = _scale(name, axis, model, path)
+    return Between(axis.lower * scale, axis.upper * scale, axis.scale)
+
+
+def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
+    if axis.column is not None:
+        raise ValueError(f"axes.{name}.column: only a table has columns")
+    if axis.values is None:
+        points = axis.model_copy(update={"n": None})
+        return _between(name, points, model, path)._replace(n=axis.n)
+    for key in ("lower", "upper", "n"):
+        if getattr(axis, key) is not None:
+            raise ValueError(f"axes.{name}: wanted are values, or lower and upper, not both")
+    return _as_column(name, np.asarray(axis.values) * _scale(name, axis, model, path))
+
+
+def _as_column(name: str, values: np.ndarray) -> np.ndarray:
+    """Seeds are whole numbers."""
+    if name != "seed":
+        return values
+    whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
+    if not np.all(whole & (values < 2**32)):
+        raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1")
+    return values.astype(np.int64)
+
+
+def _table(one: DesignConfig, model: Model, path: Path) -> Design:
+    if one.file is None:
+        raise ValueError("file: missing, wanted is a table in CSV or Parquet")
+    if not one.axes:
+        raise ValueError("axes: none given, wanted is at least one, as Ixx: {} for a column Ixx")
+    source = open_table(path.parent / one.file)
+    for name, axis in one.axes.items():
+        for key in ("lower", "upper", "values", "n"):
+            if getattr(axis, key) is not None:
+                raise ValueError(f"axes.{name}.{key}: the table has the values")
+    columns = {name: axis.column or name for name, axis in one.axes.items()}
+    found = source.numbers(list(dict.fromkeys(columns.values())))
+    scaled: Mapping[str, np.ndarray] = {
+        name: _as_column(name, found[columns[name]] * _scale(name, axis, model, path))
+        for name, axis in one.axes.items()
+    }
+    return designs.table(scaled)
+
+
+def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
+    """What takes the axis's numbers to SI."""
+    if axis.unit is None:
+        return 1.0
+    kind, _, of = name.partition(".")
+    si: str | None = "s" if name == "delay" else "1"
+    if name in naming.names(model.Params):
+        si = naming.unit(model.Params, name)
+    elif kind == "initial" and of in naming.names(model.State):
+        si = naming.unit(model.State, of)
+    elif kind == "offset" and of in naming.names(model.Inputs):
+        si = naming.unit(model.Inputs, of)
+    try:
+        return units.factor(axis.unit, si or "1")
+    except ValueError as e:
+        raise ValueError(f"axes.{name}.unit: {e}") from e
+
+
+def _reduce(one: ReduceConfig, where: str, path: Path) -> Reduce:
+    how: Any = one.how
+    if how not in HOWS and how not in LINEAR and is_path(how):
+        how = by_path(how, f"{where}.how", path.absolute().parent)
+        if not callable(how) and not isinstance(how, Streaming):
+            found = "nothing" if how is None else f"a {type(how).__name__}"
+            raise InputError(
+                f"{where}.how: {one.how!r} is {found}, wanted is a function of a Trajectory"
+            )
+    return Reduce(how, one.signal, one.input, one.gain)

@@ -1,0 +1,225 @@
+"""What is drawn of a sweep: its axes and results as columns of numbers, and which of them count.
+
+A place is a value as it lies on the paper: its logarithm where the scale is logarithmic.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+WIDE = 30.0
+"""factor over which numbers of one sign are drawn logarithmically"""
+MARKS = 300
+"""elements that are marked in a panel at most"""
+_OK = 0
+"""the status of an element that counts"""
+_FEW_CELLS = 40
+"""distinct values that are cells of their own: even ones would leave gaps between so many"""
+
+
+class Column:
+    """An axis or a result: a number (n,) for each element, NaN where it is not finite."""
+
+    def __init__(self, variable: xr.DataArray, ok: np.ndarray, *, axis: bool, alone: bool) -> None:
+        self.name = str(variable.name)
+        unit = variable.attrs.get("units")
+        self.unit = None if unit is None else str(unit)
+        self.flights = variable.sizes.get("flight", 0)
+        self.whole = variable.dtype.kind in "biu" and not self.flights
+        self.values = _numbers(variable)
+        self.finite = np.isfinite(self.values)
+        self.used = self.finite & ok
+        self.axis = axis
+        self._alone = alone
+        self._seen = self.finite if axis else self.used
+        self._cells: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def title(self) -> str:
+        if self.flights:
+            return f"{self.name}, mean over {self.flights} flights"
+        return self.name
+
+    @functools.cached_property
+    def _order(self) -> np.ndarray:
+        """Elements that set the scale, by value."""
+        order = np.argsort(self.values)
+        return order[self._seen[order]]
+
+    @functools.cached_property
+    def ranked(self) -> np.ndarray:
+        """Elements that count, by value."""
+        return self._order[self.used[self._order]]
+
+    @functools.cached_property
+    def empty(self) -> bool:
+        return not self._seen.any()
+
+    @functools.cached_property
+    def distinct(self) -> np.ndarray:
+        """Distinct values, ascending."""
+        ordered = self.values[self._order]
+        return ordered[np.concatenate([[True], np.diff(ordered) > 0])]
+
+    def few(self, most: int) -> np.ndarray | None:
+        """The distinct values of an axis, or of whole numbers, if there are few for so many
+        elements."""
+        k = self.distinct.size
+        often = 2 * k <= self._order.size or self._alone
+        found = (self.axis or self.whole) and k <= most and often
+        return self.distinct if found or k == 1 else None
+
+    def _at(self, share: float) -> float:
+        """The value that a share of the elements is below."""
+        return float(self.values[self._order[round(share * (self._order.size - 1))]])
+
+    @functools.cached_property
+    def log(self) -> bool:
+        """Whether it is drawn logarithmically; a result by its bulk, not by single elements."""
+        ends = self._at(0.0), self._at(1.0)
+        if ends[0] <= 0.0 <= ends[1] or (self.whole and not self.axis):
+            return False
+        low, high = ends if self.axis else (self._at(0.01), self._at(0.99))
+        return max(abs(low), abs(high)) > WIDE * min(abs(low), abs(high))
+
+    @functools.cached_property
+    def sign(self) -> float:
+        return -1.0 if self._at(1.0) < 0.0 else 1.0
+
+    def bent(self, values: Any) -> Any:
+        """The places of values."""
+        return self.sign * np.log10(np.abs(values)) if self.log else np.asarray(values, float)
+
+    def unbent(self, places: Any) -> Any:
+        """The values at places."""
+        return self.sign * 10.0 ** (self.sign * np.asarray(places)) if self.log else places
+
+    @functools.cached_property
+    def _places(self) -> np.ndarray:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.bent(self.values)
+
+    @functools.cached_property
+    def _range(self) -> tuple[float, float]:
+        return float(self.bent(self._at(0.0))), float(self.bent(self._at(1.0)))
+
+    @functools.cached_property
+    def view(self) -> tuple[float, float]:
+        """From the least to the largest place drawn: all of an axis, and of a result without
+        single elements that would press the others flat."""
+        low, high = self._range
+        inner = [float(self.bent(self._at(q))) for q in (0.01, 0.99)]
+        bulk = inner[1] - inner[0]
+        if not self.axis and 0.0 < 4.0 * bulk < high - low:
+            low, high = max(low, inner[0] - 0.3 * bulk), min(high, inner[1] + 0.3 * bulk)
+        return widened(low, high)
+
+    @property
+    def cut(self) -> bool:
+        """Whether single elements lie beyond the view."""
+        return self.view[0] > self._range[0] or self.view[1] < self._range[1]
+
+    def cells(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Edges of cells, as places, and the cell of each element (n,), -1 outside.
+
+        There are k even cells, or one for each of few values.
+        """
+        if k not in self._cells:
+            own = self.few(_FEW_CELLS)
+            if own is None:
+                low, high = self.view
+                edges = np.linspace(low, high, k + 1)
+                with np.errstate(invalid="ignore"):
+                    scaled = (self._places - low) * (k / (high - low))
+                    inside = (scaled >= -1e-9) & (scaled <= k + 1e-9) & self.finite
+                which = np.where(inside, scaled, 0.0).astype(np.int16).clip(0, k - 1)
+            else:
+                edges, inside = _around(self.bent(own), self.view), self.finite
+                which = np.searchsorted(0.5 * (own[1:] + own[:-1]), self.values)
+            self._cells[k] = edges, np.where(inside, which, -1).astype(np.int16)
+        return self._cells[k]
+
+    def ends(self, k: int) -> tuple[float, float]:
+        """The first and the last edge of the cells."""
+        edges, _ = self.cells(k)
+        return float(edges[0]), float(edges[-1])
+
+
+class Table:
+    """What is drawn of a sweep, read and sorted once."""
+
+    def __init__(self, ds: xr.Dataset) -> None:
+        self._ds = ds
+        self.ok = ds["status"].to_numpy() == _OK
+        self.size, self.n_ok = self.ok.size, int(np.count_nonzero(self.ok))
+        self._axes = [str(n) for n in ds.attrs["axes"]]
+        self.results = [str(n) for n, v in ds.data_vars.items() if _is_result(v)]
+        self._columns: dict[str, Column] = {}
+
+    def column(self, name: str) -> Column:
+        if name not in self._columns:
+            axis, alone = name in self._axes, len(self._axes) == 1
+            self._columns[name] = Column(self._ds[name], self.ok, axis=axis, alone=alone)
+        return self._columns[name]
+
+    @functools.cached_property
+    def axes(self) -> list[Column]:
+        """The axes that have a finite value."""
+        return [c for c in map(self.column, self._axes) if not c.empty]
+
+    def failed(self, *columns: Column, most: int = MARKS) -> np.ndarray:
+        """Elements that are not ok where these are finite, so many at most."""
+        where = ~self.ok
+        for c in columns:
+            where = where & c.finite
+        return by_lot(np.flatnonzero(where), most)
+
+
+def widened(low: float, high: float) -> tuple[float, float]:
+    """A range that is more than a point."""
+    if high - low > 1e-9 * max(abs(low), abs(high)):
+        return low, high
+    middle, half = 0.5 * (low + high), 0.05 * max(abs(low), abs(high)) or 0.5
+    return middle - half, middle + half
+
+
+def by_lot(elements: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the elements, drawn by lot: every k-th of a grid would show a few values
+    of an axis alone."""
+    if elements.size <= most:
+        return elements
+    return np.sort(np.random.default_rng(0).choice(elements, most, replace=False))
+
+
+def _is_result(variable: xr.DataArray) -> bool:
+    """Whether a variable has one number for each element, or for each and each flight."""
+    dims = {str(d) for d in variable.dims}
+    return (
+        "element" in dims
+        and dims <= {"element", "flight"}
+        and variable.dtype.kind in "biuf"
+        and not str(variable.name).startswith("trajectory_")
+    )
+
+
+def _numbers(variable: xr.DataArray) -> np.ndarray:
+    """A number (n,) for each element: the mean over flights, NaN where it is not finite.
+
+    Numbers that no picture can hold are taken as infinite, or as zero.
+    """
+    values = variable.transpose("element", ...).to_numpy().astype(np.float64)
+    if values.ndim > 1:
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = values.mean(axis=1)
+    sizes = np.abs(values)
+    return np.where(sizes < 1e100, np.where(sizes > 1e-100, values, 0.0), np.nan)
+
+
+def _around(places: np.ndarray, view: tuple[float, float]) -> np.ndarray:
+    """Edges of cells around places."""
+    if places.size == 1:
+        return np.asarray(view)
+    between = 0.5 * (places[1:] + places[:-1])
+    first, last = 2 * places[0] - between[0], 2 * places[-1] - between[-1]
+    return np.concatenate([[first], between, [last]])

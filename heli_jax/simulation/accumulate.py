@@ -1,0 +1,216 @@
+"""Runs that are reduced to a value while they go on, and never kept: for large batches."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from heli_jax import naming
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.blocks import matrix
+from heli_jax.simulation.simulate import held_inputs, per_sample, start_state
+from heli_jax.simulation.solvers import Accumulating, Held, at
+
+
+class Accumulated(NamedTuple):
+    """What is left of a run."""
+
+    value: Any
+    state: Any
+    """the model's State at the last sample"""
+    outside: dict[str, Bool[Array, ""]]
+    """by name of a limit of the model, whether it was left; empty for a model without limits"""
+    result: dfx.RESULTS
+
+
+def accumulate(
+    model: Model,
+    params: Any,
+    flight: Any,
+    update: Callable[[Any, Any, Any], Any],
+    start: Any,
+    *,
+    data: Any = (),
+    dt: Any = None,
+    initial_state: Any = None,
+    solver: str | dfx.AbstractSolver | None = None,
+    substeps: int = 4,
+    block: int = 1,
+    adjoint: dfx.AbstractAdjoint | None = None,
+) -> tuple[Any, dfx.RESULTS]:
+    """Reduce a run to a value without keeping it: for large batches.
+
+    At every sample value = update(value, outputs, data at that sample), from `start`; `data` is
+    a pytree of arrays (N,) such as the measured outputs. Other arguments as `simulate`; `block`
+    is the number of samples a step of solver "exact" (4 is fastest in batches of 64 on a CPU).
+
+    Returns:
+        The final value and diffrax's result.
+    """
+    found = accumulated(
+        model,
+        params,
+        flight,
+        update,
+        start,
+        data=data,
+        dt=dt,
+        initial_state=initial_state,
+        solver=solver,
+        substeps=substeps,
+        block=block,
+        adjoint=adjoint,
+    )
+    return found.value, found.result
+
+
+def accumulated(
+    model: Model,
+    params: Any,
+    flight: Any,
+    update: Callable[[Any, Any, Any], Any],
+    start: Any,
+    *,
+    data: Any = (),
+    dt: Any = None,
+    initial_state: Any = None,
+    solver: str | dfx.AbstractSolver | None = None,
+    substeps: int = 4,
+    block: int = 1,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    limits: bool = False,
+) -> Accumulated:
+    """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
+
+    Raises:
+        ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact.
+    """
+    inputs, dt = held_inputs(model, flight, dt)
+    x0 = start_state(model, params, initial_state, inputs, dt)
+    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, None, None)
+    if block != 1 and (held.discrete is None or block < 1):
+        raise ValueError(f"block is {block}, wanted is 1, or more with solver='exact'")
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    watched = model.limits if limits else None
+
+    def one(carried: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
+        value, outside = carried
+        if watched is not None:
+            now = watched(params, state, inputs_now)
+            outside = {name: jnp.where(now[name], 1.0, was) for name, was in outside.items()}
+        return update(value, model.output(params, state, inputs_now), data_now), outside
+
+    if block > 1 and watched is None:
+        value, state = _in_blocks(model, held, block, x0, update, start, data)
+        return Accumulated(value, state, {}, dfx.RESULTS.successful)
+    outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
+    if watched is not None:
+        # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
+        outside = dict.fromkeys(watched(params, x0, at(inputs, 0)), jnp.zeros((), dtype))
+    sol = dfx.diffeqsolve(
+        term,
+        Accumulating(method, one),
+        t0=jnp.zeros((), dtype),
+        t1=jnp.asarray(n - 1, dtype),
+        dt0=jnp.ones((), dtype),
+        y0=(x0, (start, outside)),
+        args=(held, data),
+        saveat=dfx.SaveAt(t1=True),
+        max_steps=n - 1,
+        adjoint=dfx.DirectAdjoint() if adjoint is None else adjoint,
+        throw=False,
+    )
+    state, carried = jax.tree.map(lambda v: v[0], sol.ys)
+    value, outside = one(carried, state, at(inputs, n - 1), at(data, n - 1))
+    return Accumulated(value, state, {n: v > 0 for n, v in outside.items()}, sol.result)
+
+
+def _in_blocks(
+    model: Model, held: Held, m: int, x0: Any, update: Any, start: Any, data: Any
+) -> tuple[Any, Any]:
+    """The exact recurrence m samples a step: x[k+m] = A^m x[k] + ..., and each output between
+    from x[k] directly, C A^j x[k] + ..., with coefficients of the vehicle's own.
+
+    Nothing depends on the result before it within a step, so XLA makes one loop over the vehicles
+    of it; written out sample by sample it would compute every sample from x[k] again.
+    """
+    assert held.discrete is not None
+    A, B = matrix(held.discrete.Ad), matrix(held.discrete.Bd)
+    space = jacobians(model, held.params)
+    size = A.shape[0]
+    AB, powers = [B], [jnp.eye(size, dtype=A.dtype)]
+    for _ in range(m):
+        powers.append(A @ powers[-1])
+        AB.append(A @ AB[-1])
+    C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
+    free = [_rows(C @ powers[j]) for j in range(1, m)]
+    forced = [_rows(D)] + [_rows(C @ AB[j]) for j in range(m - 1)]
+    ahead, driven = _rows(powers[m]), [_rows(AB[m - 1 - j]) for j in range(m)]
+    free, forced, ahead, driven = jax.lax.optimization_barrier((free, forced, ahead, driven))
+
+    names = naming.names(model.Outputs)
+    structure, inputs = jax.tree.structure(x0), jax.tree.structure(held.inputs)
+    U = jax.tree.leaves(held.inputs)
+    n = U[0].shape[0]
+    steps = (n - 1) // m
+
+    def outputs(x: Any, u: Any, j: int) -> Any:
+        """The outputs of the j-th sample of a step that begins at x with the inputs u[0..j]."""
+        if j == 0:
+            now = jax.tree.unflatten(inputs, u[0])
+            return model.output(held.params, jax.tree.unflatten(structure, x), now)
+        found = {}
+        for i, name in enumerate(names):
+            total = _dot(free[j - 1][i], x)
+            for back in range(j + 1):
+                total = total + _dot(forced[back][i], u[j - back])
+            found[name] = total
+        return model.Outputs(**found)
+
+    def samples(x: Any, value: Any, u: Any, now: Any, count: int) -> Any:
+        for j in range(count):
+            value = update(value, outputs(x, u, j), jax.tree.map(lambda v, j=j: v[j], now))
+        return value
+
+    def step(carried: Any, given: Any) -> tuple[Any, None]:
+        x, value = carried
+        rows, now = given
+        u = [[v[j] for v in rows] for j in range(m)]
+        value = samples(x, value, u, now, m)
+        new = [_dot(row, x) for row in ahead]
+        for j in range(m):
+            new = [v + _dot(row, u[j]) for v, row in zip(new, driven[j], strict=True)]
+        return (new, value), None
+
+    def cut(v: Array) -> Array:
+        return v[: steps * m].reshape(steps, m, *v.shape[1:])
+
+    first = jax.tree.leaves(x0)
+    given = jax.tree.map(cut, (U, data))
+    (x, value), _ = jax.lax.scan(step, (first, start), given)
+    # The samples that are left, at least one, and the state at the last of them.
+    rest = n - steps * m
+    u = [[v[steps * m + j] for v in U] for j in range(rest)]
+    value = samples(x, value, u, jax.tree.map(lambda v: v[steps * m :], data), rest)
+    last = list(x)
+    for j in range(rest - 1):
+        last = [
+            _dot(a, last) + _dot(b, u[j])
+            for a, b in zip(held.discrete.Ad, held.discrete.Bd, strict=True)
+        ]
+    return value, jax.tree.unflatten(structure, last)
+
+
+def _rows(M: Array) -> Any:
+    return tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))
+
+
+def _dot(coefficients: Any, values: Any) -> Any:
+    total = coefficients[0] * values[0]
+    for c, v in zip(coefficients[1:], values[1:], strict=True):
+        total = total + c * v
+    return total

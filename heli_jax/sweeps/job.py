@@ -1,0 +1,349 @@
+"""A sweep as it was asked for, checked, and described so that another can be told from it."""
+
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.pilot import Pilot
+from heli_jax.analysis.trim import Condition, is_whole
+from heli_jax.dynamics.model import Model, needed_but_missing
+from heli_jax.errors import nearest
+from heli_jax.flights.flight import Flight
+from heli_jax.simulation.simulate import substeps_for
+from heli_jax.simulation.solvers import solver_named
+from heli_jax.sweeps import reducers
+from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.reducers import Reduce
+
+Precision = Literal["float64", "float32"]
+
+
+class Trajectories(NamedTuple):
+    """Runs to keep, thinned."""
+
+    signals: tuple[str, ...]
+    """outputs of the model"""
+    every: int = 1
+    """samples from one kept to the next"""
+
+
+class Trimmed(NamedTuple):
+    """Each element of a whole helicopter begins in a steady flight of its own."""
+
+    condition: Condition = Condition()
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sticks: bool = True
+    """whether its sticks are added to the flight's; a logged flight has them already"""
+    of: Model | None = None
+    """what is trimmed, where the sweep's model is that with a disturbance"""
+
+
+class Plan(NamedTuple):
+    """What is compiled for a sweep; sweeps of the same plan share the program."""
+
+    model: Model
+    reduce: tuple[tuple[str, Reduce], ...]
+    solver: str
+    substeps: int
+    precision: Precision
+    trajectories: Trajectories | None
+    trimmed: Trimmed | None
+    streamed: bool
+    simulated: bool
+
+
+class Job(NamedTuple):
+    """All that a chunk of a sweep needs."""
+
+    model: Model
+    params: dict[str, float]
+    flights: tuple[Flight, ...]
+    design: Design
+    reduce: dict[str, Reduce]
+    solver: str
+    substeps: int
+    precision: Precision
+    trajectories: Trajectories | None
+    trimmed: Trimmed | None
+    pilot: Pilot | None
+
+    @property
+    def plan(self) -> Plan:
+        """The part of it that is compiled."""
+        return Plan(
+            self.model,
+            tuple(self.reduce.items()),
+            self.solver,
+            self.substeps,
+            self.precision,
+            self.trajectories,
+            self.trimmed,
+            self.streamed,
+            self.simulated,
+        )
+
+    @property
+    def streamed(self) -> bool:
+        """Whether every run is reduced while it goes on, and nothing of it has to be kept."""
+        own = any(_needs_whole_run(r) for r in self.reduce.values())
+        moved = {"delay", "seed"} & set(special_axes(self.model, self.design))
+        return not own and not moved and self.trajectories is None and self.pilot is None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether anything has to be simulated at all."""
+        kept = [r for r in self.reduce.values() if r.how not in reducers.LINEAR]
+        return bool(kept) or self.trajectories is not None
+
+
+def _needs_whole_run(one: Reduce) -> bool:
+    return callable(one.how) and not isinstance(one.how, reducers.Streaming)
+
+
+def special_axes(model: Model, design: Design) -> list[str]:
+    """The axes that are no parameters of the model."""
+    return [n for n in design.names if n not in naming.names(model.Params)]
+
+
+def job(
+    model: Model,
+    params: Any,
+    flights: Flight | tuple[Flight, ...] | list[Flight],
+    design: Design,
+    reduce: Mapping[str, Reduce],
+    *,
+    solver: str | None = None,
+    substeps: int | None = None,
+    precision: Precision = "float64",
+    trajectories: Trajectories | None = None,
+    trimmed: Trimmed | None = None,
+    pilot: Pilot | None = None,
+) -> Job:
+    """Check a sweep and lay it out.
+
+    Raises:
+        ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
+            lacks something, an unknown solver or precision, float64 while JAX has it switched off.
+    """
+    flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
+    if not flights:
+        raise ValueError("flights: none given, wanted is at least one")
+    if design.size < 1:
+        raise ValueError("axes: the design has no element, wanted is at least one")
+    _check_axes(model, design, flights)
+    _check_inputs(model, flights)
+    _check_results(model, design, reduce, flights, trajectories)
+    if precision not in ("float64", "float32"):
+        raise ValueError(f"precision: found {precision!r}, wanted is float64 or float32")
+    if precision == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
+        raise ValueError(
+            "precision: float64 is switched off in JAX, wanted is "
+            "jax.config.update('jax_enable_x64', True), or precision='float32'"
+        )
+    solver = solver or ("exact" if model.linear else "rk4")
+    if solver == "exact" and not model.linear:
+        raise ValueError(f"solver: model {model.name!r} is not linear, wanted is rk4")
+    solver_named(solver)
+    numbers = {n: float(v) for n, v in naming.asdict(params).items()}
+    lacking = needed_but_missing(model, params)
+    lacking = [n for n in lacking if n not in design.names]
+    lacking = [n for n in lacking if not all(n in f.known for f in flights)]
+    if lacking:
+        raise ValueError(f"vehicle: {', '.join(lacking)} missing, model {model.name} needs it")
+    if trimmed is not None and not is_whole(trimmed.of or model):
+        raise ValueError(f"model {model.name!r} cannot be trimmed: it is not a whole helicopter")
+    most = substeps_for(max(f.dt for f in flights)) if substeps is None else substeps
+    if most < 1:
+        raise ValueError(f"substeps is {most}, wanted is at least 1")
+    return Job(
+        model,
+        numbers,
+        flights,
+        design,
+        dict(reduce),
+        solver,
+        most,
+        precision,
+        trajectories,
+        trimmed,
+        pilot,
+    )
+
+
+def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> None:
+    params = naming.names(model.Params)
+    states, inputs = naming.names(model.State), naming.names(model.Inputs)
+    special = {f"initial.{n}" for n in states}
+    special |= {f"{kind}.{n}" for kind in ("gain", "offset") for n in inputs}
+    special |= {"delay", "seed"}
+    for name in design.names:
+        if name in params:
+            for flight in flights:
+                if name in flight.known:
+                    raise ValueError(
+                        f"axes.{name}: the flight {flight.name!r} states it as known, wanted is "
+                        "one of the two"
+                    )
+        elif name not in special:
+            kind = name.partition(".")[0]
+            among = [n for n in special if n.startswith(f"{kind}.")] or [*params, *special]
+            raise ValueError(
+                f"axes.{name}: model {model.name} has nothing of that name{nearest(name, among)}"
+            )
+    if "seed" in design.names and "seed" not in params:
+        if model.noise is None:
+            raise ValueError(
+                f"axes.seed: model {model.name} draws nothing at random, wanted is a disturbance"
+            )
+        if "delay" in design.names and "delay" not in params:
+            raise ValueError("axes.seed: noise is drawn without a delay only")
+
+
+def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
+    for flight in flights:
+        for name in naming.names(model.Inputs):
+            if name not in flight.inputs:
+                raise ValueError(
+                    f"flight {flight.name!r} has no input {name!r}, which {model.name} needs"
+                )
+        if flight.n_samples < 2:
+            raise ValueError(f"flight {flight.name!r} has one sample, wanted are two at least")
+
+
+def _check_results(
+    model: Model,
+    design: Design,
+    reduce: Mapping[str, Reduce],
+    flights: tuple[Flight, ...],
+    trajectories: Trajectories | None,
+) -> None:
+    outputs, inputs = naming.names(model.Outputs), naming.names(model.Inputs)
+    if not reduce and trajectories is None:
+        raise ValueError("reduce: nothing is to be kept, wanted is a result or trajectories")
+    for name, one in reduce.items():
+        reducers.check(name, one, outputs, inputs)
+        stream = reducers.streaming(one)
+        if name in design.names or name in ("status", "element", "flight", "time"):
+            raise ValueError(f"reduce.{name}: the name is taken, wanted is another")
+        if stream is None or not stream.against_flight:
+            continue
+        for flight in flights:
+            if one.signal not in flight.outputs:
+                raise ValueError(
+                    f"reduce.{name}: flight {flight.name!r} measured no {one.signal!r}"
+                    f"{nearest(str(one.signal), flight.outputs)}"
+                )
+    if trajectories is None:
+        return
+    if not trajectories.signals:
+        raise ValueError("trajectories.signals: none given, wanted is at least one")
+    for signal in trajectories.signals:
+        if signal not in outputs:
+            raise ValueError(
+                f"trajectories.signals: the model has no output {signal!r}"
+                f"{nearest(signal, outputs)}"
+            )
+    if trajectories.every < 1:
+        raise ValueError(f"trajectories.every is {trajectories.every}, wanted is at least 1")
+    if len({(f.dt, f.n_samples) for f in flights}) > 1:
+        raise ValueError(
+            "trajectories: the flights differ in rate or length, wanted are flights of one grid"
+        )
+
+
+def described(one: Job) -> dict[str, Any]:
+    """What fixes the numbers of a sweep, as plain data; equal for two jobs that give the same."""
+    model = one.model
+    flights = [
+        {
+            "name": f.name,
+            "samples": f.n_samples,
+            "dt": f.dt,
+            "known": dict(f.known),
+            "sha256": _digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
+        }
+        for f in one.flights
+    ]
+    kept = one.trajectories
+    return {
+        "model": model.name,
+        "source": _source(model.vector_field),
+        "vehicle": {n: v for n, v in one.params.items() if np.isfinite(v)},
+        "flights": flights,
+        "design": one.design.describe(),
+        "reduce": {n: _reducer(r) for n, r in one.reduce.items()},
+        "solver": one.solver,
+        "substeps": one.substeps,
+        "precision": one.precision,
+        "trajectories": None if kept is None else [list(kept.signals), kept.every],
+        "trimmed": None
+        if one.trimmed is None
+        else [
+            [float(v) for v in one.trimmed.condition],
+            list(one.trimmed.wind),
+            one.trimmed.sticks,
+        ],
+        "pilot": None
+        if one.pilot is None
+        else _digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(one.pilot))}),
+    }
+
+
+def _reducer(one: Reduce) -> dict[str, Any]:
+    if isinstance(one.how, str):
+        found: dict[str, Any] = {"how": one.how}
+    else:
+        how = one.how.update if isinstance(one.how, reducers.Streaming) else one.how
+        found = {"how": getattr(how, "__qualname__", str(type(how))), "source": _source(how)}
+    found |= {k: v for k, v in (("signal", one.signal), ("input", one.input)) if v is not None}
+    return found | ({"gain": one.gain} if one.how == "margins" else {})
+
+
+def _source(function: Callable[..., Any]) -> str:
+    """A fingerprint of the file that a function comes from, where it is not one of ours: another
+    program gives other numbers."""
+    function = getattr(function, "func", function)
+    module = getattr(function, "__module__", "") or ""
+    if module.partition(".")[0] == "heli_jax":
+        return ""
+    try:
+        file = inspect.getsourcefile(function)
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
+    except (TypeError, OSError):
+        return ""
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        v = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
+        digest.update(v.tobytes())
+    return digest.hexdigest()
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
+    """The keys in which two descriptions differ, each with what was and what is."""
+    found = []
+    for key in {**old, **new}:
+        a, b = old.get(key), new.get(key)
+        if a == b:
+            continue
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{above}{key}.")
+        else:
+            found.append(f"{above}{key} was {_short(a)} and is {_short(b)}")
+    return found
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "not given"
+    text = str(value)
+    return text if len(text) <= 40 else text[:37] + "..."

@@ -1,0 +1,283 @@
+"""sweep: a design of many runs, computed chunk by chunk into a store."""
+
+import importlib.metadata
+import math
+import platform
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+
+from heli_jax import run_directory
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight
+from heli_jax.sweeps import store as stores
+from heli_jax.sweeps.design import Design, table
+from heli_jax.sweeps.job import Job, Precision, Trajectories, Trimmed
+from heli_jax.sweeps.job import job as checked
+from heli_jax.sweeps.lanes import split_for
+from heli_jax.sweeps.reducers import Reduce
+from heli_jax.sweeps.summary import write_summary
+from heli_jax.sweeps.work import Split, Worker, chunks
+
+_SAMPLED = 64
+"""elements on which float32 is compared with float64"""
+
+
+class Progress(NamedTuple):
+    """How far a sweep is."""
+
+    done: int
+    """elements finished, those of earlier runs too"""
+    total: int
+    rate: float
+    """elements per second of this run; NaN while the first chunk is all there is, since that
+    waited to be compiled"""
+    remaining: float
+    """[s]; NaN likewise"""
+
+
+class Options(NamedTuple):
+    """How a sweep is carried out; nothing of it changes a number, but how it is cut may change the
+    last digit."""
+
+    resume: bool = False
+    chunk: int | None = None
+    """elements written at a time; chosen unless given"""
+    lanes: int | None = None
+    """elements computed side by side on a device; measured unless given"""
+    devices: Sequence[Any] | None = None
+    """of this process: all unless given"""
+    client: Any = None
+    """a dask.distributed Client whose workers compute the chunks"""
+    memory: Path | None = None
+    """a file that keeps what was measured"""
+    progress: Callable[[Progress], None] = lambda _: None
+    say: Callable[[str], None] = lambda _: None
+
+
+def sweep(
+    model: Any,
+    params: Any,
+    flights: Flight | Sequence[Flight],
+    design: Design,
+    reduce: Mapping[str, Reduce],
+    *,
+    out: str | Path | None = None,
+    solver: str | None = None,
+    substeps: int | None = None,
+    precision: Precision = "float64",
+    trajectories: Trajectories | None = None,
+    trimmed: Trimmed | None = None,
+    pilot: Any = None,
+    **options: Any,
+) -> xr.Dataset:
+    """Run a model once for every element of a design, and keep numbers of each run.
+
+    Args:
+        flights: what the model flies: inputs, and where results compare with them, outputs. With
+            several each result has a dimension `flight`.
+        design: which values the axes take, from `heli_jax.sweeps`: grid, listed, lhs, sobol, table,
+            product or zipped. An axis is a parameter of the model, or `initial.STATE`,
+            `gain.INPUT`, `offset.INPUT`, `delay` [s] or `seed` (of the model's noise).
+        reduce: by name, what is kept of each run.
+        out: a directory for sweep.zarr and summary.json; in memory unless given.
+        solver: "exact" (linear models, the default there), "rk4", or a diffrax solver's name;
+            steps are fixed.
+        substeps: steps a sample; enough for 5 ms unless given.
+        precision: float32 is faster on some devices; how far off its results are is measured on
+            64 elements and stands in the attributes.
+        trajectories: outputs to keep, thinned.
+        trimmed: a whole helicopter begins in a steady flight of its own.
+        pilot: a `heli_jax.analysis.pilot.Pilot` who holds the attitude.
+        **options: of `Options`: resume, chunk, lanes, devices, client, progress.
+
+    Returns:
+        A Dataset over `element`, with axes and `status` as coordinates.
+
+    Raises:
+        ValueError: the model cannot have an axis or a result.
+        InputError: the directory exists (without `resume`), is of another sweep, or cannot be
+            written to.
+    """
+    wanted = checked(
+        model,
+        params,
+        flights if isinstance(flights, Flight) else tuple(flights),
+        design,
+        reduce,
+        solver=solver,
+        substeps=substeps,
+        precision=precision,
+        trajectories=trajectories,
+        trimmed=trimmed,
+        pilot=pilot,
+    )
+    return carry_out(wanted, None if out is None else Path(out), Options(**options))
+
+
+def carry_out(
+    job: Job,
+    out: Path | None,
+    options: Options,
+    *,
+    files: Mapping[str, str] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Carry out a checked sweep; `files` are written beside the store when it is made.
+
+    Raises:
+        InputError: as `sweep`.
+    """
+    words = {**(attributes or {}), "seed": seed, "versions": versions()}
+    if out is None:
+        store = stores.create(None, job, *_cut(job, options, words), "the sweep")
+        _compute(job, store, options)
+        return store.dataset().load()
+    where = f"--out {out}"
+    if out.exists():
+        if not options.resume:
+            raise InputError(f"{where}: exists already, wanted is a new directory, or --resume")
+    else:
+        run_directory.require_free(out)
+        split, words = _cut(job, options, words)
+        try:
+            with run_directory.whole(out) as directory:
+                for name, text in (files or {}).items():
+                    (directory / name).write_text(text, encoding="utf-8")
+                stores.create(directory / "sweep.zarr", job, split, words, where)
+        except OSError as e:
+            raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
+    if not out.is_dir() or not stores.writable(out):
+        raise InputError(f"{where}: is no directory that can be written to")
+    with stores.only_writer(out, where):
+        store = stores.reopen(out / "sweep.zarr", job, where)
+        _same_cut(store, options, where)
+        for note in _changes(store.attributes.get("versions", {}), versions()):
+            options.say(f"{where}: {note}")
+        timing = _compute(job, store, options)
+        dataset = store.dataset()
+        write_summary(out / "summary.json", dataset, job, timing, where)
+    return dataset
+
+
+def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict[str, Any]]:
+    """How the sweep is cut, and the attributes of its store."""
+    for name in ("chunk", "lanes"):
+        given = getattr(options, name)
+        if given is not None and given < 1:
+            raise ValueError(f"{name} is {given}, wanted is at least 1")
+    asked = {"chunk": options.chunk, "lanes": options.lanes, "memory": options.memory}
+    if options.client is not None:
+        from heli_jax.sweeps.cluster import split_there
+
+        split = split_there(options.client, job, **asked)
+    else:
+        split = split_for(job, devices=options.devices, say=options.say, **asked)
+    if job.precision == "float32":
+        words = {**words, "float32_error": float32_error(job)}
+    return split, words
+
+
+def _same_cut(store: stores.Store, options: Options, where: str) -> None:
+    for name in ("chunk", "lanes"):
+        given, kept = getattr(options, name), getattr(store.split, name)
+        if given is not None and given != kept:
+            raise InputError(
+                f"{where}: was begun with {name} {kept}, found {given}, wanted is the same"
+            )
+
+
+def _compute(job: Job, store: stores.Store, options: Options) -> dict[str, Any]:
+    """Compute what the store lacks; returns what it took."""
+    done = store.done()
+    todo = [int(k) for k in np.flatnonzero(~done)]
+    total, size = job.design.size, store.split.chunk
+    before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))
+    begin, now = time.perf_counter(), before
+    first: tuple[float, int] | None = None
+
+    def written(chunk: int, results: dict[str, np.ndarray]) -> None:
+        nonlocal now, first
+        store.write(chunk, results)
+        now += len(results["status"])
+        rate = math.nan
+        if first is None:
+            first = time.perf_counter(), now
+        else:
+            rate = (now - first[1]) / max(time.perf_counter() - first[0], 1e-9)
+        options.progress(Progress(now, total, rate, (total - now) / rate))
+
+    if options.client is not None:
+        from heli_jax.sweeps.cluster import computed
+
+        source: Iterable[Any] = computed(options.client, job, store.split, todo)
+    else:
+        source = _local(job, store.split, todo, options.devices)
+    for chunk, results in source:
+        written(chunk, results)
+    seconds = time.perf_counter() - begin
+    return {
+        "chunks": chunks(job, store.split),
+        "computed_chunks": len(todo),
+        "computed_elements": now - before,
+        "seconds": seconds,
+        "elements_per_s": (now - before) / seconds if now > before else None,
+    }
+
+
+def _local(
+    job: Job, split: Split, todo: list[int], devices: Sequence[Any] | None
+) -> Iterable[tuple[int, dict[str, np.ndarray]]]:
+    """Chunks computed here; while one is written the devices work on the next."""
+    if not todo:
+        return
+    worker = Worker(job, split, devices)
+    ahead = worker.begin(todo[0])
+    for this, following in zip(todo, [*todo[1:], None], strict=True):
+        pending = ahead
+        if following is not None:
+            ahead = worker.begin(following)
+        yield this, worker.finish(pending)
+
+
+def float32_error(job: Job) -> dict[str, float | str]:
+    """How far the results in float32 are from those in float64, of the largest of each result, on
+    elements from all over the design."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        return {"note": "not measured: float64 is switched off in JAX"}
+    n = job.design.size
+    chosen = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED)).astype(int))
+    columns = [job.design.values(int(k), int(k) + 1) for k in chosen]
+    some = table({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
+    split = Split(len(chosen), len(chosen))
+    devices = jax.local_devices()[:1]
+    single = Worker(job._replace(design=some), split, devices).run(0)
+    double = Worker(job._replace(design=some, precision="float64"), split, devices).run(0)
+    found: dict[str, float | str] = {}
+    for name, exact in double.items():
+        if name in some.names or exact.dtype.kind != "f":
+            continue
+        off = np.abs(single[name] - exact)
+        off, size = off[np.isfinite(off)], np.abs(exact[np.isfinite(exact)])
+        largest = size.max(initial=0.0)
+        found[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
+    return found
+
+
+def versions() -> dict[str, str]:
+    """What computes: the packages that numbers depend on."""
+    found = {n: importlib.metadata.version(n) for n in ("heli_jax", "jax", "jaxlib", "numpy")}
+    return {**found, "python": platform.python_version()}
+
+
+def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    changed = [f"{n} {old[n]} then, {v} now" for n, v in new.items() if n in old and old[n] != v]
+    if not changed:
+        return []
+    return [f"begun with other versions ({', '.join(changed)}): the last digits may differ"]

@@ -1,0 +1,194 @@
+"""The Zarr store of a sweep: labelled variables over the elements, written chunk by chunk.
+
+The status of a chunk is written last, so a chunk whose status is there is whole. Zarr replaces
+files in one step, so a killed process leaves each of them as it was or as it should be.
+"""
+
+import contextlib
+import errno
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import filelock
+import numpy as np
+import xarray as xr
+import zarr
+from zarr.storage import MemoryStore
+
+from heli_jax.errors import InputError
+from heli_jax.sweeps.job import Job, described, differences
+from heli_jax.sweeps.work import NOT_RUN, Split, Variable, chunks, variables
+
+_FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}
+
+
+class Store:
+    """A sweep's results, in a directory or in memory."""
+
+    def __init__(self, group: zarr.Group, where: str) -> None:
+        self.group, self.where = group, where
+        attributes: Any = dict(group.attrs)
+        self.split = Split(**attributes["split"])
+        self.attributes = attributes
+        # Looked up once: it takes as long as a write.
+        self._arrays: dict[str, Any] = dict(group.arrays())
+
+    def done(self) -> np.ndarray:
+        """Which chunks are finished, (number of chunks,)."""
+        status = self._arrays["status"]
+        count = -(-status.shape[0] // self.split.chunk)
+        firsts = [status[k * self.split.chunk] for k in range(count)]
+        return np.asarray(firsts).reshape(-1) != NOT_RUN
+
+    def write(self, chunk: int, results: Mapping[str, np.ndarray]) -> None:
+        """Write a chunk's variables, its status last.
+
+        Raises:
+            InputError: the place cannot be written to.
+        """
+        start = chunk * self.split.chunk
+        stop = start + len(results["status"])
+        with _words(self.where):
+            for name, values in results.items():
+                if name != "status":
+                    self._arrays[name][start:stop] = values
+            self._arrays["status"][start:stop] = results["status"]
+
+    def dataset(self) -> xr.Dataset:
+        """The store as an xarray Dataset, read as it is used."""
+        found = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
+        # The order of files in a directory is none.
+        return found[self.attributes["results"]]
+
+
+@contextlib.contextmanager
+def _words(where: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        hint = ", wanted is room for the rest" if full else ""
+        raise InputError(
+            f"{where}: cannot be written ({e.strerror or e}){hint}; what is finished is kept"
+        ) from e
+
+
+def create(
+    path: Path | None, job: Job, split: Split, attributes: Mapping[str, Any], where: str
+) -> Store:
+    """A new store at `path`, or in memory.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    with _words(where):
+        store: Any = MemoryStore() if path is None else str(path)
+        group = zarr.create_group(store, zarr_format=3)
+        laid_out = variables(job)
+        size = job.design.size
+        for name, one in laid_out.items():
+            _array(group, name, one, size, split)
+        dims = {d for one in laid_out.values() for d in one.dims}
+        if "flight" in dims:
+            _labels(group, "flight", np.asarray([_label(job, i) for i in range(len(job.flights))]))
+        if "time" in dims and job.trajectories is not None:
+            flight, every = job.flights[0], job.trajectories.every
+            times = flight.times[::every]
+            _labels(group, "time", times, {"units": "s", "long_name": "from the first sample"})
+        group.attrs.update(
+            {
+                **attributes,
+                "title": f"sweep of {job.model.name}",
+                "axes": list(job.design.names),
+                "results": [n for n, one in laid_out.items() if not one.axis and n != "status"],
+                "split": split._asdict(),
+                "description": json.dumps(described(job), sort_keys=True),
+                # xarray makes coordinates of what is named here.
+                "coordinates": " ".join([*job.design.names, "status"]),
+            }
+        )
+        return Store(group, where)
+
+
+def _label(job: Job, i: int) -> str:
+    return job.flights[i].name or f"flight {i + 1}"
+
+
+def _array(group: zarr.Group, name: str, one: Variable, size: int, split: Split) -> None:
+    dtype = np.dtype(one.dtype)
+    group.create_array(
+        name,
+        shape=(size, *one.shape),
+        chunks=(split.chunk, *one.shape),
+        dtype=dtype,
+        fill_value=_FILL[dtype.kind],
+        dimension_names=one.dims,
+        attributes=one.attributes,
+        # An all-NaN chunk is a result too: without its file it would be computed again.
+        config={"write_empty_chunks": True},
+    )
+
+
+def _labels(
+    group: zarr.Group, name: str, values: np.ndarray, attributes: dict[str, Any] | None = None
+) -> None:
+    made = group.create_array(
+        name,
+        shape=values.shape,
+        dtype=values.dtype if values.dtype.kind != "U" else str,
+        dimension_names=(name,),
+        attributes=attributes or {},
+    )
+    made[:] = values
+
+
+def reopen(path: Path, job: Job, where: str) -> Store:
+    """The store of the same sweep, to go on with.
+
+    Raises:
+        InputError: it is no store of a sweep, or one of another sweep.
+    """
+    try:
+        store = Store(zarr.open_group(str(path), mode="r+"), where)
+        old = json.loads(store.attributes["description"])
+        assert {"status", *job.design.names} <= set(store._arrays)
+    except (OSError, KeyError, ValueError, TypeError, AssertionError) as e:
+        raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
+    wrong = differences(old, json.loads(json.dumps(described(job))))
+    if wrong:
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        raise InputError(
+            f"{where}: {path} is of another sweep: {wrong[0]}{more}; wanted is the same, or "
+            "another --out"
+        )
+    assert chunks(job, store.split) == store.done().size
+    return store
+
+
+@contextlib.contextmanager
+def only_writer(directory: Path, where: str) -> Iterator[None]:
+    """Hold the directory's lock; the system lets go of it when the process ends, however it does.
+
+    Raises:
+        InputError: another process holds it, or the directory cannot be written to.
+    """
+    lock = filelock.FileLock(directory / ".lock", timeout=0)
+    with _words(where):
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            raise InputError(
+                f"{where}: another process is writing to it, wanted is only one"
+            ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def writable(directory: Path) -> bool:
+    """Whether files can be made there."""
+    return os.access(directory, os.W_OK | os.X_OK)

@@ -1,0 +1,110 @@
+"""What a sweep came to, in a page of JSON."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from heli_jax.errors import InputError
+from heli_jax.sweeps.job import Job
+from heli_jax.sweeps.program import MEANINGS, OK
+
+_WORST = 5
+_SMALL_IS_BAD = ("fit", "vaf")
+
+
+def write_summary(
+    path: Path, dataset: xr.Dataset, job: Job, timing: dict[str, Any], where: str
+) -> None:
+    """Write summary.json, which appears whole or not at all.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    temporary = path.with_suffix(".part")
+    try:
+        text = json.dumps(summary(dataset, job, timing), indent=1, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as e:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{where}: summary.json cannot be written ({e.strerror or e})") from e
+
+
+def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
+    """Counts by status, quantiles of every result over the elements that are ok, the worst."""
+    status = dataset["status"].to_numpy()
+    fine = status == OK
+    results = {
+        str(name): _quantiles(dataset[name], fine)
+        for name in dataset.data_vars
+        if not str(name).startswith("trajectory_")
+    }
+    found = {
+        "model": job.model.name,
+        "elements": int(status.size),
+        "status": {word: int(np.count_nonzero(status == k)) for k, word in MEANINGS.items()},
+        "axes": {
+            n: {"min": float(v.min()), "max": float(v.max()), **_unit(dataset[n])}
+            for n in job.design.names
+            if (v := _finite(dataset[n].to_numpy())).size
+        },
+        "results": results,
+        "worst": {name: _rows(dataset, job, name, k) for name, k in worst(dataset, job).items()},
+        "split": dataset.attrs["split"],
+        "timing": timing,
+        "versions": dataset.attrs["versions"],
+        "seed": dataset.attrs["seed"],
+    }
+    if "float32_error" in dataset.attrs:
+        found["float32_error"] = dataset.attrs["float32_error"]
+    return found
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
+
+
+def _unit(variable: xr.DataArray) -> dict[str, str]:
+    return {"unit": variable.attrs["units"]} if "units" in variable.attrs else {}
+
+
+def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
+    values = _finite(variable.to_numpy()[fine].astype(np.float64))
+    if not values.size:
+        return {**_unit(variable), "n": 0}
+    q = np.quantile(values, [0.0, 0.05, 0.5, 0.95, 1.0])
+    names = ("min", "q05", "median", "q95", "max")
+    return {
+        **_unit(variable), "n": int(values.size), **dict(zip(names, map(float, q), strict=True))
+    }  # fmt: skip
+
+
+def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.ndarray]:
+    """By result, the elements that are ok and worst in it: the largest, or for what agrees with a
+    flight the smallest; of several flights the worst one counts."""
+    fine = dataset["status"].to_numpy() == OK
+    found = {}
+    for name, one in job.reduce.items():
+        if name not in dataset.data_vars:
+            continue
+        values = dataset[name].to_numpy().astype(np.float64)
+        badness = -values if one.how in _SMALL_IS_BAD else np.abs(values)
+        badness = badness.reshape(len(fine), -1).max(axis=1)
+        badness = np.where(fine & np.isfinite(badness), badness, -np.inf)
+        count = min(count, int(np.count_nonzero(badness > -np.inf)))
+        if count:
+            top = np.argpartition(badness, -count)[-count:]
+            found[name] = top[np.argsort(-badness[top], kind="stable")]
+    return found
+
+
+def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
+    rows = []
+    for k in elements:
+        value = dataset[name].to_numpy()[k]
+        axes = {n: float(dataset[n].to_numpy()[k]) for n in job.design.names}
+        rows.append({"element": int(k), "value": np.asarray(value).tolist(), "axes": axes})
+    return rows

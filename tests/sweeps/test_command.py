@@ -1,0 +1,274 @@
+"""heli-jax sweep: from a configuration to a directory, and what is refused in words."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import xarray as xr
+import yaml
+
+from heli_jax import cli
+from heli_jax.naming import names
+from heli_jax.vehicle import Helicopter
+
+ROOT = Path(__file__).parents[2]
+
+
+def content(**sweep):
+    return {
+        "model": "roll-on-stand",
+        "vehicle": str(ROOT / "configs" / "vehicles" / "bench-30.yaml"),
+        "simulate": {
+            "duration": 1.0,
+            "rate": 50,
+            "inputs": {"x_roll": {"amplitude": 3.0, "unit": "um"}},
+        },
+        "sweep": {
+            "design": "grid",
+            "axes": {"Ixx": {"lower": 0.02, "upper": 0.05, "n": 6}},
+            "reduce": {"rms": {"signal": "roll", "how": "rms"}},
+        }
+        | sweep,
+    }
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(config, name="study.yaml"):
+        path = tmp_path / name
+        path.write_text(yaml.safe_dump(config, sort_keys=False))
+        return path
+
+    return write
+
+
+def opened(out):
+    return xr.open_zarr(out / "sweep.zarr", consolidated=False, chunks=None)
+
+
+def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
+    out = tmp_path / "runs" / "one"
+    assert cli.main(["sweep", str(write(content())), "--out", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "6 elements of roll-on-stand: 6 ok" in shown.out
+    assert str(out / "sweep.zarr") in shown.out
+    assert "6 of 6 elements" in shown.err
+    assert {p.name for p in out.iterdir()} >= {"config.yaml", "sweep.zarr", "summary.json"}
+    assert (out / "figures" / "slices-rms.png").stat().st_size > 1000
+    assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
+    found = opened(out)
+    np.testing.assert_allclose(found["Ixx"], np.linspace(0.02, 0.05, 6))
+    # The resolved configuration makes the same sweep from anywhere.
+    again = tmp_path / "again"
+    assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(again)]) == 0
+    assert found["rms"].values.tobytes() == opened(again)["rms"].values.tobytes()
+    # And it is the same sweep to go on with.
+    assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(out), "--resume"]) == 0
+
+
+def test_designs_of_a_configuration(write, tmp_path, capsys):
+    table = {"inertia": [0.02, 0.03, np.nan], "lift": [5.0, 5.5, 6.0]}
+    pq.write_table(pa.table(table), tmp_path / "some.parquet")
+    inner = {
+        "design": "zip",
+        "of": [
+            {"design": "table", "file": "some.parquet",
+             "axes": {"Ixx": {"column": "inertia"}, "a": {"column": "lift", "unit": "1/rad"}}},
+            {"design": "lhs", "n": 3, "axes": {"If": {"lower": 2e-4, "upper": 4e-4}}},
+        ],
+    }  # fmt: skip
+    angles = {"design": "list", "axes": {"initial.phi": {"values": [0, 10], "unit": "deg"}}}
+    config = content(design="product", of=[inner, angles], axes={})
+    del config["sweep"]["axes"]
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(config)), "--out", str(out)]) == 0
+    found = opened(out)
+    np.testing.assert_array_equal(found["Ixx"], np.repeat(table["inertia"], 2))
+    np.testing.assert_array_equal(found["a"], np.repeat(table["lift"], 2))
+    np.testing.assert_allclose(found["initial.phi"], np.tile([0.0, np.deg2rad(10)], 3))
+    assert found["status"].values.tolist() == [0, 0, 0, 0, 1, 1]
+    assert "4 ok, 2 diverged" in capsys.readouterr().out
+
+
+def test_a_seed_and_a_function_of_ones_own(write, tmp_path):
+    (tmp_path / "my_reducers.py").write_text(
+        "import jax.numpy as jnp\n\ndef swing(run):\n"
+        "    return jnp.max(run.outputs.roll) - jnp.min(run.outputs.roll)\n"
+    )
+    config = content(
+        axes={"seed": {"values": [0, 1, 2]}},
+        reduce={"swing": {"how": "my_reducers:swing"}},
+        trajectories={"signals": ["roll"], "every": 5},
+    )
+    config["disturbance"] = {"axis": "roll", "sigma_w": 1.0, "tau_w": 1.0}
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(config)), "--out", str(out)]) == 0
+    found = opened(out)
+    assert len(set(found["swing"].values.tolist())) == 3
+    assert found["trajectory_roll"].shape == (3, 10)
+    assert found["seed"].dtype == np.int64
+
+
+WRONG = {
+    "no sweep": (lambda c: c.pop("sweep"), ["sweep: missing"]),
+    "no inputs": (lambda c: c.pop("simulate"), ["sweep: no inputs"]),
+    "no flights": (lambda c: c["sweep"].update(inputs="flights"), ["there are no flights"]),
+    "no axes": (lambda c: c["sweep"].update(axes={}), ["sweep: axes: none given"]),
+    "empty axis": (
+        lambda c: c["sweep"].update(axes={"Ixx": {"values": []}}), ["axes.Ixx: no values"],
+    ),
+    "unknown axis": (
+        lambda c: c["sweep"].update(axes={"ixx": {"values": [1]}}), ["axes.ixx", "mean 'Ixx'"],
+    ),
+    "unknown state": (
+        lambda c: c["sweep"].update(axes={"initial.fi": {"values": [1]}}),
+        ["axes.initial.fi", "initial.phi"],
+    ),
+    "unknown input": (
+        lambda c: c["sweep"].update(axes={"gain.x_rol": {"values": [1]}}), ["gain.x_roll"],
+    ),
+    "unknown design": (lambda c: c["sweep"].update(design="sobel"), ["sweep.design", "sobol"]),
+    "unknown key": (lambda c: c["sweep"].update(axis={}), ["sweep.axis", "axes"]),
+    "unknown signal": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(signal="rol"), ["reduce.rms.signal", "'roll'"],
+    ),
+    "unknown reducer": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(how="mrs"), ["reduce.rms.how", "'rms'"],
+    ),
+    "no such function": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(how="json:nothing"), ["is nothing"],
+    ),
+    "no such module": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(how="nowhere_at_all:f"), ["cannot import"],
+    ),
+    "no signal": (lambda c: c["sweep"]["reduce"].update(x={"how": "rms"}), ["x.signal: missing"]),
+    "nothing to keep": (lambda c: c["sweep"].update(reduce={}), ["nothing is to be kept"]),
+    "a name that is taken": (
+        lambda c: c["sweep"]["reduce"].update(Ixx={"how": "rms", "signal": "roll"}), ["is taken"],
+    ),
+    "against no flight": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(how="nrmse"), ["measured no 'roll'"],
+    ),
+    "sizes that do not zip": (
+        lambda c: c["sweep"].update(
+            design="list", axes={"Ixx": {"values": [0.1, 0.2]}, "a": {"values": [5]}}
+        ),
+        ["Ixx has 2, a has 1"],
+    ),
+    "designs that do not zip": (
+        lambda c: c["sweep"].update(
+            design="zip", axes={},
+            of=[{"design": "lhs", "n": 3, "axes": {"a": {"lower": 4, "upper": 5}}},
+                {"design": "list", "axes": {"Ixx": {"values": [0.1, 0.2]}}}],
+        ),
+        ["3 and 2 elements"],
+    ),
+    "n that is missing": (
+        lambda c: c["sweep"].update(design="sobol", axes={"a": {"lower": 4, "upper": 5}}),
+        ["n: missing"],
+    ),
+    "points for a sample": (
+        lambda c: c["sweep"].update(design="lhs", n=3, axes={"a": {"values": [4]}}),
+        ["axes.a.values", "lower and upper"],
+    ),
+    "no table": (lambda c: c["sweep"].update(design="table"), ["file: missing"]),
+    "a table that is not there": (
+        lambda c: c["sweep"].update(design="table", file="gone.csv", axes={"Ixx": {}}),
+        ["gone.csv", "no such file"],
+    ),
+    "a file for a grid": (lambda c: c["sweep"].update(file="x.csv"), ["file: only a table"]),
+    "a unit of another kind": (
+        lambda c: c["sweep"]["axes"]["Ixx"].update(unit="m"), ["axes.Ixx.unit"],
+    ),
+    "a seed without disturbance": (
+        lambda c: c["sweep"].update(axes={"seed": {"values": [1]}}), ["wanted is a disturbance"],
+    ),
+    "an unknown solver": (lambda c: c["sweep"].update(solver="Tsit6"), ["solver", "Tsit5"]),
+    "an abstract solver": (
+        lambda c: c["sweep"].update(solver="AbstractSolver"), ["unknown solver"],
+    ),
+    "trim of a roll model": (
+        lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
+    ),
+    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk is 0"]),
+    "margins without input": (
+        lambda c: c["sweep"]["reduce"].update(m={"how": "margins", "signal": "roll"}),
+        ["m.input: missing"],
+    ),
+    "trajectories of nothing": (
+        lambda c: c["sweep"].update(trajectories={"signals": ["rol"]}), ["signals", "'roll'"],
+    ),
+    "a vehicle that lacks something": (
+        lambda c: c.update(model="helicopter"), ["vehicle", "missing"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_ends_in_one_sentence(case, write, tmp_path, capsys):
+    change, words = WRONG[case]
+    config = content()
+    change(config)
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(config)), "--out", str(out)]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert len(shown.splitlines()) == 1
+    assert shown.startswith("heli-jax: ")
+    assert "study.yaml" in shown or "gone.csv" in shown
+    for word in words:
+        assert word in shown
+    assert not out.exists()
+
+
+def test_another_configuration_does_not_go_on_with_a_store(write, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(content())), "--out", str(out)]) == 0
+    other = write(content(axes={"Ixx": {"lower": 0.02, "upper": 0.06, "n": 6}}))
+    before = (out / "sweep.zarr" / "zarr.json").read_bytes()
+    assert cli.main(["sweep", str(other), "--out", str(out), "--resume"]) == 2
+    assert "is of another sweep: design.axes.Ixx" in capsys.readouterr().err
+    assert cli.main(["sweep", str(other), "--out", str(out)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert cli.main(["sweep", str(other), "--resume"]) == 2
+    assert "--out" in capsys.readouterr().err
+    assert before == (out / "sweep.zarr" / "zarr.json").read_bytes()
+
+
+@pytest.mark.parametrize("option", [["--workers", "0"], ["--devices", "two"],
+                                    ["--workers", "1", "--scheduler", "tcp://x:1"]])  # fmt: skip
+def test_wrong_options(option, write, capsys):
+    with pytest.raises(SystemExit) as e:
+        cli.main(["sweep", str(write(content())), *option])
+    assert e.value.code == 2
+
+
+def test_without_dask_the_extra_is_named(write, tmp_path):
+    program = (
+        "import sys\nsys.modules['distributed'] = None\nfrom heli_jax import cli\n"
+        f"sys.exit(cli.main(['sweep', {str(write(content()))!r}, '--workers', '2', '--out', 'o']))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert run.returncode == 2
+    assert "heli_jax[distributed]" in run.stderr
+    assert not (tmp_path / "o").exists()
+
+
+def test_possible_judges_as_impossible_does(vehicles_folder):
+    from heli_jax import load_vehicle
+    from heli_jax.vehicle import impossible, possible
+
+    good = {n: float(getattr(load_vehicle(vehicles_folder / "x-cell-60.yaml"), n))
+            for n in names(Helicopter)}  # fmt: skip
+    for name in names(Helicopter):
+        for value in (-1.0, 0.0, 0.5, 1.5):
+            changed = good | {name: value}
+            judged = possible(good | {name: np.array([value, good[name]])})
+            both = np.broadcast_to(judged, 2).tolist()
+            assert both == [impossible(changed) is None, True], (name, value)

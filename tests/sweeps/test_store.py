@@ -1,0 +1,288 @@
+"""What lies on disk: labels, chunks, resuming, and what is refused."""
+
+import errno
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+
+from heli_jax import Flight, models, sweep
+from heli_jax.errors import InputError
+from heli_jax.sweeps import Between, Reduce, listed, sobol
+from heli_jax.sweeps import store as stores
+from heli_jax.sweeps.job import job
+from heli_jax.sweeps.lanes import split_for
+from heli_jax.sweeps.work import Worker
+
+ROLL = models.roll_on_stand
+DESIGN = sobol({"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}, 300, seed=2)
+REDUCE = {"rms": Reduce("rms", "roll"), "fit": Reduce("fit", "roll"), "mode": Reduce("modes")}
+
+
+@pytest.fixture(scope="module")
+def short(record):
+    return Flight(
+        dt=0.02,
+        inputs={"x_roll": record.inputs["x_roll"][:50]},
+        outputs={"roll": record.outputs["roll"][:50]},
+        name="short",
+    )
+
+
+@pytest.fixture(scope="module")
+def run(bench30, short):
+    def run(out=None, design=DESIGN, reduce=REDUCE, **options):
+        options = {"chunk": 32, "lanes": 16} | options
+        return sweep(ROLL, bench30, short, design, reduce, out=out, **options)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
+    """A finished sweep on disk."""
+    out = tmp_path_factory.mktemp("sweeps") / "whole"
+    run(out)
+    return out
+
+
+def equal(a, b):
+    return set(a.variables) == set(b.variables) and all(
+        a[n].values.tobytes() == b[n].values.tobytes() for n in a.variables
+    )
+
+
+def test_xarray_reads_the_store_by_itself(whole):
+    found = xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None)
+    assert set(found.coords) == {"Ixx", "a", "status"}
+    assert found["rms"].dims == ("element",)
+    assert found["mode_real"].dims == ("element", "mode")
+    assert found["rms"].attrs["units"] == "rad"
+    assert found["Ixx"].attrs["units"] == "kg m^2"
+    assert found.attrs["split"] == {"chunk": 32, "lanes": 16}
+    assert found.attrs["axes"] == ["Ixx", "a"]
+    assert json.loads(found.attrs["description"])["design"]["n"] == 300
+    np.testing.assert_array_equal(found["a"], DESIGN.values(0, 300)["a"])
+    assert not found["status"].any()
+    assert np.isfinite(found["rms"]).all()
+
+
+def test_the_summary_counts_and_names_the_worst(whole):
+    found = json.loads((whole / "summary.json").read_text())
+    data = xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None)
+    assert found["elements"] == 300
+    assert found["status"] == {"ok": 300, "diverged": 0, "out_of_range": 0, "not_run": 0}
+    assert found["results"]["rms"]["median"] == pytest.approx(float(np.median(data["rms"])))
+    assert found["worst"]["rms"][0]["element"] == int(np.argmax(data["rms"].values))
+    assert found["worst"]["fit"][0]["element"] == int(np.argmin(data["fit"].values))
+    assert found["timing"]["computed_chunks"] == found["timing"]["chunks"] == 10
+
+
+@pytest.mark.parametrize("options", [{}, {"chunk": 100}, {"chunk": 300}])
+def test_chunks_and_devices_change_no_bit(run, whole, options):
+    on_disk = xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None)
+    assert equal(run(None, **options), on_disk)
+
+
+def test_several_devices_change_no_bit(tmp_path):
+    """In a process of its own, since the number of devices is fixed when JAX begins."""
+    import subprocess
+    import sys
+
+    program = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 3)
+import numpy as np
+from heli_jax import Flight, load_vehicle, models, sweep
+from heli_jax.sweeps import Between, Reduce, sobol
+stick = np.repeat(np.random.default_rng(0).uniform(-3e-6, 3e-6, 20), 10)
+flight = Flight(dt=0.02, inputs={"x_roll": stick}, outputs={})
+design = sobol({"Ixx": Between(0.02, 0.05)}, 200)
+found = [
+    sweep(models.roll, load_vehicle(sys.argv[1]), flight, design, {"rms": Reduce("rms", "roll")},
+          lanes=16, chunk=96, devices=jax.local_devices()[:k])["rms"].values.tobytes()
+    for k in (1, 2, 3)
+]
+assert found[0] == found[1] == found[2]
+"""
+    from pathlib import Path
+
+    vehicle = Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml"
+    subprocess.run([sys.executable, "-c", program, str(vehicle)], check=True, cwd=tmp_path)
+
+
+def test_what_is_finished_is_not_computed_again(run, whole, tmp_path, monkeypatch):
+    out = tmp_path / "cut"
+    computed = []
+    finish = Worker.finish
+
+    def counted(self, pending):
+        if len(computed) == 4:
+            raise KeyboardInterrupt
+        computed.append(pending.start)
+        return finish(self, pending)
+
+    monkeypatch.setattr(Worker, "finish", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run(out)
+    monkeypatch.setattr(Worker, "finish", finish)
+    part = xr.open_zarr(out / "sweep.zarr", consolidated=False, chunks=None)
+    assert np.count_nonzero(part["status"] == 0) == 4 * 32
+    assert np.count_nonzero(part["status"] == 255) == 300 - 4 * 32
+    seen = []
+    monkeypatch.setattr(Worker, "finish", lambda self, p: seen.append(p.start) or finish(self, p))
+    found = run(out, resume=True, chunk=None, lanes=None)
+    assert seen == list(range(4 * 32, 300, 32))
+    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
+    seen.clear()
+    run(out, resume=True)
+    assert seen == []
+
+
+def test_a_chunk_without_status_is_computed_again(run, whole, tmp_path):
+    """A kill between the results and the status of a chunk."""
+    out = tmp_path / "torn"
+    shutil.copytree(whole, out)
+    (out / "sweep.zarr" / "status" / "c" / "3").unlink()
+    (out / "sweep.zarr" / "fit" / "c" / "3").write_bytes(b"")
+    (out / "sweep.zarr" / "rms" / "c" / "3").unlink()
+    found = run(out, resume=True)
+    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
+
+
+def test_resuming_what_never_began_begins_it(run, whole, tmp_path):
+    found = run(tmp_path / "new", resume=True)
+    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"design": sobol({"Ixx": Between(0.02, 0.05, "log")}, 300)}, "design"),
+        ({"design": sobol({"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}, 301, 2)},
+         "design.n was 300 and is 301"),
+        ({"reduce": {"rms": Reduce("rms", "roll")}}, "reduce.fit"),
+        ({"solver": "rk4"}, "solver was exact and is rk4"),
+        ({"precision": "float32"}, "precision was float64 and is float32"),
+        ({"chunk": 64}, "chunk 32, found 64"),
+        ({"lanes": 64}, "lanes 16, found 64"),
+    ],
+)  # fmt: skip
+def test_the_store_of_another_sweep_is_refused(run, whole, changed, words):
+    before = {p: p.stat().st_mtime_ns for p in (whole / "sweep.zarr").rglob("*")}
+    with pytest.raises(InputError, match=words):
+        run(whole, resume=True, **changed)
+    assert before == {p: p.stat().st_mtime_ns for p in (whole / "sweep.zarr").rglob("*")}
+
+
+def test_the_store_of_another_vehicle_or_flight_is_refused(bench30, short, whole):
+    from heli_jax.naming import replace
+
+    heavier = replace(bench30, Ixx_added=bench30.Ixx_added + 0.01)
+    with pytest.raises(InputError, match=r"vehicle.Ixx_added was 0.0 and is 0.01"):
+        sweep(ROLL, heavier, short, DESIGN, REDUCE, out=whole, resume=True)
+    moved = Flight(dt=0.02, inputs={"x_roll": short.inputs["x_roll"] + 1e-9},
+                   outputs=short.outputs, name="short")  # fmt: skip
+    with pytest.raises(InputError, match="flights was"):
+        sweep(ROLL, bench30, moved, DESIGN, REDUCE, out=whole, resume=True)
+
+
+def test_a_directory_that_exists_is_kept(run, whole, tmp_path):
+    with pytest.raises(InputError, match="exists already"):
+        run(whole)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter").write_text("dear")
+    with pytest.raises(InputError, match="is no store of a sweep"):
+        run(tmp_path / "mine", resume=True)
+    assert (tmp_path / "mine" / "letter").read_text() == "dear"
+    with pytest.raises(InputError, match="exists already"):
+        run(tmp_path / "mine" / "letter")
+
+
+def test_two_writers_are_refused(run, whole):
+    with (
+        stores.only_writer(whole, "--out x"),
+        pytest.raises(InputError, match="another process is writing"),
+    ):
+        run(whole, resume=True)
+    run(whole, resume=True)
+
+
+def test_a_full_disk_ends_in_words_and_keeps_what_is_done(run, whole, tmp_path, monkeypatch):
+    out, written = tmp_path / "full", []
+    import zarr.storage._local as local
+
+    put = local._put
+
+    def full(path, value, exclusive=False):
+        if "status/c/" in str(path):
+            written.append(path)
+        if len(written) > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return put(path, value, exclusive)
+
+    monkeypatch.setattr(local, "_put", full)
+    with pytest.raises(InputError, match=r"full: cannot be written \(No space left on device\)"):
+        run(out)
+    monkeypatch.setattr(local, "_put", put)
+    part = xr.open_zarr(out / "sweep.zarr", consolidated=False, chunks=None)
+    assert np.count_nonzero(part["status"] == 0) == 3 * 32
+    found = run(out, resume=True)
+    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
+
+
+def test_a_store_that_is_no_store_is_refused(run, whole, tmp_path):
+    out = tmp_path / "broken"
+    shutil.copytree(whole, out)
+    (out / "sweep.zarr" / "zarr.json").write_text("{")
+    with pytest.raises(InputError, match="is no store of a sweep"):
+        run(out, resume=True)
+
+
+def test_a_result_that_is_nowhere_a_number_is_finished_too(run, tmp_path):
+    out = tmp_path / "nan"
+    design = listed({"Ixx": np.full(64, np.nan)})
+    run(out, design=design, reduce={"rms": Reduce("rms", "roll")})
+    found = xr.open_zarr(out / "sweep.zarr", consolidated=False, chunks=None)
+    assert (found["status"] == 1).all()
+    assert json.loads((out / "summary.json").read_text())["results"]["rms"] == {
+        "unit": "rad",
+        "n": 0,
+    }
+
+
+def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
+    import heli_jax.sweeps.lanes as lanes
+
+    def cut(n, **asked):
+        design = sobol({"Ixx": Between(0.02, 0.05)}, n)
+        wanted = job(ROLL, bench30, record, design, {"rms": Reduce("rms", "roll")})
+        return split_for(wanted, devices=jax.local_devices()[:1], **asked)
+
+    assert cut(10).lanes == 8
+    assert cut(10).chunk == 16
+    assert cut(100_000) == cut(100_000)
+    assert cut(100_000).lanes == 64
+    assert cut(100_000).chunk <= 100_000 / 4
+    assert cut(100_000, shares=8).chunk < cut(100_000).chunk
+    assert cut(1_000_000).chunk <= 1 << 14
+    assert cut(1000, chunk=77, lanes=5) == (77, 5)
+    # Measured where it pays, once, and remembered.
+    calls = []
+    monkeypatch.setattr(lanes, "_WORTH_S", 0.0)
+    monkeypatch.setattr(
+        lanes, "_time", lambda job, devices, lanes: calls.append(lanes) or abs(lanes - 128) + 1.0
+    )
+    memory = tmp_path / "cache" / "lanes.json"
+    assert cut(100_000, memory=memory).lanes == 128
+    assert sorted(calls) == [32, 64, 128, 256]
+    calls.clear()
+    assert cut(100_000, memory=memory).lanes == 128
+    assert calls == []
+    memory.write_text("no JSON")
+    assert cut(100_000, memory=memory).lanes == 128
