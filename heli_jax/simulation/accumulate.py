@@ -12,7 +12,8 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import matrix
-from heli_jax.simulation.simulate import held_inputs, per_sample, start_state
+from heli_jax.simulation.hoist import hoisted
+from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
 from heli_jax.simulation.solvers import Accumulating, Held, at
 
 
@@ -107,6 +108,10 @@ def accumulated(
     if block > 1 and watched is None:
         value, state = _in_blocks(model, held, block, x0, update, start, data)
         return Accumulated(value, state, {}, dfx.RESULTS.successful)
+    if held.discrete is None:
+        values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
+        term = field_term(model, field)
+        held = held._replace(params=values)
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
     if watched is not None:
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
@@ -141,15 +146,17 @@ def _in_blocks(
     assert held.discrete is not None
     A, B = matrix(held.discrete.Ad), matrix(held.discrete.Bd)
     space = jacobians(model, held.params)
-    size = A.shape[0]
-    AB, powers = [B], [jnp.eye(size, dtype=A.dtype)]
-    for _ in range(m):
-        powers.append(A @ powers[-1])
-        AB.append(A @ AB[-1])
     C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
-    free = [_rows(C @ powers[j]) for j in range(1, m)]
-    forced = [_rows(D)] + [_rows(C @ AB[j]) for j in range(m - 1)]
-    ahead, driven = _rows(powers[m]), [_rows(AB[m - 1 - j]) for j in range(m)]
+    rows, columns = [C], [B]
+    for _ in range(m - 1):
+        rows.append(_times(rows[-1], A))
+        columns.append(_times(A, columns[-1]))
+    power = A
+    for _ in range(m - 1):
+        power = _times(A, power)
+    free = [_rows(row) for row in rows[1:]]
+    forced = [_rows(D)] + [_rows(_times(C, column)) for column in columns[:-1]]
+    ahead, driven = _rows(power), [_rows(columns[m - 1 - j]) for j in range(m)]
     free, forced, ahead, driven = jax.lax.optimization_barrier((free, forced, ahead, driven))
 
     names = naming.names(model.Outputs)
@@ -203,6 +210,14 @@ def _in_blocks(
             for a, b in zip(held.discrete.Ad, held.discrete.Bd, strict=True)
         ]
     return value, jax.tree.unflatten(structure, last)
+
+
+def _times(X: Array, Y: Array) -> Array:
+    """X Y as a sum of outer products: many small ones side by side are faster than with `@`."""
+    total = X[:, 0, None] * Y[0, None]
+    for k in range(1, X.shape[1]):
+        total = total + X[:, k, None] * Y[k, None]
+    return total
 
 
 def _rows(M: Array) -> Any:

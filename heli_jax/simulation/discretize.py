@@ -25,13 +25,29 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     reverse mode; compiles in half the time of `jax.scipy.linalg.expm`. Valid for norms up to
     0.3 * 2^24 after balancing; beyond that the result is NaN.
     """
+    return _side_by_side(M)
+
+
+@jax.custom_batching.custom_vmap
+def _side_by_side(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The exponential where no derivative is wanted, as in sweeps."""
+    return _many(M[:, :, None])[:, :, 0]
+
+
+@_side_by_side.def_vmap
+def _side_by_side_batched(size: int, batched: Any, M: Any) -> Any:
+    # Matrices last beside each other, so that the processor takes several of them at a time.
+    return jnp.moveaxis(_many(jnp.moveaxis(M, 0, 2)), 2, 0), True
+
+
+def _many(M: Float[Array, "n n L"]) -> Float[Array, "n n L"]:
+    """The exponentials of L matrices, with no more squarings than one of them needs."""
     d = _balance(M)
     X = M * (d[None, :] / d[:, None])
-    s = _halvings(X)
+    s = _halvings(X)[None, None]
     E = _taylor(X * jnp.exp2(-s))
-    # Where no derivative is wanted, as in sweeps, only the squarings that are needed are done.
-    count = jnp.where(s <= _SQUARINGS, s, 0.0).astype(int)
-    E = jax.lax.fori_loop(0, count, lambda _, E: product(E, E), E)
+    count = jnp.max(jnp.where(s <= _SQUARINGS, s, 0.0)).astype(int)
+    E = jax.lax.fori_loop(0, count, lambda i, E: jnp.where(i < s, product(E, E), E), E)
     E = jnp.where(s <= _SQUARINGS, E, jnp.nan)
     return E * (d[:, None] / d[None, :])
 
@@ -50,16 +66,23 @@ def _expm_in_loops(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return E * (d[:, None] / d[None, :])
 
 
-def _taylor(X: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    eye = jnp.eye(X.shape[0], dtype=X.dtype)
+def _taylor(X: Float[Array, "n n *L"]) -> Float[Array, "n n *L"]:
+    eye = _eye(X)
     # Loops rather than unrolled sums: they run as fast and compile in half the time.
     degrees = jnp.arange(_DEGREE, 0, -1, dtype=X.dtype)
-    return jax.lax.scan(lambda E, k: (eye + product(X, E) / k, None), eye, degrees)[0]
+    begin = jnp.broadcast_to(eye, X.shape)
+    return jax.lax.scan(lambda E, k: (eye + product(X, E) / k, None), begin, degrees)[0]
 
 
-def _halvings(X: Float[Array, "n n"]) -> Float[Array, ""]:
+def _eye(X: Float[Array, "n n *L"]) -> Float[Array, "n n *one"]:
+    """The identity, with the axes of X."""
+    n = X.shape[0]
+    return jnp.eye(n, dtype=X.dtype).reshape(n, n, *(1,) * (X.ndim - 2))
+
+
+def _halvings(X: Float[Array, "n n *L"]) -> Float[Array, "*L"]:
     """How often to halve X for the polynomial to be exact."""
-    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(X), axis=0)))
+    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(X), axis=0), axis=0))
     return jnp.ceil(jnp.log2(jnp.maximum(norm, _THETA) / _THETA))
 
 
@@ -121,32 +144,34 @@ def moved(A: Float[Array, "n n"], f: Float[Array, " n"], g: Float[Array, " n"], 
     return Moved(P * (d[:, None] / d[None, :]), d * m, M * (d[:, None] * d[None, :]))
 
 
-def product(X: Float[Array, "n n"], Y: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def product(X: Float[Array, "n n *L"], Y: Float[Array, "n n *L"]) -> Float[Array, "n n *L"]:
     """X Y; for small n as a sum of outer products, which takes a batch of them 5 times faster."""
     n = X.shape[0]
     if n > _SMALL:
-        return X @ Y
+        return X @ Y if X.ndim == 2 else jnp.einsum("ijl,jkl->ikl", X, Y)
     total = X[:, 0, None] * Y[0, None]
     for k in range(1, n):
         total = total + X[:, k, None] * Y[k, None]
     return total
 
 
-def _balance(M: Float[Array, "n n"]) -> Float[Array, " n"]:
+def _balance(M: Float[Array, "n n *L"]) -> Float[Array, "n *L"]:
     """Powers of two d such that M[i, j] d[j] / d[i] has rows and columns of like size (Osborne)."""
     n = M.shape[0]
-    off = jnp.abs(M) * (1.0 - jnp.eye(n, dtype=M.dtype))
-    places = jnp.arange(n)
+    off = jnp.abs(M) * (1.0 - _eye(M))
+    places = jnp.arange(n).reshape(n, *(1,) * (M.ndim - 2))
 
     def sweep(k: Array, d: Array) -> Array:
         i = k % n
-        column, row = jnp.sum(off[:, i] * d[i] / d), jnp.sum(off[i, :] * d / d[i])
+        column = jnp.sum(off[:, i] * (d[i][None] / d), axis=0)
+        row = jnp.sum(off[i, :] * (d / d[i][None]), axis=0)
         both = (column > 0) & (row > 0)
         ratio = jnp.where(both, row, 1.0) / jnp.where(both, column, 1.0)
+        change = jnp.exp2(jnp.round(0.5 * jnp.log2(ratio)))
         # Not by index: many small vectors side by side are changed element by element faster.
-        return jnp.where(places == i, d * jnp.exp2(jnp.round(0.5 * jnp.log2(ratio))), d)
+        return jnp.where(places == i, d * change[None], d)
 
-    return jax.lax.fori_loop(0, 3 * n, sweep, jnp.ones(n, M.dtype))
+    return jax.lax.fori_loop(0, 3 * n, sweep, jnp.ones(M.shape[1:], M.dtype))
 
 
 class Discrete(NamedTuple):

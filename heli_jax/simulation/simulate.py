@@ -210,7 +210,7 @@ def per_sample(
         raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
     parts = None if delay is None else split_delay(delay, dt)
 
-    term = term_of(model)
+    term = field_term(model, model.vector_field)
     dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         late = None if parts is None else parts[1] * dt
@@ -285,8 +285,8 @@ def _kick(
     return model.State(**{n: new[i] for i, n in enumerate(names)})
 
 
-def term_of(model: Model) -> dfx.ODETerm:
-    """The vector field, per second, within one sample.
+def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> dfx.ODETerm:
+    """The vector field, per second, within one sample; of its parameters as `Held` has them.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
     """
@@ -296,7 +296,7 @@ def term_of(model: Model) -> dfx.ODETerm:
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, Held):
             return x  # only the shapes are asked for; the inputs may not be the model's
-        return model.vector_field(now.params, x, now.inputs)
+        return vector_field(now.params, x, now.inputs)
 
     return dfx.ODETerm(field)
 

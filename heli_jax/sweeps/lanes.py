@@ -23,10 +23,11 @@ _WORTH_S = 60.0
 _CHUNK_S = 2.0
 """What a chunk should take [s], about: a kill costs as much, and writing is to be little of it."""
 _CHUNK_BYTES = 64e6
-_CHUNKS = 8
-"""at least, where there are enough elements: to see how it goes, and to share the work evenly"""
+_CHUNKS = 4
+"""at least, where there are enough elements, to see how it goes; twice as many for each of several
+processes, to share the work evenly"""
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
-_ROOM = {"cpu": 1 << 14, "gpu": 1 << 18}
+_ROOM = {"cpu": 1 << 16, "gpu": 1 << 18}
 
 
 def split_for(
@@ -59,7 +60,8 @@ def split_for(
         room = min(_ROOM[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
         if kind == "gpu":
             wanted = room
-        each = _power(math.ceil(job.design.size / (_CHUNKS * shares)))
+        pieces = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
+        each = _power(job.design.size / pieces)
         chunk = max(step, math.ceil(min(wanted, room, each) / step) * step)
         chunk = min(chunk, math.ceil(job.design.size / step) * step)
     return Split(chunk, lanes)

@@ -20,7 +20,7 @@ class Measured(NamedTuple):
     values: Any
     """(N,), or the value at one sample"""
     seen: Any
-    """(N,), 1 where something was measured, else 0; or that at one sample"""
+    """(N,), 1 where something was measured, else 0; or that at one sample; None: everywhere"""
     count: Any
     spread: Any
     """sum of squares about the mean"""
@@ -66,7 +66,7 @@ def measured(values: np.ndarray, dtype: Any) -> Measured:
     spread = float(np.sum((known - known.mean()) ** 2)) if known.size else 0.0
     return Measured(
         np.where(seen, values, 0.0).astype(dtype),
-        seen.astype(dtype),
+        None if seen.all() else seen.astype(dtype),
         np.asarray(known.size, dtype),
         np.asarray(spread, dtype),
         np.asarray(np.sum(known**2), dtype),
@@ -93,8 +93,12 @@ def _same(value: Any, n: Any, _: Any) -> Any:
     return value
 
 
+def _where(v: Any, m: Measured) -> Any:
+    return v if m.seen is None else v * m.seen
+
+
 def _misfit(value: Any, y: Any, m: Measured) -> Any:
-    e = (m.values - y) * m.seen
+    e = _where(m.values - y, m)
     return value + e * e
 
 
@@ -111,7 +115,7 @@ def _fit_percent(value: Any, n: Any, m: Measured) -> Any:
 
 
 def _misfit_and_sum(value: Any, y: Any, m: Measured) -> Any:
-    e = (m.values - y) * m.seen
+    e = _where(m.values - y, m)
     return (value[0] + e * e, value[1] + e)
 
 
@@ -121,7 +125,7 @@ def _vaf(value: Any, n: Any, m: Measured) -> Any:
 
 
 def _misfit_and_power(value: Any, y: Any, m: Measured) -> Any:
-    e, seen = (m.values - y) * m.seen, y * m.seen
+    e, seen = _where(m.values - y, m), _where(y, m)
     return (value[0] + e * e, value[1] + seen * seen)
 
 

@@ -178,7 +178,8 @@ class Worker:
         status = np.where(functools.reduce(np.logical_and, finite), status, DIVERGED)
         # What a run that diverged or a vehicle that cannot be left behind is no result.
         lost = impossible | (status == DIVERGED)
-        for name in (*found[0].results, *(f"trajectory_{n}" for n in found[0].trajectories)):
+        names = (*found[0].results, *(f"trajectory_{n}" for n in found[0].trajectories))
+        for name in names if lost.any() else ():
             results[name] = _blanked(results[name], lost)
         columns = {
             n: v if v.dtype.kind in "iu" else v.astype(np.float64)
@@ -212,7 +213,10 @@ class Worker:
         count = len(next(iter(columns.values())))
         if not of_helicopter(self.job.model.Params):
             return np.zeros(count, bool)
-        return ~np.broadcast_to(possible({**self.job.params, **columns}), count)
+        swept = {n: columns[n] for n in columns if n in self.job.params}
+        # The ends of the paddle are judged together.
+        both = {n: self.job.params[n] for n in ("R1", "R2") if swept.keys() & {"R1", "R2"}}
+        return ~np.broadcast_to(possible({**both, **swept}), count)
 
 
 def _worst(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,0 +1,442 @@
+"""Speed of sweeps against hand-written programs, side by side in one run, as a table and a figure.
+
+The work is that of `heli_jax.sweep` from the design to the store on disk: the roll model on its
+stand, the mean square misfit of every vehicle to a record. A figure is the slope between a small
+and a large number of vehicles, so that compilation and start-up do not count; ours and the C kernel
+run in turn on the same threads, and the ratio is the median over the pairs. Ours counts the
+discretisation of every vehicle, where C is handed its coefficients.
+
+    .venv/bin/python experiments/benchmarks/sweeps.py [--quick] [--out runs/benchmarks]
+
+Takes about six minutes on two cores. Where JAX finds a GPU it is measured as well.
+"""
+
+import argparse
+import ctypes
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from kernels import compiled, pointer
+
+from heli_jax import Flight, load_vehicle, models, sweep
+from heli_jax.dynamics.roll import roll_transfer_function
+from heli_jax.naming import replace
+from heli_jax.simulation.discretize import discretize
+from heli_jax.sweeps import Between, Reduce, sobol
+
+jax.config.update("jax_enable_x64", True)
+if __name__ == "__main__":
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+
+VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "bench-30.yaml")
+DT, SUBSTEPS, CHUNK = 0.02, 4, 16384
+REDUCE = {"misfit": Reduce("rmse", "roll")}
+
+
+class Sizes(NamedTuple):
+    """How much is measured."""
+
+    exact: tuple[int, int]
+    rk4: tuple[int, int]
+    pairs: int
+    batches: tuple[int, ...]
+    lengths: tuple[int, ...]
+    most: int
+
+
+FULL = Sizes(
+    (2 * CHUNK, 8 * CHUNK), (CHUNK, 3 * CHUNK), 7,
+    (1, 10, 100, 1000, 10_000, 100_000, 1_000_000), (100, 1000, 10_000, 100_000), 1_000_000,
+)  # fmt: skip
+QUICK = Sizes((CHUNK, 3 * CHUNK), (CHUNK, 2 * CHUNK), 3, (1, 100, 10_000), (100, 1000), 100_000)
+
+
+def record(samples: int) -> Flight:
+    """A driven run with 2 mrad of noise."""
+    rng = np.random.default_rng(0)
+    u = 3e-6 * np.repeat(rng.uniform(-1, 1, -(-samples // 25)), 25)[:samples]
+    num, den = roll_transfer_function(VEHICLE, stand=True)
+    system: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+    y = scipy.signal.lfilter(np.ravel(system[0]), system[1], u)
+    y = y + 2e-3 * rng.standard_normal(samples)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y}, name="bench")
+
+
+def design(n: int) -> Any:
+    return sobol({"Ixx": Between(0.02, 0.05, "log"), "If": Between(2e-4, 6e-4, "log")}, n)
+
+
+def seconds(run: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    run()
+    return time.perf_counter() - begin
+
+
+def ours(flight: Flight, n: int, solver: str, **options: Any) -> float:
+    """Seconds of a sweep to disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "sweep"
+        return seconds(
+            lambda: sweep(
+                models.roll_on_stand, VEHICLE, flight, design(n), REDUCE, out=out, solver=solver,
+                substeps=SUBSTEPS, **{"chunk": CHUNK, **options},
+            )
+        )  # fmt: skip
+
+
+def in_threads(work: Callable[[int], None], threads: int) -> None:
+    running = [threading.Thread(target=work, args=(k,)) for k in range(threads)]
+    for one in running:
+        one.start()
+    for one in running:
+        one.join()
+
+
+def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the C kernel takes of n vehicles: discrete coefficients, and those of the equations."""
+    values = design(n).values(0, n)
+
+    def scalars(Ixx: Any, If: Any) -> Any:
+        d = discretize(models.roll_on_stand, replace(VEHICLE, Ixx=Ixx, If=If), jnp.asarray(DT))
+        return jnp.stack(jax.tree.leaves((d.Ad, d.Bd)))
+
+    mapped = jax.jit(lambda v: jax.lax.map(lambda p: scalars(*p), v, batch_size=64))
+    coefficients = np.asarray(mapped((values["Ixx"], values["If"]))).T
+    v: Any = {k: float(getattr(VEHICLE, k)) for k in VEHICLE.__dataclass_fields__} | values
+    q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
+    k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
+    k2 = q * v["R"] ** 4 / (2 * v["Ixx"] * v["L1"] * (v["L2"] + v["L3"]))
+    one = np.ones(n)
+    rows = [k1, one / v["L5"], one / v["Omega"], v["Omega"] ** 2 * one, k2 * v["L3"]]
+    rows += [k2 * v["L2"] * v["L4"], v["kappa"] * one, v["zeta"] * one]
+    return coefficients, np.array(rows)
+
+
+def in_c(
+    kernel: Any, flight: Flight, solver: str, given: tuple[np.ndarray, np.ndarray], threads: int
+) -> Callable[[], np.ndarray]:
+    """The C kernel on all vehicles, on some threads; it returns the mean squares."""
+    matrix = given[0] if solver == "exact" else given[1]
+    parts = [np.ascontiguousarray(p) for p in np.array_split(matrix, threads, axis=1)]
+    costs = [np.zeros(p.shape[1]) for p in parts]
+    u, y, size = flight.inputs["x_roll"], flight.outputs["roll"], ctypes.c_size_t
+
+    def work(k: int) -> None:
+        common = (pointer(parts[k]), pointer(u), pointer(y), pointer(costs[k]))
+        counts = (size(parts[k].shape[1]), size(u.size))
+        if solver == "exact":
+            kernel.exact(*common, *counts)
+        else:
+            kernel.rk4(*common, *counts, ctypes.c_double(DT), ctypes.c_int(SUBSTEPS))
+
+    def run() -> np.ndarray:
+        in_threads(work, threads)
+        return np.concatenate(costs)
+
+    return run
+
+
+class Ratio(NamedTuple):
+    """Microseconds a vehicle, ours and C's, and the median ratio with its quartiles."""
+
+    ours: float
+    theirs: float
+    ratio: float
+    low: float
+    high: float
+
+
+def against_c(
+    kernel: Any, flight: Flight, solver: str, sizes: tuple[int, int], pairs: int, devices: list[Any]
+) -> Ratio:
+    small, large = sizes
+    given = arrays(large)
+    few = (given[0][:, :small], given[1][:, :small])
+    run_few = in_c(kernel, flight, solver, few, len(devices))
+    run_many = in_c(kernel, flight, solver, given, len(devices))
+    check(flight, solver, run_few())
+    ours(flight, small, solver, devices=devices)
+    rows = []
+    for _ in range(pairs):
+        a, c = ours(flight, small, solver, devices=devices), seconds(run_few)
+        b, d = ours(flight, large, solver, devices=devices), seconds(run_many)
+        rows.append((1e6 * (b - a) / (large - small), 1e6 * (d - c) / (large - small)))
+    found = sorted(a / b for a, b in rows)
+    quarter = len(found) // 4
+    return Ratio(
+        min(a for a, _ in rows), min(b for _, b in rows), statistics.median(found), found[quarter],
+        found[-1 - quarter],
+    )  # fmt: skip
+
+
+def check(flight: Flight, solver: str, cost: np.ndarray) -> None:
+    """Both give the same numbers."""
+    found = sweep(
+        models.roll_on_stand, VEHICLE, flight, design(cost.size), REDUCE, solver=solver,
+        substeps=SUBSTEPS, chunk=CHUNK,
+    )  # fmt: skip
+    np.testing.assert_allclose(found["misfit"].to_numpy() ** 2, cost, rtol=1e-6)
+
+
+def in_numpy(flight: Flight, given: np.ndarray, n: int) -> Callable[[], np.ndarray]:
+    """The recurrence with NumPy, all vehicles side by side."""
+    A, B = given[:16, :n].reshape(4, 4, n), given[16:, :n]
+    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+
+    def run() -> np.ndarray:
+        x, cost = np.zeros((4, n)), np.zeros(n)
+        for k in range(u.size):
+            cost += (y[k] - x[0]) ** 2
+            x = np.einsum("ijn,jn->in", A, x) + B * u[k]
+        return cost / u.size
+
+    return run
+
+
+def in_scipy(flight: Flight, n: int) -> Callable[[], np.ndarray]:
+    """SciPy's cont2discrete and lfilter, vehicle by vehicle."""
+    values = design(n).values(0, n)
+    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+
+    def run() -> np.ndarray:
+        cost = np.zeros(n)
+        for k in range(n):
+            v = replace(VEHICLE, Ixx=float(values["Ixx"][k]), If=float(values["If"][k]))
+            num, den = roll_transfer_function(v, stand=True)
+            system: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+            simulated = scipy.signal.lfilter(np.ravel(system[0]), system[1], u)
+            cost[k] = np.mean((y - simulated) ** 2)
+        return cost
+
+    return run
+
+
+def in_numba(flight: Flight, given: np.ndarray, threads: int) -> Callable[[], np.ndarray] | None:
+    """The C kernel's loops in Numba; None where it is not installed."""
+    try:
+        import numba
+    except ImportError:
+        return None
+
+    @numba.njit(fastmath=True, nogil=True)
+    def loops(c: Any, u: Any, y: Any, cost: Any) -> None:
+        for v in range(cost.size):
+            x0 = x1 = x2 = x3 = total = 0.0
+            for k in range(u.size):
+                e = y[k] - x0
+                total += e * e
+                n0 = c[0, v] * x0 + c[1, v] * x1 + c[2, v] * x2 + c[3, v] * x3 + c[16, v] * u[k]
+                n1 = c[4, v] * x0 + c[5, v] * x1 + c[6, v] * x2 + c[7, v] * x3 + c[17, v] * u[k]
+                n2 = c[8, v] * x0 + c[9, v] * x1 + c[10, v] * x2 + c[11, v] * x3 + c[18, v] * u[k]
+                n3 = c[12, v] * x0 + c[13, v] * x1 + c[14, v] * x2 + c[15, v] * x3 + c[19, v] * u[k]
+                x0, x1, x2, x3 = n0, n1, n2, n3
+            cost[v] = total / u.size
+
+    parts = [np.ascontiguousarray(p) for p in np.array_split(given, threads, axis=1)]
+    costs = [np.zeros(p.shape[1]) for p in parts]
+    u, y = np.array(flight.inputs["x_roll"]), np.array(flight.outputs["roll"])
+
+    def run() -> np.ndarray:
+        in_threads(lambda k: loops(parts[k], u, y, costs[k]), threads)
+        return np.concatenate(costs)
+
+    return run
+
+
+def per_vehicle(run: Callable[[], Any], n: int, times: int = 3) -> float:
+    """Microseconds a vehicle, the best of some runs after one that does not count."""
+    run()
+    return 1e6 * min(seconds(run) for _ in range(times)) / n
+
+
+def slope(flight: Flight, sizes: tuple[int, int], solver: str, **options: Any) -> float:
+    """Microseconds a vehicle of ours, between two sizes, the best of three."""
+    small, large = sizes
+    ours(flight, small, solver, **options)
+    return min(
+        1e6 * (ours(flight, large, solver, **options) - ours(flight, small, solver, **options))
+        / (large - small)
+        for _ in range(3)
+    )  # fmt: skip
+
+
+def on_workers(flight: Flight, n: int, workers: int) -> float:
+    """Microseconds a vehicle on a local dask cluster, from a quarter of them to the last."""
+    from heli_jax.sweeps.cluster import connected
+
+    seen: list[tuple[float, int]] = []
+    with connected(workers=workers) as client:
+        ours(flight, n, "rk4", client=client, chunk=2048,
+             progress=lambda p: seen.append((time.perf_counter(), p.done)))  # fmt: skip
+    t0, n0 = next(s for s in seen if s[1] >= n / 4)
+    t1, n1 = seen[-1]
+    return 1e6 * (t1 - t0) / (n1 - n0)
+
+
+def memory_of(n: int, samples: int) -> tuple[float, float]:
+    """Seconds between the first chunk and the last, and peak resident memory [MB], of a sweep in a
+    process of its own."""
+    program = [sys.executable, __file__, "--memory", str(n), str(samples)]
+    run = subprocess.run(program, capture_output=True, text=True, check=True)
+    found = json.loads(run.stdout)
+    return found["seconds"], found["MB"]
+
+
+def memory(n: int, samples: int) -> None:
+    seen: list[tuple[float, int]] = []
+    ours(record(samples), n, "exact", progress=lambda p: seen.append((time.perf_counter(), p.done)))
+    (t0, n0), (t1, n1) = seen[0], seen[-1]
+    MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"seconds": (t1 - t0) * n / max(1, n1 - n0), "MB": MB}))
+
+
+def table(rows: list[tuple[str, str, str]]) -> None:
+    for what, value, wanted in rows:
+        print(f"{what:62s} {value:>28s}  {wanted}")
+
+
+def on_cpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
+    devices, flight = jax.local_devices(), record(6000)
+    threads, kernel = len(devices), compiled("kernel.c")
+    rows: list[tuple[str, str, str]] = []
+    drawn: dict[str, Any] = {"throughput": {}}
+    for solver, wanted in (("exact", "<= 2.0"), ("rk4", "<= 1.8")):
+        pair = sizes.exact if solver == "exact" else sizes.rk4
+        r = against_c(kernel, flight, solver, pair, sizes.pairs, devices)
+        value = f"{r.ratio:.2f} ({r.low:.2f}-{r.high:.2f})"
+        rows.append((f"{solver}, {threads} threads: time / C's", value, wanted))
+        rows.append(("    a vehicle: ours, C [us]", f"{r.ours:.2f}, {r.theirs:.2f}", ""))
+        drawn["throughput"] |= {f"{solver}": r.ours, f"{solver} in C": r.theirs}
+    given, few = arrays(4096)[0], 256
+    others = {
+        "exact in NumPy, one thread": (in_numpy(flight, given, 4096), 4096, 1),
+        "exact in SciPy, one thread": (in_scipy(flight, few), few, 1),
+    }
+    numba = in_numba(flight, given, threads)
+    if numba is not None:
+        others["exact in Numba"] = (numba, 4096, 3)
+    for name, (run, n, times) in others.items():
+        us = per_vehicle(run, n, times)
+        rows.append((f"{name}: a vehicle [us]", f"{us:.1f}", ""))
+        drawn["throughput"][name] = us
+    for solver in ("exact", "rk4"):
+        pair = sizes.exact if solver == "exact" else sizes.rk4
+        one, all_ = (slope(flight, pair, solver, devices=d) for d in (devices[:1], devices))
+        value = f"{one / all_:.2f}"
+        rows.append((f"{solver}: {threads} devices over one", value, ">= 1.7 for two"))
+    one, two = (on_workers(flight, sizes.rk4[1], k) for k in (1, 2))
+    rows.append(("rk4: two dask workers, of ideal", f"{100 * one / two / 2:.0f} %", ">= 80 %"))
+    drawn["batch"] = {n: ours_at(record(1000), n) for n in sizes.batches}
+    drawn["length"] = {N: slope(record(N), (256, 1024), "exact", chunk=256) for N in sizes.lengths}
+    part, whole = memory_of(sizes.most // 4, 1000), memory_of(sizes.most, 1000)
+    linear = whole[0] / part[0] / 4
+    rows.append(
+        (f"{sizes.most} vehicles x 1000 samples: peak memory", f"{whole[1]:.0f} MB", "< 1 GB")
+    )
+    rows.append(("    time over four times that of a quarter", f"{linear:.3f}", "0.9 to 1.1"))
+    return rows, drawn
+
+
+def ours_at(flight: Flight, n: int) -> float:
+    """Microseconds a vehicle of a whole sweep of n in memory, compiled before."""
+
+    def run() -> None:
+        sweep(models.roll_on_stand, VEHICLE, flight, design(n), REDUCE)
+
+    run()
+    return 1e6 * seconds(run) / n
+
+
+def on_gpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
+    """The compiled part alone on a GPU, whole batches at once, and what a step of it takes."""
+    from heli_jax.sweeps.job import job
+    from heli_jax.sweeps.program import Program, arguments
+
+    flight, rows, drawn = record(6000), [], {}
+    for precision in ("float64", "float32"):
+        for solver in ("exact", "rk4"):
+            for n in (1000, 10_000, 100_000, 1_000_000):
+                wanted = job(
+                    models.roll_on_stand, VEHICLE, flight, design(n), REDUCE, solver=solver,
+                    substeps=SUBSTEPS, precision=precision,
+                )  # fmt: skip
+                program = Program(wanted, 0, jax.local_devices()[:1], n)
+                values = arguments(wanted, wanted.design.values(0, n))
+                jax.block_until_ready(program(values, n))
+                best = min(
+                    seconds(lambda p=program, v=values, n=n: jax.block_until_ready(p(v, n)))
+                    for _ in range(3)
+                )
+                steps = 6000 / 4 if solver == "exact" else 6000
+                rows.append((
+                    f"GPU, {solver}, {precision}, {n} vehicles",
+                    f"{1e6 * best / n:.3f} us, {1e6 * best / steps:.1f} us a step", "",
+                ))  # fmt: skip
+                drawn[(precision, solver, n)] = 1e6 * best / n
+    return rows, drawn
+
+
+def draw(path: Path, drawn: dict[str, Any], gpu: dict[Any, float]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots(2, 2).ravel()
+    names = sorted(drawn.get("throughput", {}), key=lambda n: drawn["throughput"][n])
+    axes[0].barh(names, [drawn["throughput"][n] for n in names])
+    axes[0].set(xscale="log", xlabel="a vehicle of 6000 samples [µs]")
+    for ax, key, text in ((axes[1], "batch", "vehicles of 1000 samples"),
+                          (axes[2], "length", "samples")):  # fmt: skip
+        points = drawn.get(key, {})
+        ax.loglog(list(points), list(points.values()), "o-")
+        ax.set(xlabel=text, ylabel="a vehicle [µs]")
+        ax.grid(alpha=0.3)
+    for kind in sorted({k[:2] for k in gpu}):
+        points = {n: v for (p, s, n), v in gpu.items() if (p, s) == kind}
+        axes[3].loglog(list(points), list(points.values()), "o-", label=" ".join(kind))
+    axes[3].set(xlabel="vehicles of 6000 samples", ylabel="a vehicle [µs]", title="GPU")
+    if gpu:
+        axes[3].legend()
+    else:
+        axes[3].text(0.5, 0.5, "no GPU here", ha="center", transform=axes[3].transAxes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+    print(f"figure: {path}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
+    parser.add_argument("--out", default="runs/benchmarks", help="folder of the figure")
+    parser.add_argument("--memory", nargs=2, type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory:
+        memory(*options.memory)
+        return
+    sizes = QUICK if options.quick else FULL
+    print(f"jax {jax.__version__}, {jax.local_devices()[0].device_kind}, 6000 samples")
+    gpu: dict[Any, float] = {}
+    if jax.default_backend() == "cpu":
+        rows, drawn = on_cpu(sizes)
+    else:
+        rows, gpu = on_gpu(sizes)
+        drawn = {}
+    table(rows)
+    draw(Path(options.out) / "sweeps.png", drawn, gpu)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""What is computed of the parameters alone leaves the loop, and nothing else changes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import models, naming
+from heli_jax.dynamics.model import zeros
+from heli_jax.simulation.hoist import hoisted
+
+
+def operations(function, *arguments):
+    """How often each operation stands in a function, those within others too."""
+    found = {}
+
+    def count(jaxpr):
+        for e in jaxpr.eqns:
+            found[e.primitive.name] = found.get(e.primitive.name, 0) + 1
+            for inner in jax.tree.leaves(e.params, is_leaf=lambda v: hasattr(v, "eqns")):
+                if hasattr(getattr(inner, "jaxpr", inner), "eqns"):
+                    count(getattr(inner, "jaxpr", inner))
+
+    count(jax.make_jaxpr(function)(*arguments).jaxpr)
+    return found
+
+
+@pytest.mark.parametrize("name", ["roll-on-stand", "helicopter", "helicopter-paper"])
+def test_the_equations_stay_as_they_are(vehicles_folder, name):
+    from heli_jax import load_vehicle
+
+    file = "bench-30.yaml" if name.startswith("roll") else "x-cell-60.yaml"
+    model, params = models.by_name(name), load_vehicle(vehicles_folder / file)
+    rng = np.random.default_rng(3)
+
+    def drawn(record):
+        return record(**{n: jnp.asarray(0.1 * rng.standard_normal()) for n in naming.names(record)})
+
+    x, u = drawn(model.State), drawn(model.Inputs)
+    if "Omega" in naming.names(model.State):
+        x = naming.replace(x, Omega=params.Omega)
+    values, field = hoisted(model.vector_field, params, zeros(model.State), zeros(model.Inputs))
+    for a, b in zip(
+        jax.tree.leaves(model.vector_field(params, x, u)), jax.tree.leaves(field(values, x, u)),
+        strict=True,
+    ):  # fmt: skip
+        assert a == b
+    before = sum(operations(model.vector_field, params, x, u).values())
+    assert sum(operations(field, values, x, u).values()) < before
+
+
+def test_no_division_by_a_parameter_is_left(bench30):
+    model = models.roll_on_stand
+    x, u = zeros(model.State), zeros(model.Inputs)
+    values, field = hoisted(model.vector_field, bench30, x, u)
+    assert operations(model.vector_field, bench30, x, u)["div"] > 3
+    assert "div" not in operations(field, values, x, u)
+
+
+def test_literals_constants_and_outputs_of_parameters_alone():
+    table = jnp.arange(3.0)
+
+    def function(p, x):
+        a = p["a"]
+        return {"alone": a * 2.0, "same": x, "number": 1.0, "both": jnp.sum(table * a) * x}
+
+    p = {"a": jnp.asarray(3.0)}
+    values, rest = hoisted(function, p, jnp.asarray(0.0))
+    found = rest(values, jnp.asarray(2.0))
+    assert found == {"alone": 6.0, "same": 2.0, "number": 1.0, "both": 18.0}
+    slope = jax.grad(lambda a: rest(hoisted(function, {"a": a}, 0.0)[0], jnp.asarray(2.0))["both"])
+    assert slope(jnp.asarray(3.0)) == 6.0
