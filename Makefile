@@ -33,6 +33,7 @@ test: .venv/.installed
 bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/identification.py
 	$(BIN)/python experiments/benchmarks/helicopter.py
+	$(BIN)/python experiments/benchmarks/sweeps.py
 
 clean:
 	rm -rf .venv runs .pytest_cache .ruff_cache

@@ -1,0 +1,76 @@
+"""Sweeps on dask workers, some of which die; and on this process, which is killed."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heli_jax import models, sweep
+from heli_jax.errors import InputError
+from heli_jax.sweeps import Between, Reduce, sobol
+
+ROOT = Path(__file__).parents[2]
+ROLL = models.roll_on_stand
+
+
+def pids(client):
+    return sorted(client.run(os.getpid).values())
+
+
+# dask closes a killed worker's pipes late, and Python's collector then warns.
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_worker_that_dies_costs_nothing(bench30, record):
+    pytest.importorskip("distributed")
+    from heli_jax.sweeps.cluster import connected
+
+    design = sobol({"Ixx": Between(0.02, 0.05), "a": Between(4.0, 6.0)}, 600)
+    reduce = {"rms": Reduce("rms", "roll"), "fit": Reduce("fit", "roll"), "mode": Reduce("modes")}
+    options = {"chunk": 32, "lanes": 16}
+    alone = sweep(ROLL, bench30, record, design, reduce, **options)
+    with connected(workers=2) as client:
+        killed = []
+
+        def kill(progress):
+            if progress.done > 100 and not killed:
+                killed.append(pids(client)[0])
+                os.kill(killed[0], signal.SIGKILL)
+
+        found = sweep(
+            ROLL, bench30, record, design, reduce, client=client, progress=kill, **options
+        )
+        assert killed
+        assert killed[0] not in pids(client)
+    for name in alone.variables:
+        assert alone[name].values.tobytes() == found[name].values.tobytes()
+    assert np.all(found["status"] == 0)
+
+
+def test_no_scheduler_ends_in_words(monkeypatch):
+    pytest.importorskip("distributed")
+    from heli_jax.sweeps import cluster
+
+    monkeypatch.setattr(cluster, "_CONNECT_S", 1)
+    with (
+        pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers"),
+        cluster.connected("tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_killed_and_resumed(tmp_path, monkeypatch):
+    """The experiment that shows it at full size, in small."""
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    survives = __import__("sweep_survives")
+    import subprocess
+
+    config = survives.configuration(tmp_path, n=6144, chunk=256, duration=20.0)
+    subprocess.run(
+        survives.command(config, tmp_path / "whole"), check=True, capture_output=True, cwd=tmp_path
+    )
+    found = survives.kills(config, tmp_path / "whole", tmp_path / "killed", 2, seed=1)
+    assert found.equal
+    assert found.hit >= 1
+    assert found.rewritten == 0
