@@ -279,14 +279,16 @@ def _sweep(options: argparse.Namespace) -> int:
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
     from heli_jax import config as configuration
     from heli_jax import generate, output
+    from heli_jax.config.sweeps import simulates, sweep_job
     from heli_jax.sweeps.run import Options, carry_out
 
     experiment = configuration.load(config, options.set)
-    made = generate.drive(experiment) if configuration.simulates(experiment) else None
-    job = configuration.sweep_job(experiment) if made is None else configuration.sweep_job(*made)
+    made = generate.drive(experiment) if simulates(experiment) else None
+    job = sweep_job(experiment) if made is None else sweep_job(*made)
     wanted = experiment.config.sweep
     assert wanted is not None
     out = out or run_directory.default_directory(config)
+    resolved = output.as_yaml(configuration.resolved(experiment))
     with output.sweep_progress() as progress, _client(options, config) as client:
         how = Options(
             resume=options.resume,
@@ -303,7 +305,8 @@ def _sweep(options: argparse.Namespace) -> int:
                 job,
                 out,
                 how,
-                files={"config.yaml": output.as_yaml(configuration.resolved(experiment))},
+                files={"config.yaml": resolved},
+                attributes={"configuration": resolved},
                 seed=wanted.seed or 0,
             )
         except KeyboardInterrupt:

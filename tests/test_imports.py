@@ -195,9 +195,26 @@ def test_the_package_itself_imports_nothing_heavy():
     assert run.stdout.strip() == "[]"
 
 
+def test_what_other_commands_import_is_without_the_sweeps_libraries():
+    program = (
+        "import sys\n"
+        "from heli_jax import config, generate, output\n"
+        "print(sorted({'zarr', 'xarray', 'pandas', 'distributed', 'scipy.stats'} & {*sys.modules}))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == "[]"
+
+
 def test_every_name_at_the_top_exists():
     for name in dir(heli_jax):
         assert getattr(heli_jax, name) is not None
     assert importlib.import_module("heli_jax.models") is heli_jax.models
     with pytest.raises(AttributeError, match="nothing"):
         heli_jax.nothing  # noqa: B018
+    sweeps = importlib.import_module("heli_jax.sweeps")
+    for name in dir(sweeps):
+        assert getattr(sweeps, name) is not None
+    with pytest.raises(AttributeError, match="nothing"):
+        sweeps.nothing  # noqa: B018

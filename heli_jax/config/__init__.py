@@ -4,7 +4,6 @@ from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import read_flights, signals
 from heli_jax.config.problems import disturbed, problem, rivals
 from heli_jax.config.schema import Config, SimulateConfig, StickConfig
-from heli_jax.config.sweeps import simulates, sweep_job
 
 __all__ = [
     "Config",
@@ -19,6 +18,4 @@ __all__ = [
     "resolved",
     "rivals",
     "signals",
-    "simulates",
-    "sweep_job",
 ]

@@ -4,34 +4,43 @@ A design says which values the axes take, element by element; reducers say what 
 run; `sweep` computes chunks of elements and writes each when it is done.
 """
 
-from heli_jax.sweeps.design import (
-    Between,
-    Design,
-    grid,
-    lhs,
-    listed,
-    product,
-    sobol,
-    table,
-    zipped,
-)
-from heli_jax.sweeps.job import Trajectories, Trimmed
-from heli_jax.sweeps.reducers import Reduce, Streaming
-from heli_jax.sweeps.run import sweep
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "Between",
-    "Design",
-    "Reduce",
-    "Streaming",
-    "Trajectories",
-    "Trimmed",
-    "grid",
-    "lhs",
-    "listed",
-    "product",
-    "sobol",
-    "sweep",
-    "table",
-    "zipped",
-]
+if TYPE_CHECKING:
+    from heli_jax.sweeps.design import Between as Between
+    from heli_jax.sweeps.design import Design as Design
+    from heli_jax.sweeps.design import grid as grid
+    from heli_jax.sweeps.design import lhs as lhs
+    from heli_jax.sweeps.design import listed as listed
+    from heli_jax.sweeps.design import product as product
+    from heli_jax.sweeps.design import sobol as sobol
+    from heli_jax.sweeps.design import table as table
+    from heli_jax.sweeps.design import zipped as zipped
+    from heli_jax.sweeps.job import Trajectories as Trajectories
+    from heli_jax.sweeps.job import Trimmed as Trimmed
+    from heli_jax.sweeps.reducers import Reduce as Reduce
+    from heli_jax.sweeps.reducers import Streaming as Streaming
+    from heli_jax.sweeps.run import sweep as sweep
+
+# Loaded when they are first used: the store's libraries take a second that other commands spare.
+_HOMES = {
+    **dict.fromkeys(
+        ("Between", "Design", "grid", "lhs", "listed", "product", "sobol", "table", "zipped"),
+        "design",
+    ),
+    **dict.fromkeys(("Trajectories", "Trimmed"), "job"),
+    **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
+    "sweep": "run",
+}
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'heli_jax.sweeps' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"heli_jax.sweeps.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOMES)

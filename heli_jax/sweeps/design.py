@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-import scipy.stats.qmc
 
 Columns = dict[str, np.ndarray]
 
@@ -168,6 +167,8 @@ class _Sampled:
 
     @functools.cached_property
     def _hypercube(self) -> np.ndarray:
+        import scipy.stats.qmc  # not before it is needed: slow
+
         rng = np.random.default_rng(self.seed)
         return scipy.stats.qmc.LatinHypercube(len(self.axes), rng=rng).random(self._n)
 
@@ -175,6 +176,8 @@ class _Sampled:
         if self.kind == "lhs":
             points = self._hypercube[start:stop]
         else:
+            import scipy.stats.qmc
+
             rng = np.random.default_rng(self.seed)
             engine = scipy.stats.qmc.Sobol(len(self.axes), rng=rng)
             if start:

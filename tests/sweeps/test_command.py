@@ -63,6 +63,8 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
     found = opened(out)
     np.testing.assert_allclose(found["Ixx"], np.linspace(0.02, 0.05, 6))
+    assert yaml.safe_load(found.attrs["configuration"])["sweep"]["design"] == "grid"
+    assert found.attrs["seed"] == 0
     # The resolved configuration makes the same sweep from anywhere.
     again = tmp_path / "again"
     assert cli.main(["sweep", str(out / "config.yaml"), "--out", str(again)]) == 0
