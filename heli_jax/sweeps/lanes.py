@@ -24,7 +24,7 @@ _CHUNK_S = 2.0
 """What a chunk should take [s], about: a kill costs as much, and writing is to be little of it."""
 _CHUNK_BYTES = 64e6
 _CHUNKS = 4
-"""at least, where there are enough elements, to see how it goes; twice as many for each of several
+"""about, where there are enough elements, to see how it goes; twice as many for each of several
 processes, to share the work evenly"""
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
 _ROOM = {"cpu": 1 << 16, "gpu": 1 << 18}
