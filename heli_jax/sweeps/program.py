@@ -31,6 +31,9 @@ RUNAWAY = 1e12
 
 _BLOCK = 4
 _TRIMMED = 1e-6
+_CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+"""XLA stays at 256 bits unless told, where elements side by side gain most from the widest vectors
+there are: roll model, 64 lanes, two cores: 1.5 times as fast. Without AVX-512 nothing changes."""
 
 
 class Given(NamedTuple):
@@ -295,10 +298,12 @@ def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, An
     def starts(numbers: Given, values: dict[str, Any]) -> Start:
         return _each(functools.partial(steady, plan, numbers), values, lanes)
 
+    options = _CPU_OPTIONS if devices[0].platform == "cpu" else None
     run = jax.jit(
         jax.shard_map(
             part, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
-        )
+        ),
+        compiler_options=options,
     )
     # Apart, since lineax does not work within shard_map.
     before = None if plan.trimmed is None else jax.jit(starts)
