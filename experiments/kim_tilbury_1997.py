@@ -31,9 +31,10 @@ from heli_jax.identification.metrics import Metrics, metrics
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.naming import asdict, replace, unit
 from heli_jax.report import style
-from heli_jax.report.files import fit_json, versions, write_json
+from heli_jax.report.files import fit_json, write_json
 from heli_jax.report.numbers import measured, number, percent
 from heli_jax.simulation.inputs import random_steps
+from heli_jax.versions import versions
 
 jax.config.update("jax_enable_x64", True)
 SEED, N, DT, STICK, NOISE, SIGMA_W, TAU_W = 1997, 5000, 0.02, 3e-6, 2e-3, 1.04, 1.0

@@ -267,7 +267,7 @@ def _sweep(options: argparse.Namespace) -> int:
         raise InputError("--resume: wanted is --out DIR too, the directory of the sweep")
     out = Path(options.out) if options.out else None
     if out is not None and not options.resume:
-        run_directory.require_free(out)
+        run_directory.require_free(out, ", or --resume")
     _prepare_jax()
     import jax
 
@@ -310,10 +310,8 @@ def _sweep(options: argparse.Namespace) -> int:
                 seed=wanted.seed or 0,
             )
         except KeyboardInterrupt:
-            kept = (
-                f"; what is finished is kept: --out {out} --resume goes on" if out.exists() else ""
-            )
-            _say(f"interrupted{kept}")
+            kept = f"what is finished is kept: --out {out} --resume goes on"
+            _say(f"interrupted; {kept if out.exists() else 'nothing was written'}")
             return INTERRUPTED
         except InputError:
             raise

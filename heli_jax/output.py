@@ -190,7 +190,7 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
     if out is None:
         tables.write_table(sys.stdout.buffer, columns)
         return
-    with _whole(out, "--out") as temporary:
+    with run_directory.whole_file(out, f"--out {out}") as temporary:
         tables.write_table(temporary, columns)
 
 
@@ -203,22 +203,8 @@ def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simu
     from heli_jax.report.view import write_view as write
 
     title, params = experiment.path.stem, experiment.vehicle.params
-    with _whole(out, "--view") as temporary:
+    with run_directory.whole_file(out, f"--view {out}") as temporary:
         write(temporary, simulated.runs, simulated.model, params, title, simulated.notes)
-
-
-@contextlib.contextmanager
-def _whole(out: Path, option: str) -> Iterator[Path]:
-    """A place beside `out` to write to, which becomes `out` at the end."""
-    temporary = out.with_name(f".{out.stem}.part{out.suffix}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        temporary.replace(out)
-    except OSError as e:
-        raise InputError(f"{option} {out}: cannot be written ({e.strerror or e})") from e
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

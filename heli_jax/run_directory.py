@@ -1,4 +1,4 @@
-"""A directory that appears whole or not at all."""
+"""Directories and files that appear whole or not at all."""
 
 import os
 import shutil
@@ -16,14 +16,14 @@ def default_directory(config: Path) -> Path:
     return Path("runs") / f"{config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
-def require_free(path: Path) -> None:
-    """Refuse a directory that exists, before any work is done.
+def require_free(path: Path, otherwise: str = "") -> None:
+    """Refuse a directory that exists, before any work is done; `otherwise` is what else is wanted.
 
     Raises:
         InputError: it exists, or its parent cannot hold it.
     """
     if path.exists():
-        raise InputError(f"--out {path}: exists already, wanted is a new directory")
+        raise InputError(f"--out {path}: exists already, wanted is a new directory{otherwise}")
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent
@@ -43,3 +43,21 @@ def whole(path: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+@contextmanager
+def whole_file(path: Path, where: str) -> Iterator[Path]:
+    """A place beside `path` to write to, which becomes `path` at the end.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        temporary.replace(path)
+    except OSError as e:
+        raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -96,15 +96,9 @@ def impossible(params: Mapping[str, float]) -> str | None:
     `params` are numbers by name; a name that is missing is not judged.
     """
     for name, value in params.items():
-        if name not in naming.names(Helicopter):
-            continue
-        if name in _MAY_BE_NEGATIVE:
-            continue
-        if name in _MAY_BE_ZERO:
-            if value < 0:
-                return f"{name} is {value:g}, wanted is zero or more"
-        elif value <= 0:
-            return f"{name} is {value:g}, wanted is more than zero"
+        if _too_small(name, value):
+            wanted = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
+            return f"{name} is {value:g}, wanted is {wanted}"
     r1, r2 = params.get("R1"), params.get("R2")
     if r1 is not None and r2 is not None and r1 >= r2:
         return (
@@ -121,14 +115,19 @@ def possible(params: Mapping[str, Any]) -> np.ndarray:
     judges one; a value that is not a number is not judged."""
     fine = np.asarray(True)
     for name, value in params.items():
-        if name in naming.names(Helicopter) and name not in _MAY_BE_NEGATIVE:
-            v = np.asarray(value)
-            fine = fine & ~(v < 0 if name in _MAY_BE_ZERO else v <= 0)
+        fine = fine & ~_too_small(name, np.asarray(value))
     if "R1" in params and "R2" in params:
         fine = fine & ~(np.asarray(params["R1"]) >= np.asarray(params["R2"]))
     if "B" in params:
         fine = fine & ~(np.asarray(params["B"]) > 1)
     return np.asarray(fine)
+
+
+def _too_small(name: str, value: Any) -> Any:
+    """Whether values [SI] of a constant are below what it can be."""
+    if name not in naming.names(Helicopter) or name in _MAY_BE_NEGATIVE:
+        return np.zeros(np.shape(value), bool)
+    return value < 0 if name in _MAY_BE_ZERO else value <= 0
 
 
 class Constant(NamedTuple):

@@ -82,7 +82,8 @@ def trim(
     spread = np.zeros(len(_unknowns(model)))
     for _ in range(_TRIES):
         found = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(spread)))
-        if _plausible(found) and (best is None or found.residual < best.residual):
+        sound = plausible(found) and np.isfinite(found.residual)
+        if sound and (best is None or found.residual < best.residual):
             best = found
         if best is not None and best.residual < _TOLERANCE:
             _check_sticks(model, params, best, condition, sticks)
@@ -211,11 +212,10 @@ def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]
     return guess, scale
 
 
-def _plausible(found: Trim) -> bool:
-    """The rotor turns, the blades push upwards, and the machine is not on its back."""
-    level = abs(float(found.state.phi)) < 1.5 and abs(float(found.state.theta)) < 1.5
-    turning = float(found.state.Omega) > 0 and float(found.inputs.x_throttle) > 0
-    return bool(np.isfinite(found.residual)) and turning and level
+def plausible(found: Trim) -> Any:
+    """Whether the rotor turns, the blades push upwards, and the machine is not on its back."""
+    level = (abs(found.state.phi) < 1.5) & (abs(found.state.theta) < 1.5)
+    return level & (found.state.Omega > 0) & (found.inputs.x_throttle > 0)
 
 
 def _check_sticks(

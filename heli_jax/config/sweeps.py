@@ -19,7 +19,7 @@ from heli_jax.flights.table import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
 from heli_jax.sweeps.design import Between, Design
-from heli_jax.sweeps.job import Job, Trajectories, Trimmed, job
+from heli_jax.sweeps.job import Job, Trajectories, Trimmed, axis_unit, job
 from heli_jax.sweeps.reducers import HOWS, LINEAR, Reduce, Streaming
 
 _DRAWN = ("seed", "sigma_w", "tau_w")
@@ -198,16 +198,8 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
     """What takes the axis's numbers to SI."""
     if axis.unit is None:
         return 1.0
-    kind, _, of = name.partition(".")
-    si: str | None = "s" if name == "delay" else "1"
-    if name in naming.names(model.Params):
-        si = naming.unit(model.Params, name)
-    elif kind == "initial" and of in naming.names(model.State):
-        si = naming.unit(model.State, of)
-    elif kind == "offset" and of in naming.names(model.Inputs):
-        si = naming.unit(model.Inputs, of)
     try:
-        return units.factor(axis.unit, si or "1")
+        return units.factor(axis.unit, axis_unit(model, name) or "1")
     except ValueError as e:
         raise ValueError(f"axes.{name}.unit: {e}") from e
 

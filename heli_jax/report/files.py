@@ -1,9 +1,7 @@
 """A fit as files: fit.json and the signals."""
 
-import importlib.metadata
 import json
 import math
-import platform
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +16,7 @@ from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.intervals import Intervals
 from heli_jax.identification.problem import Problem
 from heli_jax.report.card import card
-
-_PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
+from heli_jax.versions import versions
 
 
 class Further(NamedTuple):
@@ -27,12 +24,6 @@ class Further(NamedTuple):
 
     choice: Choice | None = None
     intervals: Intervals | None = None
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers came from."""
-    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {"python": platform.python_version(), **found}
 
 
 def fit_json(

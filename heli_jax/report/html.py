@@ -14,9 +14,10 @@ from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
-from heli_jax.report.files import Further, versions
+from heli_jax.report.files import Further
 from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
+from heli_jax.versions import versions
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""

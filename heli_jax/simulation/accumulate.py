@@ -12,9 +12,10 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import matrix
+from heli_jax.simulation.discretize import product, scalars
 from heli_jax.simulation.hoist import hoisted
 from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
-from heli_jax.simulation.solvers import Accumulating, Held, at
+from heli_jax.simulation.solvers import Accumulating, Held, advance, at, dot
 
 
 class Accumulated(NamedTuple):
@@ -34,38 +35,17 @@ def accumulate(
     flight: Any,
     update: Callable[[Any, Any, Any], Any],
     start: Any,
-    *,
-    data: Any = (),
-    dt: Any = None,
-    initial_state: Any = None,
-    solver: str | dfx.AbstractSolver | None = None,
-    substeps: int = 4,
-    block: int = 1,
-    adjoint: dfx.AbstractAdjoint | None = None,
+    **options: Any,
 ) -> tuple[Any, dfx.RESULTS]:
     """Reduce a run to a value without keeping it: for large batches.
 
-    At every sample value = update(value, outputs, data at that sample), from `start`; `data` is
-    a pytree of arrays (N,) such as the measured outputs. Other arguments as `simulate`; `block`
-    is the number of samples a step of solver "exact" (4 is fastest in batches of 64 on a CPU).
+    At every sample value = update(value, outputs, data at that sample), from `start`. Options as
+    `accumulated`.
 
     Returns:
         The final value and diffrax's result.
     """
-    found = accumulated(
-        model,
-        params,
-        flight,
-        update,
-        start,
-        data=data,
-        dt=dt,
-        initial_state=initial_state,
-        solver=solver,
-        substeps=substeps,
-        block=block,
-        adjoint=adjoint,
-    )
+    found = accumulated(model, params, flight, update, start, **options)
     return found.value, found.result
 
 
@@ -86,6 +66,10 @@ def accumulated(
     limits: bool = False,
 ) -> Accumulated:
     """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
+
+    `data` is a pytree of arrays (N,) such as the measured outputs. `block` is the number of samples
+    a step of solver "exact" (4 is fastest in batches of 64 on a CPU). Other arguments as
+    `simulate`.
 
     Raises:
         ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact.
@@ -147,16 +131,14 @@ def _in_blocks(
     A, B = matrix(held.discrete.Ad), matrix(held.discrete.Bd)
     space = jacobians(model, held.params)
     C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
-    rows, columns = [C], [B]
+    rows, columns, power = [C], [B], A
     for _ in range(m - 1):
-        rows.append(_times(rows[-1], A))
-        columns.append(_times(A, columns[-1]))
-    power = A
-    for _ in range(m - 1):
-        power = _times(A, power)
-    free = [_rows(row) for row in rows[1:]]
-    forced = [_rows(D)] + [_rows(_times(C, column)) for column in columns[:-1]]
-    ahead, driven = _rows(power), [_rows(columns[m - 1 - j]) for j in range(m)]
+        rows.append(product(rows[-1], A))
+        columns.append(product(A, columns[-1]))
+        power = product(A, power)
+    free = [scalars(row) for row in rows[1:]]
+    forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
+    ahead, driven = scalars(power), [scalars(column) for column in reversed(columns)]
     free, forced, ahead, driven = jax.lax.optimization_barrier((free, forced, ahead, driven))
 
     names = naming.names(model.Outputs)
@@ -172,9 +154,9 @@ def _in_blocks(
             return model.output(held.params, jax.tree.unflatten(structure, x), now)
         found = {}
         for i, name in enumerate(names):
-            total = _dot(free[j - 1][i], x)
+            total = dot(free[j - 1][i], x)
             for back in range(j + 1):
-                total = total + _dot(forced[back][i], u[j - back])
+                total = total + dot(forced[back][i], u[j - back])
             found[name] = total
         return model.Outputs(**found)
 
@@ -188,9 +170,9 @@ def _in_blocks(
         rows, now = given
         u = [[v[j] for v in rows] for j in range(m)]
         value = samples(x, value, u, now, m)
-        new = [_dot(row, x) for row in ahead]
+        new = [dot(row, x) for row in ahead]
         for j in range(m):
-            new = [v + _dot(row, u[j]) for v, row in zip(new, driven[j], strict=True)]
+            new = [v + dot(row, u[j]) for v, row in zip(new, driven[j], strict=True)]
         return (new, value), None
 
     def cut(v: Array) -> Array:
@@ -205,27 +187,5 @@ def _in_blocks(
     value = samples(x, value, u, jax.tree.map(lambda v: v[steps * m :], data), rest)
     last = list(x)
     for j in range(rest - 1):
-        last = [
-            _dot(a, last) + _dot(b, u[j])
-            for a, b in zip(held.discrete.Ad, held.discrete.Bd, strict=True)
-        ]
+        last = advance(held.discrete, last, u[j])
     return value, jax.tree.unflatten(structure, last)
-
-
-def _times(X: Array, Y: Array) -> Array:
-    """X Y as a sum of outer products: many small ones side by side are faster than with `@`."""
-    total = X[:, 0, None] * Y[0, None]
-    for k in range(1, X.shape[1]):
-        total = total + X[:, k, None] * Y[k, None]
-    return total
-
-
-def _rows(M: Array) -> Any:
-    return tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))
-
-
-def _dot(coefficients: Any, values: Any) -> Any:
-    total = coefficients[0] * values[0]
-    for c, v in zip(coefficients[1:], values[1:], strict=True):
-        total = total + c * v
-    return total

@@ -144,13 +144,13 @@ def moved(A: Float[Array, "n n"], f: Float[Array, " n"], g: Float[Array, " n"], 
     return Moved(P * (d[:, None] / d[None, :]), d * m, M * (d[:, None] * d[None, :]))
 
 
-def product(X: Float[Array, "n n *L"], Y: Float[Array, "n n *L"]) -> Float[Array, "n n *L"]:
-    """X Y; for small n as a sum of outer products, which takes a batch of them 5 times faster."""
-    n = X.shape[0]
-    if n > _SMALL:
+def product(X: Float[Array, "n k *L"], Y: Float[Array, "k m *L"]) -> Float[Array, "n m *L"]:
+    """X Y; for small k as a sum of outer products, which takes a batch of them 5 times faster."""
+    inner = X.shape[1]
+    if inner > _SMALL:
         return X @ Y if X.ndim == 2 else jnp.einsum("ijl,jkl->ikl", X, Y)
     total = X[:, 0, None] * Y[0, None]
-    for k in range(1, n):
+    for k in range(1, inner):
         total = total + X[:, k, None] * Y[k, None]
     return total
 
@@ -229,8 +229,9 @@ def _held(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
 
 def _hoisted(*matrices: Array) -> tuple[Any, ...]:
     """Matrices as scalars, behind a barrier so that XLA does not compute them at every step."""
-    scalars = tuple(
-        tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))
-        for M in matrices
-    )
-    return jax.lax.optimization_barrier(scalars)
+    return jax.lax.optimization_barrier(tuple(scalars(M) for M in matrices))
+
+
+def scalars(M: Float[Array, "n m"]) -> tuple[tuple[Any, ...], ...]:
+    """A matrix row by row as nested tuples of scalars."""
+    return tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))

@@ -97,13 +97,14 @@ class Exact(_Stateless):
 
 def advance(discrete: Discrete, x: Any, u: Any, before: Any = None) -> list[Any]:
     """x[k+1] from lists of scalars; `before` is the input still held from the sample before."""
-    new = [_dot(a, x) + _dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
+    new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
-        new = [v + _dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
+        new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
     return new
 
 
-def _dot(coefficients: Any, values: Any) -> Any:
+def dot(coefficients: Any, values: Any) -> Any:
+    """The sum of products of two lists of scalars, term by term from the first."""
     total = coefficients[0] * values[0]
     for c, v in zip(coefficients[1:], values[1:], strict=True):
         total = total + c * v

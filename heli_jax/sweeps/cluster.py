@@ -21,6 +21,7 @@ from heli_jax.errors import InputError
 from heli_jax.sweeps.job import Job
 from heli_jax.sweeps.lanes import split_for
 from heli_jax.sweeps.work import Split, Worker
+from heli_jax.versions import versions
 
 _RETRIES = 5
 _AHEAD = 3
@@ -88,8 +89,6 @@ def connected(
 
 
 def _versions() -> dict[str, str]:
-    from heli_jax.sweeps.run import versions
-
     return {n: v for n, v in versions().items() if n in ("heli_jax", "jax", "jaxlib")}
 
 

@@ -4,8 +4,11 @@ A design gives its values in slices, so that a sweep of any size takes little me
 Sobol sequence are computed where they are needed (a Latin hypercube and a table are held whole).
 """
 
+import dataclasses
 import functools
+import hashlib
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -58,6 +61,16 @@ class Design(Protocol):
         ...
 
 
+def digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of named arrays, whatever their order."""
+    found = hashlib.sha256()
+    for name in sorted(arrays):
+        v = np.ascontiguousarray(arrays[name])
+        found.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
+        found.update(v.tobytes())
+    return found.hexdigest()
+
+
 def _check_between(name: str, axis: Between) -> None:
     low, high = axis.lower, axis.upper
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -97,7 +110,6 @@ def _points(name: str, axis: Between | Sequence[float] | np.ndarray) -> np.ndarr
 class _Listed(NamedTuple):
     columns: Columns
     kind: str
-    source: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,14 +123,8 @@ class _Listed(NamedTuple):
         return {n: v[start:stop] for n, v in self.columns.items()}
 
     def describe(self) -> dict[str, Any]:
-        import hashlib
-
-        digest = hashlib.sha256()
-        for name, v in self.columns.items():
-            digest.update(f"{name}:{v.dtype.str}:{v.size}:".encode())
-            digest.update(np.ascontiguousarray(v).tobytes())
         found = {"design": self.kind, "axes": list(self.columns), "n": self.size}
-        return {**found, "sha256": digest.hexdigest()}
+        return {**found, "sha256": digest(self.columns)}
 
 
 class _Grid(NamedTuple):
@@ -193,20 +199,21 @@ class _Sampled:
 def _quiet_random(engine: Any, n: int) -> np.ndarray:
     """Points of a Sobol sequence; SciPy's warning that n is no power of two is left out, since a
     slice of a sequence never is one."""
-    import warnings
-
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The balance properties of Sobol")
         return engine.random(n)
 
 
-class _Product(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Combined:
     parts: tuple[Design, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(n for part in self.parts for n in part.names)
 
+
+class _Product(_Combined):
     @property
     def size(self) -> int:
         return math.prod(part.size for part in self.parts)
@@ -226,13 +233,7 @@ class _Product(NamedTuple):
         return {"design": "product", "of": [part.describe() for part in self.parts]}
 
 
-class _Zipped(NamedTuple):
-    parts: tuple[Design, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(n for part in self.parts for n in part.names)
-
+class _Zipped(_Combined):
     @property
     def size(self) -> int:
         return self.parts[0].size

@@ -18,7 +18,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import Design
+from heli_jax.sweeps.design import Design, digest
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]
@@ -266,7 +266,7 @@ def described(one: Job) -> dict[str, Any]:
             "samples": f.n_samples,
             "dt": f.dt,
             "known": dict(f.known),
-            "sha256": _digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
+            "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
         }
         for f in one.flights
     ]
@@ -291,7 +291,7 @@ def described(one: Job) -> dict[str, Any]:
         ],
         "pilot": None
         if one.pilot is None
-        else _digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(one.pilot))}),
+        else digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(one.pilot))}),
     }
 
 
@@ -303,6 +303,18 @@ def _reducer(one: Reduce) -> dict[str, Any]:
         found = {"how": getattr(how, "__qualname__", str(type(how))), "source": _source(how)}
     found |= {k: v for k, v in (("signal", one.signal), ("input", one.input)) if v is not None}
     return found | ({"gain": one.gain} if one.how == "margins" else {})
+
+
+def axis_unit(model: Model, name: str) -> str | None:
+    """The SI unit of an axis; None where it has none, as a seed, or there is no such axis."""
+    kind, _, of = name.partition(".")
+    if name in naming.names(model.Params):
+        return naming.unit(model.Params, name)
+    if kind == "initial" and of in naming.names(model.State):
+        return naming.unit(model.State, of)
+    if kind == "offset" and of in naming.names(model.Inputs):
+        return naming.unit(model.Inputs, of)
+    return {"delay": "s", "gain": "1"}.get(kind)
 
 
 def _source(function: Callable[..., Any]) -> str:
@@ -317,15 +329,6 @@ def _source(function: Callable[..., Any]) -> str:
         return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
     except (TypeError, OSError):
         return ""
-
-
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        v = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
-        digest.update(v.tobytes())
-    return digest.hexdigest()
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:

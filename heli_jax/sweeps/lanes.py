@@ -13,8 +13,7 @@ import jax
 from heli_jax import naming
 from heli_jax.sweeps.job import Job
 from heli_jax.sweeps.program import Program, arguments, shapes
-from heli_jax.sweeps.work import BLOCKS as _BLOCKS
-from heli_jax.sweeps.work import Split
+from heli_jax.sweeps.work import BLOCKS, Split
 
 _CPU, _GPU = 64, 1 << 17
 _CANDIDATES = {"cpu": (32, 64, 128, 256), "gpu": (1 << 13, 1 << 15, 1 << 17)}
@@ -50,11 +49,11 @@ def split_for(
     kind = "cpu" if devices[0].platform == "cpu" else "gpu"
     share = math.ceil(job.design.size / len(devices))
     if lanes is None:
-        lanes = min(_default(job, kind), _power(share / _BLOCKS))
+        lanes = min(_default(job, kind), _power(share / BLOCKS))
         if share > 8 * max(_CANDIDATES[kind]):
             lanes = _measured(job, devices, kind, lanes, memory, say)
     if chunk is None:
-        step = _BLOCKS * lanes * len(devices)
+        step = BLOCKS * lanes * len(devices)
         wanted = _power(_CHUNK_S * len(devices) / _guess(job))
         heaviest = max(_bytes(shapes(job, i)) for i in range(len(job.flights)))
         room = min(_ROOM[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
@@ -145,9 +144,9 @@ def _remembered(memory: Path | None) -> dict[str, Any]:
 
 
 def _time(job: Job, devices: tuple[Any, ...], lanes: int) -> float:
-    """Seconds an element takes, the best of three runs of two blocks a device."""
+    """Seconds an element takes, the best of three runs of as few blocks as a device has."""
     program = Program(job, 0, devices, lanes)
-    count = min(2 * lanes * len(devices), job.design.size)
+    count = min(BLOCKS * lanes * len(devices), job.design.size)
     values = arguments(job, job.design.values(0, count))
     jax.block_until_ready(program(values, count))
     best = math.inf

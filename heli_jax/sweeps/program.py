@@ -10,7 +10,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from heli_jax import naming
-from heli_jax.analysis.trim import STICKS, equilibrium
+from heli_jax.analysis.trim import STICKS, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.simulation.accumulate import accumulated
 from heli_jax.simulation.simulate import simulate
@@ -90,7 +90,7 @@ class Start(NamedTuple):
 def element(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | None) -> Found:
     """One element: the axes' values are scalars."""
     model, dtype = plan.model, numbers.dt.dtype
-    params, own = _params(plan, numbers, values)
+    params, moved = _params(plan, numbers, values)
     status = jnp.asarray(OK)
     inputs = numbers.inputs
     if start is None:
@@ -101,14 +101,17 @@ def element(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | N
         inputs = jax.tree.map(lambda u, stick: u + stick, inputs, start.sticks)
     state = naming.replace(
         state,
-        **{n.removeprefix("initial."): v for n, v in values.items() if n.startswith("initial.")},
+        **{n.removeprefix("initial."): v for n, v in moved.items() if n.startswith("initial.")},
     )
-    inputs = _moved(inputs, values)
+    inputs = _moved(inputs, moved)
     results: dict[str, Any] = {}
     kept: dict[str, Any] = {}
     if plan.simulated:
-        run = _streamed if plan.streamed else _whole
-        results, kept, last, outside = run(plan, numbers, params, state, inputs, values, own)
+        if plan.streamed:
+            run = _streamed(plan, numbers, params, state, inputs)
+        else:
+            run = _whole(plan, numbers, params, state, inputs, moved)
+        results, kept, last, outside = run
         for left in outside:
             status = jnp.where(left, OUT_OF_RANGE, status)
         sound = jnp.stack([jnp.abs(v) < RUNAWAY for v in jax.tree.leaves(last)])
@@ -124,9 +127,11 @@ def element(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | N
 
 
 def _params(plan: Plan, numbers: Given, values: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The element's parameters, and the axes that are among them."""
-    own = {n: v for n, v in values.items() if n in naming.names(plan.model.Params)}
-    return plan.model.Params(**{**numbers.base, **numbers.known, **own}), own
+    """The element's parameters, and the axes that are not among them."""
+    own = naming.names(plan.model.Params)
+    swept = {n: v for n, v in values.items() if n in own}
+    params = plan.model.Params(**{**numbers.base, **numbers.known, **swept})
+    return params, {n: v for n, v in values.items() if n not in own}
 
 
 def steady(plan: Plan, numbers: Given, values: dict[str, Any]) -> Start:
@@ -140,8 +145,7 @@ def steady(plan: Plan, numbers: Given, values: dict[str, Any]) -> Start:
         (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
     )
     found = equilibrium(whole, plain, condition, wind)
-    level = (jnp.abs(found.state.phi) < 1.5) & (jnp.abs(found.state.theta) < 1.5)
-    sound = (found.residual < _TRIMMED) & (found.state.Omega > 0) & level
+    sound = plausible(found) & (found.residual < _TRIMMED)
     for name, (low, high) in STICKS.items():
         stick = getattr(found.inputs, name)
         sound = sound & (stick >= low) & (stick <= high)
@@ -204,7 +208,7 @@ def _named(name: str, result: Any) -> dict[str, Any]:
 
 
 def _streamed(
-    plan: Plan, numbers: Given, params: Any, state: Any, inputs: Any, values: Any, own: Any
+    plan: Plan, numbers: Given, params: Any, state: Any, inputs: Any
 ) -> tuple[dict[str, Any], dict[str, Any], Any, list[Any]]:
     """The run reduced while it goes on."""
     update, start, data = _updating(plan, numbers)
@@ -227,10 +231,9 @@ def _streamed(
 
 
 def _whole(
-    plan: Plan, numbers: Given, params: Any, state: Any, inputs: Any, values: Any, own: Any
+    plan: Plan, numbers: Given, params: Any, state: Any, inputs: Any, moved: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any], Any, list[Any]]:
     """The whole run, for functions of it and for trajectories to keep."""
-    seeded = "seed" in values and "seed" not in own
     run: Trajectory = simulate(
         plan.model,
         params,
@@ -239,8 +242,8 @@ def _whole(
         initial_state=state,
         solver=solver_named(plan.solver),
         substeps=plan.substeps,
-        delay=None if "delay" in own else values.get("delay"),
-        key=jax.random.key(values["seed"]) if seeded else None,
+        delay=moved.get("delay"),
+        key=jax.random.key(moved["seed"]) if "seed" in moved else None,
         feedback=numbers.pilot,
     )
     update, start, data = _updating(plan, numbers)

@@ -1,8 +1,6 @@
 """sweep: a design of many runs, computed chunk by chunk into a store."""
 
-import importlib.metadata
 import math
-import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +20,8 @@ from heli_jax.sweeps.job import job as checked
 from heli_jax.sweeps.lanes import split_for
 from heli_jax.sweeps.reducers import Reduce
 from heli_jax.sweeps.summary import write_summary
-from heli_jax.sweeps.work import Split, Worker, chunks
+from heli_jax.sweeps.work import Split, Worker
+from heli_jax.versions import versions
 
 _SAMPLED = 64
 """elements on which float32 is compared with float64"""
@@ -140,11 +139,8 @@ def carry_out(
         _compute(job, store, options)
         return store.dataset().load()
     where = f"--out {out}"
-    if out.exists():
-        if not options.resume:
-            raise InputError(f"{where}: exists already, wanted is a new directory, or --resume")
-    else:
-        run_directory.require_free(out)
+    if not (options.resume and out.exists()):
+        run_directory.require_free(out, ", or --resume")
         split, words = _cut(job, options, words)
         try:
             with run_directory.whole(out) as directory:
@@ -223,7 +219,7 @@ def _compute(job: Job, store: stores.Store, options: Options) -> dict[str, Any]:
         written(chunk, results)
     seconds = time.perf_counter() - begin
     return {
-        "chunks": chunks(job, store.split),
+        "chunks": store.split.chunks(total),
         "computed_chunks": len(todo),
         "computed_elements": now - before,
         "seconds": seconds,
@@ -268,12 +264,6 @@ def float32_error(job: Job) -> dict[str, float | str]:
         largest = size.max(initial=0.0)
         found[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
     return found
-
-
-def versions() -> dict[str, str]:
-    """What computes: the packages that numbers depend on."""
-    found = {n: importlib.metadata.version(n) for n in ("heli_jax", "jax", "jaxlib", "numpy")}
-    return {**found, "python": platform.python_version()}
 
 
 def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:

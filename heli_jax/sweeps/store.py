@@ -20,7 +20,8 @@ from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
 from heli_jax.sweeps.job import Job, described, differences
-from heli_jax.sweeps.work import NOT_RUN, Split, Variable, chunks, variables
+from heli_jax.sweeps.program import NOT_RUN
+from heli_jax.sweeps.work import Split, Variable, variables
 
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}
 
@@ -36,10 +37,15 @@ class Store:
         # Looked up once: it takes as long as a write.
         self._arrays: dict[str, Any] = dict(group.arrays())
 
+    @property
+    def names(self) -> set[str]:
+        """The variables it has."""
+        return set(self._arrays)
+
     def done(self) -> np.ndarray:
         """Which chunks are finished, (number of chunks,)."""
         status = self._arrays["status"]
-        count = -(-status.shape[0] // self.split.chunk)
+        count = self.split.chunks(status.shape[0])
         firsts = [status[k * self.split.chunk] for k in range(count)]
         return np.asarray(firsts).reshape(-1) != NOT_RUN
 
@@ -82,35 +88,34 @@ def create(
     """A new store at `path`, or in memory.
 
     Raises:
-        InputError: the place cannot be written to.
+        OSError: the place cannot be written to.
     """
-    with _words(where):
-        store: Any = MemoryStore() if path is None else str(path)
-        group = zarr.create_group(store, zarr_format=3)
-        laid_out = variables(job)
-        size = job.design.size
-        for name, one in laid_out.items():
-            _array(group, name, one, size, split)
-        dims = {d for one in laid_out.values() for d in one.dims}
-        if "flight" in dims:
-            _labels(group, "flight", np.asarray([_label(job, i) for i in range(len(job.flights))]))
-        if "time" in dims and job.trajectories is not None:
-            flight, every = job.flights[0], job.trajectories.every
-            times = flight.times[::every]
-            _labels(group, "time", times, {"units": "s", "long_name": "from the first sample"})
-        group.attrs.update(
-            {
-                **attributes,
-                "title": f"sweep of {job.model.name}",
-                "axes": list(job.design.names),
-                "results": [n for n, one in laid_out.items() if not one.axis and n != "status"],
-                "split": split._asdict(),
-                "description": json.dumps(described(job), sort_keys=True),
-                # xarray makes coordinates of what is named here.
-                "coordinates": " ".join([*job.design.names, "status"]),
-            }
-        )
-        return Store(group, where)
+    store: Any = MemoryStore() if path is None else str(path)
+    group = zarr.create_group(store, zarr_format=3)
+    laid_out = variables(job)
+    size = job.design.size
+    for name, one in laid_out.items():
+        _array(group, name, one, size, split)
+    dims = {d for one in laid_out.values() for d in one.dims}
+    if "flight" in dims:
+        _labels(group, "flight", np.asarray([_label(job, i) for i in range(len(job.flights))]))
+    if "time" in dims and job.trajectories is not None:
+        flight, every = job.flights[0], job.trajectories.every
+        times = flight.times[::every]
+        _labels(group, "time", times, {"units": "s", "long_name": "from the first sample"})
+    group.attrs.update(
+        {
+            **attributes,
+            "title": f"sweep of {job.model.name}",
+            "axes": list(job.design.names),
+            "results": [n for n, one in laid_out.items() if not one.axis and n != "status"],
+            "split": split._asdict(),
+            "description": json.dumps(described(job), sort_keys=True),
+            # xarray makes coordinates of what is named here.
+            "coordinates": " ".join([*job.design.names, "status"]),
+        }
+    )
+    return Store(group, where)
 
 
 def _label(job: Job, i: int) -> str:
@@ -154,8 +159,7 @@ def reopen(path: Path, job: Job, where: str) -> Store:
     try:
         store = Store(zarr.open_group(str(path), mode="r+"), where)
         old = json.loads(store.attributes["description"])
-        assert {"status", *job.design.names} <= set(store._arrays)
-    except (OSError, KeyError, ValueError, TypeError, AssertionError) as e:
+    except (OSError, KeyError, ValueError, TypeError) as e:
         raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
     wrong = differences(old, json.loads(json.dumps(described(job))))
     if wrong:
@@ -164,7 +168,9 @@ def reopen(path: Path, job: Job, where: str) -> Store:
             f"{where}: {path} is of another sweep: {wrong[0]}{more}; wanted is the same, or "
             "another --out"
         )
-    assert chunks(job, store.split) == store.done().size
+    missing = sorted(variables(job).keys() - store.names)
+    if missing:
+        raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
     return store
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from heli_jax.errors import InputError
+from heli_jax import run_directory
 from heli_jax.sweeps.job import Job
 from heli_jax.sweeps.program import MEANINGS, OK
 
@@ -23,14 +23,9 @@ def write_summary(
     Raises:
         InputError: it cannot be written.
     """
-    temporary = path.with_suffix(".part")
-    try:
-        text = json.dumps(summary(dataset, job, timing), indent=1, allow_nan=False)
+    text = json.dumps(summary(dataset, job, timing), indent=1, allow_nan=False)
+    with run_directory.whole_file(path, f"{where}: summary.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as e:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{where}: summary.json cannot be written ({e.strerror or e})") from e
 
 
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
@@ -94,17 +89,17 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.nd
         badness = -values if one.how in _SMALL_IS_BAD else np.abs(values)
         badness = badness.reshape(len(fine), -1).max(axis=1)
         badness = np.where(fine & np.isfinite(badness), badness, -np.inf)
-        count = min(count, int(np.count_nonzero(badness > -np.inf)))
-        if count:
-            top = np.argpartition(badness, -count)[-count:]
+        few = min(count, int(np.count_nonzero(badness > -np.inf)))
+        if few:
+            top = np.argpartition(badness, -few)[-few:]
             found[name] = top[np.argsort(-badness[top], kind="stable")]
     return found
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
-    rows = []
-    for k in elements:
-        value = dataset[name].to_numpy()[k]
-        axes = {n: float(dataset[n].to_numpy()[k]) for n in job.design.names}
-        rows.append({"element": int(k), "value": np.asarray(value).tolist(), "axes": axes})
-    return rows
+    values = dataset[name].to_numpy()[elements].tolist()
+    axes = {n: dataset[n].to_numpy()[elements].astype(np.float64) for n in job.design.names}
+    return [
+        {"element": int(k), "value": v, "axes": {n: float(a[i]) for n, a in axes.items()}}
+        for i, (k, v) in enumerate(zip(elements, values, strict=True))
+    ]

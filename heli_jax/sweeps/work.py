@@ -10,12 +10,10 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.margins import margins
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.job import Job
+from heli_jax.sweeps.job import Job, axis_unit
 from heli_jax.sweeps.program import (
     DIVERGED,
     MEANINGS,
-    NOT_RUN,
-    OK,
     OUT_OF_RANGE,
     Found,
     Program,
@@ -49,6 +47,10 @@ class Split(NamedTuple):
     """elements written at a time"""
     lanes: int
     """elements computed side by side on a device"""
+
+    def chunks(self, size: int) -> int:
+        """How many chunks a sweep of so many elements has."""
+        return -(-size // self.chunk)
 
 
 def variables(job: Job) -> dict[str, Variable]:
@@ -106,19 +108,18 @@ def _words(unit: str | None, meaning: str) -> dict[str, Any]:
 
 
 def _axis_words(job: Job, name: str) -> dict[str, Any]:
-    model = job.model
-    if name in naming.names(model.Params):
-        return _words(naming.unit(model.Params, name), naming.meaning(model.Params, name))
     kind, _, of = name.partition(".")
-    if kind == "initial":
-        return _words(naming.unit(model.State, of), f"{of} at the first sample")
-    if kind == "offset":
-        return _words(naming.unit(model.Inputs, of), f"added to {of}")
-    if kind == "gain":
-        return _words("1", f"factor of {of}")
-    if kind == "delay":
-        return _words("s", "the inputs act this much later")
-    return _words(None, "seed of the disturbance")
+    if name in naming.names(job.model.Params):
+        meaning = naming.meaning(job.model.Params, name)
+    else:
+        meaning = {
+            "initial": f"{of} at the first sample",
+            "offset": f"added to {of}",
+            "gain": f"factor of {of}",
+            "delay": "the inputs act this much later",
+            "seed": "seed of the disturbance",
+        }[kind]
+    return _words(axis_unit(job.model, name), meaning)
 
 
 def _result_words(job: Job, name: str) -> dict[str, Any]:
@@ -236,14 +237,3 @@ def _eigenvalues(A: np.ndarray) -> np.ndarray:
     values = np.linalg.eigvals(np.where(finite[:, None, None], A, 0.0)).astype(np.complex128)
     order = np.lexsort((values.imag, np.abs(values)), axis=1)
     return np.where(finite[:, None], np.take_along_axis(values, order, axis=1), np.nan)
-
-
-def chunks(job: Job, split: Split) -> int:
-    """How many chunks the sweep has."""
-    return -(-job.design.size // split.chunk)
-
-
-__all__ = [
-    "DIVERGED", "MEANINGS", "NOT_RUN", "OK", "OUT_OF_RANGE", "Split", "Variable", "Worker",
-    "chunks", "variables",
-]  # fmt: skip
