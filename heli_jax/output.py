@@ -282,11 +282,13 @@ def print_sweep(out: Path) -> None:
         one = worst_ones[0]
         at = ", ".join(f"{n} = {v:.4g}" for n, v in one["axes"].items())
         print(f"worst {name}: element {one['element']}, {at}")
+    for note in found["notes"]:
+        print(f"! {note}")
     timing = found["timing"]
     if timing["computed_elements"]:
         print(
             f"{timing['computed_elements']} elements in {timing['seconds']:.3g} s "
-            f"({timing['elements_per_s']:.3g} a second)"
+            f"({timing['elements_per_s']:.3g} a second, with compilation)"
         )
     print(f"store: {out / 'sweep.zarr'}")
 

@@ -110,14 +110,16 @@ def needed_but_missing(model: Model, params: Any) -> list[str]:
     """The parameters that are NaN (not given) and that the model reads, in field order."""
     params = plain(params)
     open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    return [n for n in open_ if reads(model, params, n)]
+
+
+def reads(model: Model, params: Any, name: str) -> bool:
+    """Whether the rates or the outputs depend on a parameter, where states and inputs are one."""
     one = np.float64(1.0)
+    others = {n: one for n, v in naming.asdict(params).items() if np.isnan(v)}
+    filled = naming.replace(plain(params), **{**others, name: np.float64(np.nan)})
     x = model.State(**dict.fromkeys(naming.names(model.State), one))
     u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
-
-    def reads(name: str) -> bool:
-        filled = naming.replace(params, **{n: one for n in open_ if n != name})
-        with np.errstate(all="ignore"):
-            parts = field_and_output(model, filled, x, u)
-        return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
-
-    return [n for n in open_ if reads(n)]
+    with np.errstate(all="ignore"):
+        parts = field_and_output(model, filled, x, u)
+    return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))

@@ -12,7 +12,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_whole
-from heli_jax.dynamics.model import Model, needed_but_missing
+from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.simulation.simulate import substeps_for
@@ -315,6 +315,26 @@ def axis_unit(model: Model, name: str) -> str | None:
     if kind == "offset" and of in naming.names(model.Inputs):
         return naming.unit(model.Inputs, of)
     return {"delay": "s", "gain": "1"}.get(kind)
+
+
+def unread(one: Job) -> list[str]:
+    """The axes that are parameters which the model does not read, so that no run depends on them.
+
+    Tried at one point of the states and inputs; a model that reads a parameter elsewhere alone has
+    it here by mistake.
+    """
+    model = one.model
+    params = model.Params(**one.params)
+    axes = [n for n in one.design.names if n in naming.names(model.Params)]
+    drawn = model.noise if "seed" in one.design.names else None
+
+    def else_read(name: str) -> bool:
+        missing = naming.replace(plain(params), **{name: np.float64(np.nan)})
+        with np.errstate(all="ignore"):
+            parts = (model.initial_state(missing), None if drawn is None else drawn(missing))
+        return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
+
+    return [n for n in axes if not reads(model, params, n) and not else_read(n)]
 
 
 def _source(function: Callable[..., Any]) -> str:

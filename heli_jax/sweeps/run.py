@@ -15,7 +15,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.design import Design, table
-from heli_jax.sweeps.job import Job, Precision, Trajectories, Trimmed
+from heli_jax.sweeps.job import Job, Precision, Trajectories, Trimmed, unread
 from heli_jax.sweeps.job import job as checked
 from heli_jax.sweeps.lanes import split_for
 from heli_jax.sweeps.reducers import Reduce
@@ -133,7 +133,12 @@ def carry_out(
     Raises:
         InputError: as `sweep`.
     """
-    words = {**(attributes or {}), "seed": seed, "versions": versions()}
+    notes = [
+        f"axes.{n}: {job.model.name} does not read {n}: no run depends on it" for n in unread(job)
+    ]
+    for note in notes:
+        options.say(note)
+    words = {**(attributes or {}), "seed": seed, "versions": versions(), "notes": notes}
     if out is None:
         store = stores.create(None, job, *_cut(job, options, words), "the sweep")
         _compute(job, store, options)

@@ -52,6 +52,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "timing": timing,
         "versions": dataset.attrs["versions"],
         "seed": dataset.attrs["seed"],
+        "notes": dataset.attrs.get("notes", []),
     }
     if "float32_error" in dataset.attrs:
         found["float32_error"] = dataset.attrs["float32_error"]

@@ -67,6 +67,14 @@ def test_every_reducer_is_what_numpy_makes_of_the_run(bench30, record, solver):
     assert not found["status"].any()
 
 
+def test_an_axis_that_changes_nothing_says_so(bench30, record):
+    design = grid({"Ixx": [0.02, 0.03], "Iyy": [0.1], "gain.x_roll": [1.0]})
+    found = sweep(ROLL, bench30, record, design, {"peak": Reduce("peak", "roll")})
+    assert found.attrs["notes"] == [
+        "axes.Iyy: roll-on-stand does not read Iyy: no run depends on it"
+    ]
+
+
 def test_the_labels_say_what_stands_there(bench30, record):
     reduce = {"peak": Reduce("peak", "roll"), "fit": Reduce("fit", "roll")}
     found = sweep(ROLL, bench30, record, grid({"Ixx": [0.02, 0.03]}), reduce)
@@ -172,6 +180,7 @@ def test_a_seed_draws_the_disturbance(bench30, record):
     )
     design = product(listed({"seed": [4, 5]}), listed({"sigma_w": [0.0, 1.0]}))
     found = sweep(model, params, record, design, {"rms": Reduce("rms", "roll")})
+    assert found.attrs["notes"] == []
     quiet = simulate(ROLL, bench30, record).outputs.roll
     still = np.sqrt(np.mean(quiet**2))
     np.testing.assert_allclose(found["rms"].values[[0, 2]], still, rtol=1e-9)
