@@ -3,9 +3,11 @@
 import argparse
 import contextlib
 import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,17 +30,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     converge; 130 interrupted.
     """
     options = _parser().parse_args(arguments)
+    with _interrupts() as seen:
+        try:
+            return options.run(options)
+        except KeyboardInterrupt:
+            _say("interrupted; nothing was written")
+            return INTERRUPTED
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return DONE
+        except Exception as e:
+            if seen:
+                _say("interrupted")
+                return INTERRUPTED
+            if not isinstance(e, InputError):
+                raise
+            _say(" ".join(str(e).split()))
+            return WRONG_INPUT
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """The interrupts that came, also those that a library on the way makes another error of."""
+    seen: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or before is not signal.default_int_handler:
+        yield seen  # another's, or interrupts are ignored
+        return
+
+    def note(number: int, frame: Any) -> None:
+        seen.append(number)
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
     try:
-        return options.run(options)
-    except InputError as e:
-        _say(" ".join(str(e).split()))
-        return WRONG_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted; nothing was written")
-        return INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
+from heli_jax import cli
 from heli_jax.cli import main
+from heli_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 TREX = ROOT.parent / "shared" / "data" / "trex550" / "Pitchtest.csv"
@@ -365,6 +367,23 @@ def test_usage_and_places_to_write(bench, capsys):
     refused(capsys, ["fit", bench, "--out", bench.parent / "there"], "exists already")
     refused(capsys, ["simulate", bench, "--out", bench.parent / "x.doc"], ".csv or .parquet")
     refused(capsys, ["info", bench.parent / "none.csv"], "none.csv")
+
+
+def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys):
+    def lowered(options):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as e:
+            raise InputError("bench.yaml: fit: cannot be lowered") from e
+
+    monkeypatch.setattr(cli, "_info", lowered)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["info", "log.csv"]) == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == "heli-jax: interrupted\n"
 
 
 def test_interrupt_leaves_nothing_behind(bench):
