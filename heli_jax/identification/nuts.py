@@ -61,6 +61,8 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
 
+    # Traced once each, where blackjax asks for them ten times.
+    @jax.jit
     def density(xi: Array) -> Array:
         return log_posterior(at.layout, at.data, at.noise, at.z + root @ xi)
 
@@ -69,6 +71,7 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
         return density(xi)
 
     # Few unknowns and long records: the gradient by forward mode, as everywhere here.
+    @jax.jit
     def primal(xi: Array) -> tuple[Array, Array]:
         value, push = jax.linearize(density, xi)
         return value, jax.vmap(push)(jnp.eye(xi.shape[0], dtype=xi.dtype))
