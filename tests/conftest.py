@@ -48,6 +48,11 @@ _MAPPED = 30_000
 kernel takes some, and past them the process dies."""
 
 
+# What is imported lives as long as the process; tracing makes millions of objects beside it.
+gc.freeze()
+gc.set_threshold(50_000, 20, 50)
+
+
 @pytest.fixture(autouse=True)
 def _programs_are_let_go():
     began = time.monotonic()
