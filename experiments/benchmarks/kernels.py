@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-FLAGS = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
-if platform.machine() == "x86_64":
-    FLAGS += ["-mprefer-vector-width=512"]  # as ours; gcc stays at 256 bits unless told
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
+WIDE = ("-mprefer-vector-width=512",) if platform.machine() == "x86_64" else ()
+"""as wide as ours; gcc stays at 256 bits unless told"""
 
 
-def compiled(source: str) -> Any:
-    """The library of a C file of this folder."""
+def compiled(source: str, more: tuple[str, ...] = ()) -> Any:
+    """The library of a C file of this folder, compiled with `FLAGS` and more."""
     out = Path(tempfile.mkdtemp()) / "kernel.so"
     file = Path(__file__).parent / source
-    subprocess.run(["gcc", *FLAGS, str(file), "-o", str(out), "-lm"], check=True)
+    subprocess.run(["gcc", *FLAGS, *more, str(file), "-o", str(out), "-lm"], check=True)
     return ctypes.CDLL(str(out))
 
 
