@@ -173,7 +173,7 @@ def simulation_against_c(flight: Flight, solver: str) -> tuple[float, ...]:
 
         def scalars(i: jax.Array) -> jax.Array:
             d = discretize(models.roll_on_stand, replace(VEHICLE, Ixx=i), jnp.asarray(DT))
-            return jnp.stack(jax.tree.leaves((d.Ad, d.Bd)))
+            return jnp.concatenate([d.Ad.ravel(), d.Bd.ravel()])
 
         coef = np.ascontiguousarray(np.asarray(jax.vmap(scalars)(jnp.asarray(Ixx))).T)
 

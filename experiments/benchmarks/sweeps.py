@@ -114,7 +114,7 @@ def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
 
     def scalars(Ixx: Any, If: Any) -> Any:
         d = discretize(models.roll_on_stand, replace(VEHICLE, Ixx=Ixx, If=If), jnp.asarray(DT))
-        return jnp.stack(jax.tree.leaves((d.Ad, d.Bd)))
+        return jnp.concatenate([d.Ad.ravel(), d.Bd.ravel()])
 
     mapped = jax.jit(lambda v: jax.lax.map(lambda p: scalars(*p), v, batch_size=64))
     coefficients = np.asarray(mapped((values["Ixx"], values["If"]))).T

@@ -103,23 +103,17 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
     n, p = x0.shape[0], y.shape[1]
     # Behind barriers every number is computed once: XLA would compute each for every use.
     once = jax.lax.optimization_barrier
-    a, columns, Q, c, r = once(
-        (
-            [[system.Ad[i, j] for j in range(n)] for i in range(n)],
-            list(system.Ad.T),
-            list(system.Q),
-            [[system.C[k, j] for j in range(n)] for k in range(p)],
-            list(R),
-        )
-    )
+    Ad, Q, C, R = once((system.Ad, system.Q, system.C, R))
 
     def step(carry: tuple[Array, Any], sample: tuple[Any, Array]) -> tuple[Any, Any]:
         x, P = carry
         y, w = sample
+        a = [[Ad[i, j] for j in range(n)] for i in range(n)]
+        c = [[C[k, j] for j in range(n)] for k in range(p)]
         errors, variances = [], []
         for k in range(p):
             h = _sum(P[i] * c[k][i] for i in range(n))
-            s = _sum(h[i] * c[k][i] for i in range(n)) + r[k]
+            s = _sum(h[i] * c[k][i] for i in range(n)) + R[k]
             seen = jnp.isfinite(y[k])
             e = jnp.where(seen, y[k], 0.0) - _sum(x[i] * c[k][i] for i in range(n))
             g = jnp.where(seen, 1.0 / s, 0.0)
@@ -129,9 +123,9 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
             x, P = once((x, P))
             errors.append(jnp.where(seen, e, jnp.nan))
             variances.append(jnp.where(seen, s, jnp.nan))
-        x = _sum(columns[i] * x[i] for i in range(n)) + w
+        x = _sum(Ad[:, i] * x[i] for i in range(n)) + w
         M = once([_sum(P[k] * a[i][k] for k in range(n)) for i in range(n)])
-        P = [_sum(columns[k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)]
+        P = [_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)]
         return (x, P), (errors, variances)
 
     samples = (list((y - system.feed).T), system.drive)

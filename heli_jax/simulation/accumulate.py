@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.blocks import matrix
 from heli_jax.simulation.discretize import product, scalars
 from heli_jax.simulation.hoist import hoisted
 from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
@@ -92,6 +91,7 @@ def accumulated(
     if block > 1 and watched is None:
         value, state = _in_blocks(model, held, block, x0, update, start, data)
         return Accumulated(value, state, {}, dfx.RESULTS.successful)
+    held = held.in_scalars()
     if held.discrete is None:
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
@@ -128,7 +128,7 @@ def _in_blocks(
     of it; written out sample by sample it would compute every sample from x[k] again.
     """
     assert held.discrete is not None
-    A, B = matrix(held.discrete.Ad), matrix(held.discrete.Bd)
+    A, B, _ = held.discrete
     space = jacobians(model, held.params)
     C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
     rows, columns, power = [C], [B], A
@@ -185,7 +185,7 @@ def _in_blocks(
     rest = n - steps * m
     u = [[v[steps * m + j] for v in U] for j in range(rest)]
     value = samples(x, value, u, jax.tree.map(lambda v: v[steps * m :], data), rest)
-    last = list(x)
+    last, discrete = list(x), held.discrete.in_scalars()
     for j in range(rest - 1):
-        last = advance(held.discrete, last, u[j])
+        last = advance(discrete, last, u[j])
     return value, jax.tree.unflatten(structure, last)

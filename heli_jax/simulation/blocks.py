@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.solvers import Held, advance, at
+from heli_jax.simulation.discretize import product
+from heli_jax.simulation.solvers import Held, at
 
 
 def blockwise(held: Held, m: int, x0: Any) -> Any:
@@ -21,21 +21,18 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
     """
     assert held.discrete is not None
-    A = matrix(held.discrete.Ad)
-    B, U = columns(held)
+    A, (B, U) = held.discrete.Ad, columns(held)
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
     U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
     powers, Am = _powers(A, m)
     response = powers @ B
     w = jnp.einsum("kjr,jnr->kn", U, response[::-1])
-    eye = tuple(tuple(row) for row in jnp.eye(size, dtype=A.dtype))
-    coarse = Discrete(tuple(tuple(row) for row in Am), eye, None)
 
-    def step(x: Any, w: Any) -> tuple[Any, Any]:
-        return advance(coarse, x, w), jnp.stack(x)
+    def step(x: Array, w: Array) -> tuple[Array, Array]:
+        return jnp.sum(Am * x[None, :], axis=1) + w, x
 
-    _, starts = jax.lax.scan(step, jax.tree.leaves(x0), list(w.T))
+    _, starts = jax.lax.scan(step, jnp.stack(jax.tree.leaves(x0)), w)
     lag = jnp.arange(m)[:, None] - 1 - jnp.arange(m)[None, :]
     kept = (lag >= 0)[:, :, None]
 
@@ -48,27 +45,24 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(x0), [one(i) for i in range(size)])
 
 
-def matrix(rows: Any) -> Array:
-    """An array of nested tuples of scalars."""
-    return jnp.stack([jnp.stack(list(row)) for row in rows])
-
-
 def columns(held: Held) -> tuple[Array, Array]:
     """B (n, r) and what it multiplies (N, r): the inputs now, then those still held before."""
     assert held.discrete is not None
     now = jax.tree.leaves(held.inputs)
     n = now[0].shape[0]
-    B = matrix(held.discrete.Bd)
+    B = held.discrete.Bd
     if held.delay is None:
         return B, jnp.stack(now, axis=1)
     k = jnp.arange(n) - held.delay[0]
     both = [*jax.tree.leaves(at(held.inputs, k)), *jax.tree.leaves(at(held.inputs, k - 1))]
-    return jnp.concatenate([B, matrix(held.discrete.Bp)], axis=1), jnp.stack(both, axis=1)
+    return jnp.concatenate([B, held.discrete.Bp], axis=1), jnp.stack(both, axis=1)
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:
-    """A^0 ... A^(m-1) and A^m for m a power of two, by doubling."""
-    powers, top = jnp.eye(A.shape[0], dtype=A.dtype)[None], A
-    while powers.shape[0] < m:
-        powers, top = jnp.concatenate([powers, powers @ top]), top @ top
+    """A^0 ... A^(m-1) and A^m."""
+
+    def step(P: Array, _: None) -> tuple[Array, Array]:
+        return product(P, A), P
+
+    top, powers = jax.lax.scan(step, jnp.eye(A.shape[0], dtype=A.dtype), None, length=m)
     return powers, top

@@ -175,7 +175,7 @@ def _balance(M: Float[Array, "n n *L"]) -> Float[Array, "n *L"]:
 
 
 class Discrete(NamedTuple):
-    """x[k+1] = Ad x[k] + Bd u[k], as nested tuples of scalars.
+    """x[k+1] = Ad x[k] + Bd u[k], in matrices, or in nested tuples of scalars (`in_scalars`).
 
     With a delayed input, `Bp` multiplies the sample that is still held at the start of the
     interval; otherwise it is None.
@@ -185,9 +185,13 @@ class Discrete(NamedTuple):
     Bd: Any
     Bp: Any
 
+    def in_scalars(self) -> "Discrete":
+        """As nested tuples."""
+        return _once(Discrete(*(None if M is None else scalars(M) for M in self)))
+
 
 def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete:
-    """The zero-order-hold equivalent of a linear model for steps of `dt` [s].
+    """The zero-order-hold equivalent of a linear model for steps of `dt` [s], in matrices.
 
     `late` [s], within [0, dt], is the part of each interval in which the sample before is still
     held: x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] + G(dt-late) u[k].
@@ -195,13 +199,15 @@ def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
     if late is None:
-        Ad, Bd = _hoisted(*_held(A, B, dt))
-        return Discrete(Ad, Bd, None)
+        return _once(Discrete(*_held(A, B, dt), None))
     late = jnp.asarray(late, A.dtype)
     first, second = _held(A, B, late), _held(A, B, dt - late)
-    Ad, Bd, Bp = second[0] @ first[0], second[1], second[0] @ first[1]
-    Ad, Bd, Bp = _hoisted(Ad, Bd, Bp)
-    return Discrete(Ad, Bd, Bp)
+    return _once(Discrete(second[0] @ first[0], second[1], second[0] @ first[1]))
+
+
+def _once(discrete: Discrete) -> Discrete:
+    """Behind a barrier, so that XLA does not compute it at every step, nor for every use."""
+    return jax.lax.optimization_barrier(discrete)
 
 
 def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
@@ -225,11 +231,6 @@ def _held(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
     M = jnp.zeros((n + m, n + m), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     E = expm(M * dt)
     return E[:n, :n], E[:n, n:]
-
-
-def _hoisted(*matrices: Array) -> tuple[Any, ...]:
-    """Matrices as scalars, behind a barrier so that XLA does not compute them at every step."""
-    return jax.lax.optimization_barrier(tuple(scalars(M) for M in matrices))
 
 
 def scalars(M: Float[Array, "n m"]) -> tuple[tuple[Any, ...], ...]:

@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.blocks import blockwise, columns, matrix
+from heli_jax.simulation.blocks import blockwise, columns
 from heli_jax.simulation.discretize import discretize, moved, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
 from heli_jax.simulation.solvers import (
@@ -133,6 +134,7 @@ def simulate(
         _require_blocks(method, block, events)
         states, result = blockwise(held, block, x0), dfx.RESULTS.successful
     else:
+        held = held.in_scalars()
         states, result, dtype = None, None, jax.tree.leaves(x0)[0].dtype
         if events:
             over = functools.partial(any_over, events, params)
@@ -232,7 +234,7 @@ def held_columns(
     B, U = columns(held)
     n = U.shape[0]
     acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n)
-    return matrix(held.discrete.Ad), U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
+    return held.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
 
 
 def _require_blocks(method: Any, block: int, events: Any) -> None:
@@ -257,10 +259,8 @@ def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tup
         return Noisy(method, functools.partial(_kick, model, held.params, held.dt, feedback)), held
     L = square_root(process_noise(model, held.params, dt))
     draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
-    rows = tuple((*b, *row) for b, row in zip(held.discrete.Bd, L, strict=True))
-    return method, held._replace(
-        inputs=(held.inputs, tuple(draws.T)), discrete=held.discrete._replace(Bd=rows)
-    )
+    discrete = held.discrete._replace(Bd=jnp.concatenate([held.discrete.Bd, L], axis=1))
+    return method, held._replace(inputs=(held.inputs, tuple(draws.T)), discrete=discrete)
 
 
 def _kick(
@@ -285,20 +285,26 @@ def _kick(
     return model.State(**{n: new[i] for i, n in enumerate(names)})
 
 
+class _Field(eqx.Module):
+    """A vector field as diffrax calls it: equal for equal models, so that it is compiled once."""
+
+    State: type = eqx.field(static=True)
+    vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
+
+    def __call__(self, t: Any, x: Any, now: Any) -> Any:
+        if not isinstance(x, self.State):
+            return jax.tree.map(jnp.zeros_like, x)
+        if isinstance(now, Held):
+            return x  # only the shapes are asked for; the inputs may not be the model's
+        return self.vector_field(now.params, x, now.inputs)
+
+
 def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> dfx.ODETerm:
     """The vector field, per second, within one sample; of its parameters as `Held` has them.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
     """
-
-    def field(t: Any, x: Any, now: Any) -> Any:
-        if not isinstance(x, model.State):
-            return jax.tree.map(jnp.zeros_like, x)
-        if isinstance(now, Held):
-            return x  # only the shapes are asked for; the inputs may not be the model's
-        return vector_field(now.params, x, now.inputs)
-
-    return dfx.ODETerm(field)
+    return dfx.ODETerm(_Field(model.State, vector_field))
 
 
 def _stepwise(

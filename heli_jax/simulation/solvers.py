@@ -31,6 +31,12 @@ class Held(NamedTuple):
     delay: Any
     discrete: Discrete | None
 
+    def in_scalars(self) -> "Held":
+        """As a solver steps with it."""
+        if self.discrete is None:
+            return self
+        return self._replace(discrete=self.discrete.in_scalars())
+
 
 class Now(NamedTuple):
     """The arguments of a vector field within one interval: parameters and the held inputs."""

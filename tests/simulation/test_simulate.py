@@ -402,6 +402,25 @@ def test_noise_of_a_nonlinear_model_is_that_of_its_linearisation(bench30):
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-6 * np.std(a))
 
 
+@pytest.mark.parametrize("solver", ["exact", "rk4", dfx.Tsit5()])
+def test_a_second_run_compiles_nothing(bench30, solver):
+    inputs = STAND.Inputs(x_roll=jnp.asarray(U))
+    lighter = naming.replace(bench30, Ixx=0.9 * bench30.Ixx)
+    for vehicle in (bench30, lighter):
+        simulate(STAND, vehicle, inputs, dt=DT, solver=solver)
+    compiled = []
+
+    def note(event: str, _: float, **more: object) -> None:
+        compiled.extend([more] * ("compile" in event))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        simulate(STAND, bench30, inputs, dt=DT, solver=solver)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert not compiled
+
+
 def test_missing_input_of_a_flight_is_named(bench30):
     flight = Flight(dt=DT, inputs={"x_pitch": U}, outputs={})
     with pytest.raises(ValueError, match="no input 'x_roll', which roll-on-stand needs"):
