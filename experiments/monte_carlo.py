@@ -24,8 +24,9 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.baseline import baseline
 from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import deviations
+from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.layout import Noise, layout_of
-from heli_jax.identification.noise import evaluation, levelled
+from heli_jax.identification.noise import levelled
 from heli_jax.identification.start import start_vector
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.inputs import random_steps
@@ -107,8 +108,8 @@ def fisher(params: Any, records: int = 5) -> dict[str, float]:
         z = start_vector(layout, data, problem)
         dtype = z.dtype
         noise = Noise(({"roll": np.asarray(NOISE, dtype)},), np.zeros((), dtype))
-        noise = levelled(data, evaluation(layout, data, noise, z), noise)
-        found.append(deviations(evaluation(layout, data, noise, z).J)[: len(FREE)])
+        noise = levelled(data, evaluate(layout, data, noise, z), noise)
+        found.append(deviations(evaluate(layout, data, noise, z).J)[: len(FREE)])
     mean = np.sqrt(np.mean(np.square(found), axis=0))
     return dict(zip(FREE, (float(v) for v in mean), strict=True))
 

@@ -80,21 +80,21 @@ def _records(
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
             moved = _disturbed(at, u, i, keys)
         else:
-            moved = clean[i].outputs
+            moved = dict(zip(at.layout.outputs[i], clean[i].outputs, strict=True))
         one = {}
         for n, y in flight.outputs.items():
             sd = float(sds[n]) * float(u.scales.get(n, 1.0))
             noise = sd * rng.standard_normal((runs, y.shape[0]))
             if fit.coloured:
                 noise = _like(fit.signals[i].residual(n), runs, rng)
-            made = np.asarray(getattr(moved, n)) + float(u.biases[i][n]) + noise
+            made = np.asarray(moved[n]) + float(u.biases[i][n]) + noise
             one[n] = jnp.asarray(np.where(np.isnan(np.asarray(y)), np.nan, made), at.z.dtype)
         records.append(one)
     return tuple(records)
 
 
-def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> Any:
-    """Outputs (runs, N) with a disturbance drawn for each key."""
+def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
+    """By name the outputs (runs, N) with a disturbance drawn for each key."""
     flight, layout = at.data.flights[i], at.layout
     params, inputs = driven(layout, at.data, u, flight)
     start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
@@ -117,7 +117,7 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> Any:
             key=second,
         ).outputs
 
-    return jax.lax.map(run, keys, batch_size=_BATCH)
+    return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
 
 
 def _like(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarray:

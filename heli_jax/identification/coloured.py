@@ -6,8 +6,8 @@ Bartlett's, with which no variance can come out negative (Newey and West, 1987).
 
 import numpy as np
 
+from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.layout import Data, Layout
-from heli_jax.identification.residual import Evaluation
 
 LONGEST = 20.0
 """lags of the residual's autocovariance that are used [s], at most a fifth of the record"""

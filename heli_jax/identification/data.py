@@ -9,6 +9,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import coordinates
+from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.layout import (
     Data,
     FlightData,
@@ -17,7 +18,6 @@ from heli_jax.identification.layout import (
     layout_of,
 )
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.residual import evaluate
 from heli_jax.identification.start import start_vector
 
 
@@ -77,12 +77,12 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     z = start_vector(layout, data, problem)
     one = np.ones((), z.dtype)
     sd = tuple(dict.fromkeys(flight.outputs, one) for flight in data.flights)
-    e = jax.device_get(evaluate(layout, data, Noise(sd, np.zeros((), z.dtype)), z))
-    scaled = []
+    e = evaluate(layout, data, Noise(sd, np.zeros((), z.dtype)), z)
+    scaled, names = [], naming.names(layout.model.State)
     for flight, runs, rms in zip(data.flights, e.simulated, e.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
         y = {n: v[np.isfinite(v)] for n, v in y.items()}
         ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))
-        scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in rms.items()}
+        scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
         scaled.append(flight._replace(state_scale=jax.device_put(scale)))
     return data._replace(flights=tuple(scaled))

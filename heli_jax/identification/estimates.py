@@ -5,11 +5,11 @@ from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.identifiability import Unknown, Verdict
 from heli_jax.identification.judgement import references_of, unknowns_of
 from heli_jax.identification.layout import Data, Layout
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
-from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Estimate
 
 _SAYS_NOTHING = 1e3

@@ -8,6 +8,7 @@ from jaxtyping import Array
 from heli_jax.identification import excitation
 from heli_jax.identification import search as starting
 from heli_jax.identification.data import data_of
+from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import (
     Data,
@@ -18,14 +19,12 @@ from heli_jax.identification.layout import (
 )
 from heli_jax.identification.noise import (
     disturbance_or_none,
-    evaluation,
     first_noise,
     levelled,
     settle,
 )
 from heli_jax.identification.outcome import Ran, assemble, noise_by_name, signals_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, StartRow, Status
 from heli_jax.identification.start import start_vector
 
@@ -48,10 +47,10 @@ def _begin(problem: Problem) -> _Begin:
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     noise = first_noise(problem, problem.training)
     z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
-    e = evaluation(layout, data, noise, z)
+    e = evaluate(layout, data, noise, z)
     noise = levelled(data, e, noise)
     if layout.filtered:
-        e = evaluation(layout, data, noise, z)
+        e = evaluate(layout, data, noise, z)
     return _Begin(layout, data, noise, z, e)
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.identifiability import NULL, Unknown, Verdict, judge, projected
 from heli_jax.identification.layout import Layout
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.residual import Evaluation
 
 
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:

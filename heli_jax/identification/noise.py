@@ -3,18 +3,17 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimates import deviations
+from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.layout import Data, Layout, Noise
 from heli_jax.identification.metrics import noise_guess
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.residual import Evaluation, evaluate
 from heli_jax.identification.search import Search
 
 NO_DISTURBANCE = 2.71
@@ -35,11 +34,6 @@ class Settled(NamedTuple):
     """(steps, cost) of every round of the optimiser"""
     ratio: float | None = None
     """twice the log-likelihood that a disturbance gained, where that was asked"""
-
-
-def evaluation(layout: Layout, data: Data, noise: Noise, z: Array) -> Evaluation:
-    """`evaluate` as NumPy arrays, for what is not compiled."""
-    return jax.device_get(evaluate(layout, data, noise, z))
 
 
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
@@ -73,7 +67,7 @@ def settle(search: Search, noise: Noise, best: Optimum) -> Settled:
     """Alternate between the optimum and the noise until both stay (relaxation of R)."""
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(8):
-        e = evaluation(search.layout, search.data, noise, best.z)
+        e = evaluate(search.layout, search.data, noise, best.z)
         z, new = _updated(search.layout, search.data, e, noise, best.z)
         fall = float(noise.level - new.level)
         change = abs(fall) + max(
@@ -112,12 +106,12 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
     same residuals with sigma_w all but zero are those of output error.
     """
     layout, data, best, noise = search.layout, search.data, found.best, found.noise
-    e = evaluation(layout, data, noise, best.z)
+    e = evaluate(layout, data, noise, best.z)
     at = layout.noise_at("sigma_w")
     if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
         return found
     none = without_disturbance(search, found)
-    alone = evaluation(layout, data, none.noise, none.best.z)
+    alone = evaluate(layout, data, none.noise, none.best.z)
     if bool(none.best.converged) and not _corrects(alone, none.noise):
         without = log_likelihood(layout, data, none.noise, alone)
         ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
@@ -128,7 +122,7 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
             again = settle(search, none.noise, best)
             found = again._replace(trace=(*found.trace, *again.trace))
             best, noise = found.best, found.noise
-            e = evaluation(layout, data, noise, best.z)
+            e = evaluate(layout, data, noise, best.z)
             ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
         if not np.isfinite(ratio) or ratio < NO_DISTURBANCE:
             return none._replace(trace=found.trace, ratio=ratio)

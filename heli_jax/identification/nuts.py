@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.layout import Data, Layout, Noise, Reached, value_of
-from heli_jax.identification.noise import evaluation
 from heli_jax.identification.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
 
@@ -56,7 +56,7 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     at = fit.reached
     if fit.lost:
         raise ValueError(f"nuts: the data do not determine {', '.join(fit.lost)}")
-    e = evaluation(at.layout, at.data, at.noise, at.z)
+    e = evaluate(at.layout, at.data, at.noise, at.z)
     # Whitened by the Gaussian approximation, so that all directions have size one.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
@@ -95,7 +95,8 @@ def _sample(
         blackjax.nuts, density, target_acceptance_rate=_TARGET, initial_step_size=0.5
     )
     first = 0.1 * jax.random.normal(keys[0], (q,), at.z.dtype)
-    (state, parameters), _ = adaptation.run(keys[1], first, warmup)
+    run = jax.jit(adaptation.run, static_argnums=2)
+    (state, parameters), _ = run(keys[1], first, warmup)
     sampler = blackjax.nuts(density, **parameters)
     settling = warmup // 2
 
@@ -118,8 +119,8 @@ def _posterior(at: Reached, z: np.ndarray, divergent: int) -> Posterior:
     from blackjax import diagnostics
 
     named = jnp.asarray(z[:, :, : len(at.layout.free)])
-    rhat = np.max(np.asarray(diagnostics.potential_scale_reduction(named)))
-    effective = np.min(np.asarray(diagnostics.effective_sample_size(named)))
+    rhat = np.max(np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named)))
+    effective = np.min(np.asarray(jax.jit(diagnostics.effective_sample_size)(named)))
     found = {
         name: np.asarray(value_of(at.layout, at.data, i, named[:, :, i]))
         for i, name in enumerate(at.layout.free)

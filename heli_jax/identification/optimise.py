@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.layout import Data, Layout, Noise, Reached
-from heli_jax.identification.residual import differentiate
+from heli_jax.identification.residual import Slopes, differentiate
 
 
 class Optimum(NamedTuple):
@@ -191,14 +191,14 @@ _many = tuple(jax.jit(jax.vmap(f)) for f in (_compressed, _begin, _advance, _poi
 
 
 def _descend(
-    slopes: Callable[[Array], tuple[Array, Array]],
+    at: Callable[[Array], tuple[Array, Array]],
     terms: _Terms,
     first: tuple[Array, Array],
     count: np.ndarray | int,
     max_steps: int,
     how: tuple[Any, ...],
 ) -> Optimum:
-    """Step until arrived, from residuals and Jacobian at the start; `slopes` gives them elsewhere.
+    """Step until arrived, from residuals and Jacobian at the start; `at` gives them elsewhere.
 
     The residuals are evaluated by the one program that evaluates them for everything else: it
     takes longer to compile than to run.
@@ -209,40 +209,76 @@ def _descend(
         state = advance(terms, state, compressed(terms, r, J))
         if k + 1 == max_steps or bool(np.all(state.done)):
             break
-        r, J = slopes(point(terms, state.solver.y_eval))
-    return _optimum(terms, state, point(terms, state.xi), count)
+        r, J = at(point(terms, state.solver.y_eval))
+    return _optimum(terms.units.level, state, point(terms, state.xi), count)
+
+
+class _Loop(NamedTuple):
+    """A run that evaluates its residuals itself."""
+
+    k: Array
+    units: _Scaling
+    state: _State
+    last: Slopes
+    """of the last point that was tried"""
+
+
+class _End(NamedTuple):
+    """Where such a run ended."""
+
+    z: Float[Array, " q"]
+    level: Float[Array, ""]
+    state: _State
+    last: Slopes
 
 
 @eqx.filter_jit
 def _at_once(
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    terms: _Terms,
-    first: tuple[Array, Array],
-    max_steps: Array,
-) -> tuple[_State, Array]:
-    """`_descend` from one start in a program of its own, and the point where it ended."""
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"], max_steps: Any
+) -> _End:
+    """`_descend` from one start as one program; with one step it evaluates z0 and nothing else."""
 
-    def advanced(state: _State, r: Array, J: Array) -> _State:
-        return _advance(terms, state, _compressed(terms, r, J))
+    def more(now: _Loop) -> Array:
+        return (now.k < max_steps) & ~now.state.done
 
-    def more(carry: tuple[Array, _State]) -> Array:
-        return (carry[0] < max_steps) & ~carry[1].done
+    def step(now: _Loop) -> _Loop:
+        point = _point(_terms(layout, z0, now.units), now.state.solver.y_eval)
+        e = differentiate(layout, data, noise, point)
+        units = jax.tree.map(
+            lambda new, old: jnp.where(now.k == 0, new, old), _scaling(e.r, e.J), now.units
+        )
+        terms = _terms(layout, z0, units)
+        state = _advance(terms, now.state, _compressed(terms, e.r, e.J))
+        return _Loop(now.k + 1, units, state, e)
 
-    def step(carry: tuple[Array, _State]) -> tuple[Array, _State]:
-        k, state = carry
-        e = differentiate(layout, data, noise, _point(terms, state.solver.y_eval))
-        return k + 1, advanced(state, e.r, e.J)
+    # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere.
+    units = _Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
+    shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
+    last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    begin = _Loop(jnp.asarray(0), units, _begin(_terms(layout, z0, units)), last)
+    end = jax.lax.while_loop(more, step, begin)
+    terms = _terms(layout, z0, end.units)
+    return _End(_point(terms, end.state.xi), end.units.level, end.state, end.last)
 
-    state = advanced(_begin(terms), *first)
-    _, state = jax.lax.while_loop(more, step, (jnp.ones_like(max_steps), state))
-    return state, _point(terms, state.xi)
+
+def _whole(layout: Layout) -> bool:
+    """Whether a run is one program.
+
+    Linear models without a filter take no longer to evaluate than a step takes to be called for.
+    """
+    return layout.model.linear and not layout.filtered
 
 
-def _optimum(terms: _Terms, state: _State, z: Array, count: np.ndarray | int) -> Optimum:
+def slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
+    """`differentiate` by the program that the optimiser compiles as well."""
+    if _whole(layout):
+        return _at_once(layout, data, noise, z, np.asarray(1)).last
+    return differentiate(layout, data, noise, z)
+
+
+def _optimum(level: Array, state: _State, z: Array, count: np.ndarray | int) -> Optimum:
     rows = state.solver.f_info.residual
-    cost = jnp.sum(jnp.square(rows), axis=-1) * terms.units.level**2
+    cost = jnp.sum(jnp.square(rows), axis=-1) * level**2
     cost = cost / jnp.asarray(count, cost.dtype)
     fine = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z), axis=-1)
     return Optimum(z, cost, state.solver.num_steps, state.fine & fine)
@@ -256,21 +292,18 @@ def optimise(
     max_steps: int = 200,
 ) -> Optimum:
     """The least-squares optimum from z0."""
-    first = differentiate(layout, data, noise, z0)
-    terms = _terms(layout, z0, _scaling(first.r, first.J))
     count = residuals_count(data)
-    if layout.model.linear and not layout.filtered:
-        # Such residuals take no longer to evaluate than a step takes to be called for, and compile
-        # in two seconds.
-        steps = jnp.asarray(max_steps)
-        state, z = _at_once(layout, data, noise, terms, (first.r, first.J), steps)
-        return _optimum(terms, state, z, count)
+    if _whole(layout):
+        end = _at_once(layout, data, noise, z0, np.asarray(max_steps))
+        return _optimum(end.level, end.state, end.z, count)
 
-    def slopes(z: Array) -> tuple[Array, Array]:
+    def at(z: Array) -> tuple[Array, Array]:
         e = differentiate(layout, data, noise, z)
         return e.r, e.J
 
-    return _descend(slopes, terms, (first.r, first.J), count, max_steps, _one)
+    first = at(z0)
+    terms = _terms(layout, z0, _scaling(*first))
+    return _descend(at, terms, first, count, max_steps, _one)
 
 
 @eqx.filter_jit
@@ -298,7 +331,7 @@ def optimise_many(
     its start.
     """
     layout, noise = reached.layout, reached.noise
-    first = differentiate(layout, reached.data, noise, reached.z)
+    first = slopes(layout, reached.data, noise, reached.z)
     units = _scaling(first.r, first.J)
     if hold is not None:
         units = units._replace(unit=units.unit.at[hold].set(0.0))
@@ -306,16 +339,16 @@ def optimise_many(
     found = []
     for i in range(0, k, batch):
         # The last ones again where the batch is not full.
-        at = np.minimum(np.arange(i, i + batch), k - 1)
-        z0 = starts[at]
-        numbers = jax.vmap(data)(jax.tree.map(lambda v, at=at: v[at], each))
+        chosen = np.minimum(np.arange(i, i + batch), k - 1)
+        z0 = starts[chosen]
+        numbers = jax.vmap(data)(jax.tree.map(lambda v, chosen=chosen: v[chosen], each))
         terms = jax.vmap(lambda z: _terms(layout, z, units))(z0)
 
-        def slopes(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
+        def at(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _slopes(layout, numbers, noise, z)
 
         count = residuals_count(numbers) // batch
-        ends = _descend(slopes, terms, slopes(z0), count, max_steps, _many)
+        ends = _descend(at, terms, at(z0), count, max_steps, _many)
         found.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
 

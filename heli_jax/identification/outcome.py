@@ -21,6 +21,7 @@ from heli_jax.identification.estimates import (
     labels,
     stated_noise_notes,
 )
+from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
@@ -28,7 +29,6 @@ from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whitene
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
     Settled,
-    evaluation,
     first_noise,
     innovation_sums,
     log_likelihood,
@@ -36,7 +36,6 @@ from heli_jax.identification.noise import (
 )
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.residual import Evaluation
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.search import Search, table
 from heli_jax.identification.start import start_vector
@@ -66,7 +65,7 @@ def noise_by_name(
 def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fit:
     """All that a fit says, from where the optimiser ended."""
     layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
-    e = evaluation(layout, data, noise, best.z)
+    e = evaluate(layout, data, noise, best.z)
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e) if usable else ran.before
     n = residuals_count(data)
@@ -306,11 +305,11 @@ def _validation(
         theirs = theirs._replace(sd=sd)
     steps = 1 if problem.model.linear else 5
     for _ in range(steps if other.size > layout.weak else 0):
-        e = evaluation(other, data, theirs, full)
+        e = evaluate(other, data, theirs, full)
         columns = np.asarray(e.J)[:, layout.weak :]
         step, *_ = np.linalg.lstsq(columns, -np.asarray(e.r), rcond=1e-10)
         full = full.at[layout.weak :].add(jnp.asarray(step, z.dtype))
-    return signals_of(evaluation(other, data, theirs, full), held)
+    return signals_of(evaluate(other, data, theirs, full), held)
 
 
 def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.identifiability import Z95
 from heli_jax.identification.layout import Reached, value_of
-from heli_jax.identification.noise import evaluation
 from heli_jax.identification.optimise import optimise_many, residuals_count
 from heli_jax.identification.result import Fit
 
@@ -48,7 +48,7 @@ def profile(
 
 def _profile(at: Reached, name: str, points: int) -> Profile:
     i = at.layout.free.index(name)
-    e = evaluation(at.layout, at.data, at.noise, at.z)
+    e = evaluate(at.layout, at.data, at.noise, at.z)
     inverse = np.linalg.pinv(np.asarray(e.J, np.float64), rcond=1e-10)
     along = inverse @ inverse[i]
     sd = float(np.sqrt(along[i]))

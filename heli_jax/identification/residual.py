@@ -34,10 +34,10 @@ def driven(layout: Layout, data: Data, u: Unknowns, flight: FlightData) -> tuple
 class Run(NamedTuple):
     """A simulated flight."""
 
-    states: Any
-    """the model's State, arrays (N,)"""
-    outputs: Any
-    """the model's Outputs, arrays (N,), without bias"""
+    states: Float[Array, "s N"]
+    """as the model's State orders them"""
+    outputs: Float[Array, "p N"]
+    """what the flight measures, as `Layout.outputs` orders it, without bias"""
     ends: Any
     """with windows the State that each leads to at the next one's first sample, (windows,)"""
 
@@ -56,7 +56,8 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
             i = members[0]
             params, inputs = driven(layout, data, u, data.flights[i])
             run = _simulated_one(layout, params, inputs, data.flights[i].dt, u.states[i], u.shift)
-            alone[i] = Run(run.states, run.outputs, None)
+            measured = [getattr(run.outputs, n) for n in layout.outputs[i]]
+            alone[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
         else:
             alone |= _together(layout, data, u, members, m)
     return tuple(alone[i] for i in range(len(data.flights)))
@@ -105,6 +106,9 @@ def _together(
         return run.states, run.outputs
 
     states, outputs = jax.vmap(one)(*stacked)
+    names = naming.names(layout.model.Outputs)
+    # All of them in one array, since XLA makes a kernel of every part that is cut out of another.
+    x, y = (jnp.stack(jax.tree.leaves(v)) for v in (states, outputs))
     found, first = {}, 0
     for i in members:
         count = layout.windows[i][0]
@@ -112,10 +116,11 @@ def _together(
         mine = slice(first, first + count)
 
         def joined(v: Array, mine: slice = mine, n: int = n) -> Array:
-            return v[mine, :m].reshape(-1)[:n]
+            return v[:, mine, :m].reshape(v.shape[0], -1)[:, :n]
 
         ends = jax.tree.map(lambda v, mine=mine: v[mine, -1], states) if count > 1 else None
-        found[i] = Run(jax.tree.map(joined, states), jax.tree.map(joined, outputs), ends)
+        rows = np.array([names.index(name) for name in layout.outputs[i]])
+        found[i] = Run(joined(x), joined(y[rows]), ends)
         first += count
     return found
 
@@ -188,26 +193,38 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     return z[layout.weak :]
 
 
-def _simulation_rows(data: Data, noise: Noise, raw: Any) -> Array:
-    return jnp.concatenate(
-        [
-            jnp.where(jnp.isfinite(y), by_name[n], 0.0) / sd[n]
-            for flight, by_name, sd in zip(data.flights, raw, noise.sd, strict=True)
-            for n, y in flight.outputs.items()
-        ]
-    )
-
-
-def _rows(
-    layout: Layout, data: Data, noise: Noise, z: Array, errors: Any, jumps: Array | None = None
+def _simulation_rows(
+    layout: Layout, data: Data, noise: Noise, u: Unknowns, runs: tuple[Run, ...]
 ) -> Array:
-    """All rows from the innovations, or from measured - bias - simulated and what the windows
-    jump."""
-    if layout.filtered:
-        rows = [_likelihood_rows(layout, data, noise, errors)]
-    else:
-        rows = [_simulation_rows(data, noise, errors), *([] if jumps is None else [jumps])]
+    """(measured - bias - simulated) / sd, signal after signal; zero where nothing is measured."""
+    # Joined first: of signals one by one XLA makes kernels one by one.
+    at = [(i, n) for i, names in enumerate(layout.outputs) for n in names]
+    measured = [data.flights[i].outputs[n] for i, n in at]
+    which = np.repeat(np.arange(len(at)), [y.shape[0] for y in measured])
+    y = jnp.concatenate(measured)
+    simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
+    sd = jnp.stack([noise.sd[i][n] for i, n in at])
+    error = y - _joined(u)[which] - simulated
+    return jnp.where(jnp.isfinite(y), error, 0.0) / sd[which]
+
+
+def _joined(u: Unknowns) -> Array:
+    """The biases, flight after flight and output after output."""
+    return jnp.stack([b for bias in u.biases for b in bias.values()])
+
+
+def _rows(layout: Layout, data: Data, z: Array, *measured: Array | None) -> Array:
+    """All rows: those of the measurements, then the priors'."""
+    rows = [r for r in measured if r is not None]
     return jnp.concatenate([*rows, prior_rows(layout, data, z), weak_rows(layout, z)])
+
+
+def _simulated_rows(
+    layout: Layout, data: Data, noise: Noise, z: Array, u: Unknowns, runs: tuple[Run, ...]
+) -> Array:
+    """All rows of output error; with windows also what the states jump between them."""
+    measured = _simulation_rows(layout, data, noise, u, runs)
+    return _rows(layout, data, z, measured, _jumps(layout, data, u, runs))
 
 
 def _jumps(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> Array | None:
@@ -230,26 +247,19 @@ def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> 
     """The rows whose squares are summed, without their derivative."""
     u = unpack(layout, data, z)
     if layout.filtered:
-        return _rows(layout, data, noise, z, filtered(layout, data, noise, u))
-    runs = predict(layout, data, u)
-    return _rows(layout, data, noise, z, _raw(data, u, runs), _jumps(layout, data, u, runs))
-
-
-def _raw(data: Data, u: Unknowns, runs: tuple[Run, ...]) -> tuple[dict[str, Any], ...]:
-    return tuple(
-        {n: y - bias[n] - getattr(run.outputs, n) for n, y in flight.outputs.items()}
-        for flight, run, bias in zip(data.flights, runs, u.biases, strict=True)
-    )
+        found = filtered(layout, data, noise, u)
+        return _rows(layout, data, z, _likelihood_rows(layout, data, noise, found))
+    return _simulated_rows(layout, data, noise, z, u, predict(layout, data, u))
 
 
 class Shown(NamedTuple):
-    """The simulation beside the measurements."""
+    """What is simulated."""
 
-    simulated: tuple[dict[str, Any], ...]
-    """with the bias, SI, by flight and output"""
-    raw: tuple[dict[str, Any], ...]
-    """measured - simulated, SI, by flight and output; NaN where nothing is measured"""
-    state_rms: tuple[dict[str, Any], ...]
+    outputs: tuple[Float[Array, "p N"], ...]
+    """by flight, SI, as `Layout.outputs` orders them, without the bias"""
+    biases: Float[Array, " s"]
+    """flight after flight and output after output"""
+    state_rms: Float[Array, "f n"]
     """root mean square of each simulated state, by flight"""
 
 
@@ -266,21 +276,6 @@ class Slopes(NamedTuple):
     """what output error simulates on its way"""
 
 
-class Evaluation(NamedTuple):
-    """Everything that one point tells."""
-
-    simulated: tuple[dict[str, Any], ...]
-    raw: tuple[dict[str, Any], ...]
-    state_rms: tuple[dict[str, Any], ...]
-    innovations: tuple[Innovations, ...]
-    r: Any
-    J: Any
-    named: Any
-    """values of the named unknowns"""
-    slopes: Any
-    """their derivatives by their own coordinates"""
-
-
 @eqx.filter_jit
 def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
     """Residuals and their Jacobian in forward mode, in one pass.
@@ -294,10 +289,10 @@ def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"
         u = unpack(layout, data, z)
         if layout.filtered:
             found = filtered(layout, data, noise, u)
-            r = _rows(layout, data, noise, z, found)
+            r = _rows(layout, data, z, _likelihood_rows(layout, data, noise, found))
             return r, (r, None, found)
         runs = predict(layout, data, u)
-        r = _rows(layout, data, noise, z, _raw(data, u, runs), _jumps(layout, data, u, runs))
+        r = _simulated_rows(layout, data, noise, z, u, runs)
         return r, (r, runs, ())
 
     seeds = seeded(layout)
@@ -311,41 +306,11 @@ def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"
         directions = jnp.asarray(seeds.T, z.dtype)
         r, J, (_, runs, found) = jax.vmap(along, out_axes=(None, -1, None))(directions)
         J = spread_out(layout, data, J)
-    shown = None if runs is None else _compared(data, unpack(layout, data, z), runs)
+    shown = None if runs is None else shown_of(unpack(layout, data, z), runs)
     return Slopes(r, J, found, shown)
 
 
-def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
-    """`differentiate`, the simulation, and the named unknowns."""
-    at = differentiate(layout, data, noise, z)
-    shown = _shown(layout, data, z) if at.shown is None else at.shown
-    named, slopes = _named(layout, data, z)
-    return Evaluation(*shown, at.innovations, at.r, at.J, named, slopes)
-
-
-@eqx.filter_jit
-def _shown(layout: Layout, data: Data, z: Array) -> Shown:
-    u = unpack(layout, data, z)
-    return _compared(data, u, predict(layout, data, u))
-
-
-@eqx.filter_jit
-def _named(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
-    def named(z: Array) -> Array:
-        u = unpack(layout, data, z)
-        shift = () if u.shift is None else (u.shift,)
-        return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
-
-    return named(z), jnp.diagonal(jax.jacfwd(named)(z))
-
-
-def _compared(data: Data, u: Unknowns, runs: tuple[Run, ...]) -> Shown:
-    simulated = tuple(
-        {n: bias[n] + getattr(run.outputs, n) for n in bias}
-        for run, bias in zip(runs, u.biases, strict=True)
-    )
-    return Shown(simulated, _raw(data, u, runs), tuple(_rms(run.states) for run in runs))
-
-
-def _rms(states: Any) -> dict[str, Any]:
-    return {n: jnp.sqrt(jnp.mean(jnp.square(v))) for n, v in naming.asdict(states).items()}
+def shown_of(u: Unknowns, runs: tuple[Run, ...]) -> Shown:
+    """Of the simulated flights what is shown."""
+    rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
+    return Shown(tuple(run.outputs for run in runs), _joined(u), jnp.stack(rms))

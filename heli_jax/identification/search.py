@@ -76,9 +76,9 @@ def _scan(
         z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
         runs = predict(layout, data, unpack(layout, data, z))
         ys, ms = [], []
-        for flight, run, s in zip(data.flights, runs, noise.sd, strict=True):
+        for flight, names, run, s in zip(data.flights, layout.outputs, runs, noise.sd, strict=True):
             for n, y in flight.outputs.items():
-                m = getattr(run.outputs, n)
+                m = run.outputs[names.index(n)]
                 seen = jnp.isfinite(y)
                 ys.append(_centred(y, seen) / s[n])
                 ms.append(_centred(m, seen) / s[n])

@@ -9,9 +9,10 @@ import pytest
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax.identification.data import data_of
+from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.layout import layout_of
 from heli_jax.identification.noise import first_noise
-from heli_jax.identification.residual import evaluate, rows_of
+from heli_jax.identification.residual import rows_of
 from heli_jax.identification.start import start_vector
 from tests.identification.bench import BENCH, record, vehicle
 
