@@ -159,24 +159,24 @@ class _Filter(NamedTuple):
 def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
     """Errors and variances (N, p)."""
 
+    def correct(carry: tuple[Array, Array], measured: tuple[Array, ...]) -> tuple[Any, Any]:
+        """The state and its covariance after one output."""
+        (x, P), (c, rest, r, y) = carry, measured
+        p = jnp.sum(P * c[None, :], axis=1)
+        s = jnp.sum(c * p) + r
+        seen = jnp.isfinite(y)
+        e = jnp.where(seen, y, 0.0) - rest - jnp.sum(c * x)
+        gain = jnp.where(seen, 1.0 / s, 0.0)
+        x, P = x + p * (gain * e), P - p[:, None] * (gain * p)[None, :]
+        return (x, P), (jnp.where(seen, e, jnp.nan), jnp.where(seen, s, jnp.nan))
+
     def step(carry: tuple[Array, Array], sample: tuple[Array, Any]) -> tuple[Any, Any]:
         x, P = carry
         y, now = sample
         C, rest = filter_.measure(x, now)
-        errors, variances = [], []
-        for j in range(y.shape[0]):
-            c = C[j]
-            p = jnp.sum(P * c[None, :], axis=1)
-            s = jnp.sum(c * p) + R[j]
-            seen = jnp.isfinite(y[j])
-            e = jnp.where(seen, y[j], 0.0) - rest[j] - jnp.sum(c * x)
-            gain = jnp.where(seen, 1.0 / s, 0.0)
-            x = x + p * (gain * e)
-            P = P - p[:, None] * (gain * p)[None, :]
-            errors.append(jnp.where(seen, e, jnp.nan))
-            variances.append(jnp.where(seen, s, jnp.nan))
+        (x, P), found = jax.lax.scan(correct, (x, P), (C, rest, R, y))
         x, P = filter_.move(x, P, now)
-        return (x, 0.5 * (P + P.T)), (jnp.stack(errors), jnp.stack(variances))
+        return (x, 0.5 * (P + P.T)), found
 
     _, (e, s) = jax.lax.scan(step, (x, P), (y, filter_.samples))
     return e, s

@@ -146,6 +146,24 @@ def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Inn
     return tuple(out)
 
 
+def _signals(layout: Layout) -> list[tuple[int, str]]:
+    """What is measured, as (flight, output), in the order of the rows."""
+    return [(i, n) for i, names in enumerate(layout.outputs) for n in names]
+
+
+def _which(layout: Layout, data: Data) -> np.ndarray:
+    """Of every measured number its signal."""
+    sizes = [data.flights[i].outputs[n].shape[0] for i, n in _signals(layout)]
+    return np.repeat(np.arange(len(sizes)), sizes)
+
+
+def _measured(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
+    """All that is measured, and its sd. Joined: XLA makes kernels of signals one by one."""
+    at = _signals(layout)
+    sd = jnp.stack([noise.sd[i][n] for i, n in at])
+    return jnp.concatenate([data.flights[i].outputs[n] for i, n in at]), sd[_which(layout, data)]
+
+
 def _likelihood_rows(
     layout: Layout, data: Data, noise: Noise, found: tuple[Innovations, ...]
 ) -> Array:
@@ -161,15 +179,13 @@ def _likelihood_rows(
     themselves, have the derivative $\tfrac12 s'_k/s_k$: with them J'J is Fisher's information
     (Mehra, 1970; Maine and Iliff, 1985, leave that part out).
     """
-    whitened, logs, seens = [], [], []
-    for flight, one, sd in zip(data.flights, found, noise.sd, strict=True):
-        for n, y in flight.outputs.items():
-            seen = jnp.isfinite(y)
-            s = jnp.where(seen, one.variance[n], 1.0)
-            whitened.append(jnp.where(seen, one.error[n], 0.0) / jnp.sqrt(s))
-            logs.append(jnp.where(seen, jnp.log(s / sd[n] ** 2), 0.0))
-            seens.append(seen)
-    rows, log_s, seen = (jnp.concatenate(v) for v in (whitened, logs, seens))
+    y, sd = _measured(layout, data, noise)
+    at = _signals(layout)
+    seen = jnp.isfinite(y)
+    s = jnp.where(seen, jnp.concatenate([found[i].variance[n] for i, n in at]), 1.0)
+    error = jnp.concatenate([found[i].error[n] for i, n in at])
+    rows = jnp.where(seen, error, 0.0) / jnp.sqrt(s)
+    log_s = jnp.where(seen, jnp.log(s / sd**2), 0.0)
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
     above = mean - noise.level
@@ -197,15 +213,10 @@ def _simulation_rows(
     layout: Layout, data: Data, noise: Noise, u: Unknowns, runs: tuple[Run, ...]
 ) -> Array:
     """(measured - bias - simulated) / sd, signal after signal; zero where nothing is measured."""
-    # Joined first: of signals one by one XLA makes kernels one by one.
-    at = [(i, n) for i, names in enumerate(layout.outputs) for n in names]
-    measured = [data.flights[i].outputs[n] for i, n in at]
-    which = np.repeat(np.arange(len(at)), [y.shape[0] for y in measured])
-    y = jnp.concatenate(measured)
+    y, sd = _measured(layout, data, noise)
     simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
-    sd = jnp.stack([noise.sd[i][n] for i, n in at])
-    error = y - _joined(u)[which] - simulated
-    return jnp.where(jnp.isfinite(y), error, 0.0) / sd[which]
+    error = y - _joined(u)[_which(layout, data)] - simulated
+    return jnp.where(jnp.isfinite(y), error, 0.0) / sd
 
 
 def _joined(u: Unknowns) -> Array:
