@@ -162,6 +162,7 @@ class _Sampled:
         if n < 1:
             raise ValueError(f"n is {n}, wanted is at least 1")
         self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
+        self._idle: list[Any] = []
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,17 +180,27 @@ class _Sampled:
         return scipy.stats.qmc.LatinHypercube(len(self.axes), rng=rng).random(self._n)
 
     def values(self, start: int, stop: int) -> Columns:
-        if self.kind == "lhs":
-            points = self._hypercube[start:stop]
-        else:
-            import scipy.stats.qmc
+        points = self._hypercube[start:stop] if self.kind == "lhs" else self._sobol(start, stop)
+        return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
 
+    def _sobol(self, start: int, stop: int) -> np.ndarray:
+        """Points (stop - start, axes). SciPy walks through all that it leaves out, so slice after
+        slice goes on where the last one ended."""
+        import scipy.stats.qmc
+
+        # Taken out while it is used: another thread makes its own.
+        try:
+            engine = self._idle.pop()
+        except IndexError:
+            engine = None
+        if engine is None or engine.num_generated > start:
             rng = np.random.default_rng(self.seed)
             engine = scipy.stats.qmc.Sobol(len(self.axes), rng=rng)
-            if start:
-                engine.fast_forward(start)
-            points = _quiet_random(engine, stop - start)
-        return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
+        if start > engine.num_generated:
+            engine.fast_forward(start - engine.num_generated)
+        points = _quiet_random(engine, stop - start)
+        self._idle.append(engine)
+        return points
 
     def describe(self) -> dict[str, Any]:
         axes = {n: [a.lower, a.upper, a.scale] for n, a in self.axes.items()}

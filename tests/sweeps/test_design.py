@@ -1,5 +1,6 @@
 """Designs: the values of the axes, against NumPy, SciPy and itertools."""
 
+import concurrent.futures
 import itertools
 
 import hypothesis.strategies as st
@@ -40,6 +41,26 @@ def test_slices_are_parts_of_the_whole(name, data):
     for axis in design.names:
         assert everything[axis].shape == (design.size,)
         np.testing.assert_array_equal(part[axis], everything[axis][start:stop])
+
+
+@given(cuts=st.lists(st.integers(0, 50), min_size=2, max_size=6).map(sorted))
+def test_a_sequence_goes_on_where_the_last_slice_ended(cuts):
+    design = sobol(AXES, 50, seed=3)
+    everything = whole(sobol(AXES, 50, seed=3))["a"]
+    for start, stop in itertools.pairwise(cuts):
+        np.testing.assert_array_equal(design.values(start, stop)["a"], everything[start:stop])
+
+
+def test_threads_that_take_slices_of_one_sequence_do_not_disturb_each_other():
+    design, everything = sobol(AXES, 4000, seed=3), whole(sobol(AXES, 4000, seed=3))["a"]
+    starts = np.random.default_rng(0).permutation(np.repeat(np.arange(0, 4000, 100), 8)).tolist()
+
+    def slice_at(start):
+        return design.values(start, start + 100)
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        for start, found in zip(starts, pool.map(slice_at, starts), strict=True):
+            np.testing.assert_array_equal(found["a"], everything[start : start + 100])
 
 
 def test_a_grid_is_every_combination_the_last_axis_fastest():
