@@ -9,6 +9,7 @@ import xarray as xr
 
 from heli_jax import run_directory
 from heli_jax.sweeps.job import Job
+from heli_jax.sweeps.pieces import pieces
 from heli_jax.sweeps.program import MEANINGS, OK
 
 _WORST = 5
@@ -41,11 +42,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "model": job.model.name,
         "elements": int(status.size),
         "status": {word: int(np.count_nonzero(status == k)) for k, word in MEANINGS.items()},
-        "axes": {
-            n: {"min": float(v.min()), "max": float(v.max()), **_unit(dataset[n])}
-            for n in job.design.names
-            if (v := _finite(dataset[n].to_numpy())).size
-        },
+        "axes": {n: found for n in job.design.names if (found := _ends(dataset[n]))},
         "results": results,
         "worst": {name: _rows(dataset, job, name, k) for name, k in worst(dataset, job).items()},
         "split": dataset.attrs["split"],
@@ -67,15 +64,27 @@ def _unit(variable: xr.DataArray) -> dict[str, str]:
     return {"unit": variable.attrs["units"]} if "units" in variable.attrs else {}
 
 
+def _ends(variable: xr.DataArray) -> dict[str, Any]:
+    """The least and the largest finite value; nothing where there is none."""
+    finite = [found for _, values in pieces(variable) if (found := _finite(values)).size]
+    if not finite:
+        return {}
+    ends = {"min": min(float(v.min()) for v in finite), "max": max(float(v.max()) for v in finite)}
+    return {**ends, **_unit(variable)}
+
+
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
-    values = _finite(variable.to_numpy()[fine].astype(np.float64))
-    if not values.size:
+    # The values are held once: the partition for the quantiles is made where they are.
+    values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
+    for which, piece in pieces(variable):
+        found = _finite(piece[fine[which]])
+        values[n : n + found.size] = found
+        n += found.size
+    if not n:
         return {**_unit(variable), "n": 0}
-    q = np.quantile(values, [0.0, 0.05, 0.5, 0.95, 1.0])
+    q = np.quantile(values[:n], [0.0, 0.05, 0.5, 0.95, 1.0], overwrite_input=True)
     names = ("min", "q05", "median", "q95", "max")
-    return {
-        **_unit(variable), "n": int(values.size), **dict(zip(names, map(float, q), strict=True))
-    }  # fmt: skip
+    return {**_unit(variable), "n": n, **dict(zip(names, map(float, q), strict=True))}
 
 
 def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.ndarray]:
@@ -86,20 +95,25 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.nd
     for name, one in job.reduce.items():
         if name not in dataset.data_vars:
             continue
-        values = dataset[name].to_numpy().astype(np.float64)
-        badness = -values if one.how in _SMALL_IS_BAD else np.abs(values)
-        badness = badness.reshape(len(fine), -1).max(axis=1)
-        badness = np.where(fine & np.isfinite(badness), badness, -np.inf)
-        few = min(count, int(np.count_nonzero(badness > -np.inf)))
-        if few:
-            top = np.argpartition(badness, -few)[-few:]
-            found[name] = top[np.argsort(-badness[top], kind="stable")]
+        badness, element = np.empty(0), np.empty(0, np.int64)
+        for which, piece in pieces(dataset[name]):
+            values = piece.astype(np.float64)
+            bad = -values if one.how in _SMALL_IS_BAD else np.abs(values)
+            bad = bad.reshape(len(values), -1).max(axis=1)
+            usable = np.flatnonzero(fine[which] & np.isfinite(bad))
+            most = min(count, usable.size)
+            top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
+            badness = np.concatenate([badness, bad[top]])
+            element = np.concatenate([element, top + which.start])
+        if element.size:
+            found[name] = element[np.lexsort((element, -badness))[:count]]
     return found
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
-    values = dataset[name].to_numpy()[elements].tolist()
-    axes = {n: dataset[n].to_numpy()[elements].astype(np.float64) for n in job.design.names}
+    few = dataset.isel(element=elements)
+    values = few[name].transpose("element", ...).to_numpy().tolist()
+    axes = {n: few[n].to_numpy().astype(np.float64) for n in job.design.names}
     return [
         {"element": int(k), "value": v, "axes": {n: float(a[i]) for n, a in axes.items()}}
         for i, (k, v) in enumerate(zip(elements, values, strict=True))

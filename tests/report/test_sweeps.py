@@ -10,6 +10,9 @@ import xarray as xr
 from matplotlib.colors import to_hex
 
 from heli_jax.report import style, sweeps
+from heli_jax.report.numbers import number
+from heli_jax.report.sweeps import columns
+from heli_jax.sweeps import pieces
 
 UNITS = {"Ixx": "kg*m^2", "If": "kg*m^2", "initial.phi": "rad", "misfit": "rad", "fit": "%"}
 
@@ -387,6 +390,44 @@ def test_worst_elements_are_named_and_lie_where_they_are():
     assert colours[0] == colours[1] != colours[2]
     [bundle] = [c for c in ax.collections if len(c.get_paths()) == 300]
     assert bundle.get_zorder() < lines[0].get_zorder()
+
+
+def test_a_large_sweep_is_drawn_by_lot(monkeypatch):
+    ds = sweep(4000)
+    ds["rare"] = ds["misfit"] * np.nan
+    monkeypatch.setattr(columns, "DRAWN", 400)
+    monkeypatch.setattr(pieces, "_ELEMENTS", 300)
+    ok = int(np.count_nonzero(ds["status"] == 0))
+    table = columns.Table(ds, [np.array([17, 3999])])
+    assert (table.size, table.n_ok) == (4000, ok)
+    assert {17, 3999} <= set(table.elements.tolist())
+    assert 400 <= np.count_nonzero(table.ok) <= 402
+    assert 200 <= np.count_nonzero(~table.ok) <= 202
+    some = ds.isel(element=table.elements)
+    for name in ("Ixx", "misfit"):
+        column, values = table.column(name), some[name].to_numpy()
+        np.testing.assert_array_equal(column.values[column.finite], values[np.isfinite(values)])
+    median = np.median(counted(ds, "misfit")[0])
+    assert np.median(table.column("misfit").values[table.column("misfit").used]) == pytest.approx(
+        median, rel=0.1
+    )
+    at = table.at(np.array([17, 3999]))
+    np.testing.assert_array_equal(table.column("Ixx").values[at], ds["Ixx"][[17, 3999]])
+
+    worst = {"misfit": np.array([17, 3999])}
+    n = f"{len(columns.Table(ds).elements)} drawn, by lot"
+    for figure in (sweeps.slices(ds, "misfit"), sweeps.maps(ds, "misfit"), sweeps.corner(ds)):
+        assert f"{ok} of 4000 elements ok" in titles(figure)
+        assert n in titles(figure)
+    assert "no finite value drawn: rare" in titles(sweeps.corner(ds))
+    figure = sweeps.worst(ds, worst)
+    labels = [t.get_text() for t in figure.legends[0].get_texts()]
+    assert [t.split(",")[0] for t in labels] == ["misfit: element 17", "misfit: element 3999"]
+    assert labels[0].split(", ")[1] == f"{number(float(ds['misfit'][17]))} rad"
+    assert "by lot" in titles(figure)
+    # Nothing of this where all are drawn.
+    monkeypatch.setattr(columns, "DRAWN", 4000)
+    assert "drawn" not in titles(sweeps.corner(ds))
 
 
 def test_files(tmp_path):

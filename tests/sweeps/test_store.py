@@ -11,10 +11,11 @@ import xarray as xr
 
 from heli_jax import Flight, models, sweep
 from heli_jax.errors import InputError
-from heli_jax.sweeps import Between, Reduce, listed, sobol
+from heli_jax.sweeps import Between, Reduce, listed, pieces, sobol
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.job import job
 from heli_jax.sweeps.lanes import split_for
+from heli_jax.sweeps.summary import summary
 from heli_jax.sweeps.work import Worker
 
 ROLL = models.roll_on_stand
@@ -79,6 +80,31 @@ def test_the_summary_counts_and_names_the_worst(whole):
     assert found["worst"]["rms"][0]["element"] == int(np.argmax(data["rms"].values))
     assert found["worst"]["fit"][0]["element"] == int(np.argmin(data["fit"].values))
     assert found["timing"]["computed_chunks"] == found["timing"]["chunks"] == 10
+
+
+def test_the_summary_is_that_of_all_elements_however_it_is_read(bench30, short, whole, monkeypatch):
+    data = xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None).load()
+    data["status"][[3, 150, 299]] = [1, 2, 1]
+    data["rms"][7] = np.inf
+    data["fit"].values[[20, 200, 100]] = -1e9
+    data.attrs |= {"versions": {}, "seed": 0}
+    of = job(ROLL, bench30, short, DESIGN, REDUCE)
+    at_once = summary(data, of, {})
+    for elements in (1, 37, 299):
+        monkeypatch.setattr(pieces, "_ELEMENTS", elements)
+        assert summary(data, of, {}) == at_once
+    used = (data["status"] == 0) & np.isfinite(data["rms"])
+    found, wanted = at_once["results"]["rms"], data["rms"].values[used]
+    q = [found[n] for n in ("min", "q05", "median", "q95", "max")]
+    np.testing.assert_allclose(q, np.quantile(wanted, [0.0, 0.05, 0.5, 0.95, 1.0]), rtol=1e-14)
+    assert found["n"] == 296
+    assert at_once["results"]["mode_real"]["n"] == 297 * data.sizes["mode"]
+    assert at_once["axes"]["a"]["min"] == data["a"].values.min()
+    assert [row["element"] for row in at_once["worst"]["fit"]][:3] == [20, 100, 200]
+    order = np.argsort(-np.where(used, data["rms"], -np.inf))[:5]
+    assert [row["element"] for row in at_once["worst"]["rms"]] == order.tolist()
+    assert at_once["worst"]["rms"][1]["value"] == data["rms"].values[order[1]]
+    assert at_once["worst"]["rms"][1]["axes"]["a"] == data["a"].values[order[1]]
 
 
 @pytest.mark.parametrize("options", [{}, {"chunk": 100}, {"chunk": 300}])

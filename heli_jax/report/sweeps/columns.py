@@ -4,13 +4,18 @@ A place is a value as it lies on the paper: its logarithm where the scale is log
 """
 
 import functools
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from heli_jax.sweeps.pieces import pieces
+
 WIDE = 30.0
 """factor over which numbers of one sign are drawn logarithmically"""
+DRAWN = 1 << 18
+"""elements that are ok and drawn at most, and of the others half as many"""
 MARKS = 300
 """elements that are marked in a panel at most"""
 _OK = 0
@@ -20,15 +25,18 @@ _FEW_CELLS = 40
 
 
 class Column:
-    """An axis or a result: a number (n,) for each element, NaN where it is not finite."""
+    """An axis or a result: a number (n,) for each element drawn, NaN where it is not finite."""
 
-    def __init__(self, variable: xr.DataArray, ok: np.ndarray, *, axis: bool, alone: bool) -> None:
+    def __init__(
+        self, variable: xr.DataArray, elements: np.ndarray, ok: np.ndarray, *, axis: bool,
+        alone: bool,
+    ) -> None:  # fmt: skip
         self.name = str(variable.name)
         unit = variable.attrs.get("units")
         self.unit = None if unit is None else str(unit)
         self.flights = variable.sizes.get("flight", 0)
         self.whole = variable.dtype.kind in "biu" and not self.flights
-        self.values = _numbers(variable)
+        self.values = _numbers(variable, elements)
         self.finite = np.isfinite(self.values)
         self.used = self.finite & ok
         self.axis = axis
@@ -147,12 +155,16 @@ class Column:
 
 
 class Table:
-    """What is drawn of a sweep, read and sorted once."""
+    """What is drawn of a sweep, read and sorted once: all of it, or of a large one a lot."""
 
-    def __init__(self, ds: xr.Dataset) -> None:
+    def __init__(self, ds: xr.Dataset, named: Iterable[np.ndarray] = ()) -> None:
+        """`named` are elements that are drawn in any case."""
         self._ds = ds
-        self.ok = ds["status"].to_numpy() == _OK
-        self.size, self.n_ok = self.ok.size, int(np.count_nonzero(self.ok))
+        ok = ds["status"].to_numpy() == _OK
+        self.size, self.n_ok = ok.size, int(np.count_nonzero(ok))
+        self.elements = _drawn(ok, named)
+        """which elements, ascending, (n,)"""
+        self.ok = ok[self.elements]
         self._axes = [str(n) for n in ds.attrs["axes"]]
         self.results = [str(n) for n, v in ds.data_vars.items() if _is_result(v)]
         self._columns: dict[str, Column] = {}
@@ -160,7 +172,9 @@ class Table:
     def column(self, name: str) -> Column:
         if name not in self._columns:
             axis, alone = name in self._axes, len(self._axes) == 1
-            self._columns[name] = Column(self._ds[name], self.ok, axis=axis, alone=alone)
+            self._columns[name] = Column(
+                self._ds[name], self.elements, self.ok, axis=axis, alone=alone
+            )
         return self._columns[name]
 
     @functools.cached_property
@@ -168,12 +182,29 @@ class Table:
         """The axes that have a finite value."""
         return [c for c in map(self.column, self._axes) if not c.empty]
 
+    @property
+    def some(self) -> bool:
+        """Whether not all elements are drawn."""
+        return self.elements.size < self.size
+
+    def at(self, elements: np.ndarray) -> np.ndarray:
+        """Where elements of the sweep stand in the columns."""
+        return np.searchsorted(self.elements, elements)
+
     def failed(self, *columns: Column, most: int = MARKS) -> np.ndarray:
         """Elements that are not ok where these are finite, so many at most."""
         where = ~self.ok
         for c in columns:
             where = where & c.finite
         return by_lot(np.flatnonzero(where), most)
+
+
+def _drawn(ok: np.ndarray, named: Iterable[np.ndarray]) -> np.ndarray:
+    """All elements, or a lot of those that are ok, one of the others, and those named."""
+    if ok.size <= DRAWN:
+        return np.arange(ok.size)
+    lots = by_lot(np.flatnonzero(ok), DRAWN), by_lot(np.flatnonzero(~ok), DRAWN // 2)
+    return np.unique(np.concatenate([*lots, *(np.asarray(e, np.int64) for e in named)]))
 
 
 def widened(low: float, high: float) -> tuple[float, float]:
@@ -189,7 +220,7 @@ def by_lot(elements: np.ndarray, most: int) -> np.ndarray:
     of an axis alone."""
     if elements.size <= most:
         return elements
-    return np.sort(np.random.default_rng(0).choice(elements, most, replace=False))
+    return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
 
 
 def _is_result(variable: xr.DataArray) -> bool:
@@ -203,12 +234,17 @@ def _is_result(variable: xr.DataArray) -> bool:
     )
 
 
-def _numbers(variable: xr.DataArray) -> np.ndarray:
-    """A number (n,) for each element: the mean over flights, NaN where it is not finite.
+def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
+    """A number (n,) for each of some elements, ascending: the mean over flights, NaN where it is
+    not finite.
 
     Numbers that no picture can hold are taken as infinite, or as zero.
     """
-    values = variable.transpose("element", ...).to_numpy().astype(np.float64)
+    parts = []
+    for which, piece in pieces(variable):
+        first, last = np.searchsorted(elements, [which.start, which.stop])
+        parts.append(piece[elements[first:last] - which.start].astype(np.float64))
+    values = np.concatenate(parts) if parts else np.empty(0)
     if values.ndim > 1:
         with np.errstate(invalid="ignore", over="ignore"):
             values = values.mean(axis=1)

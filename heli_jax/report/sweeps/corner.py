@@ -50,8 +50,9 @@ def draw_corner(table: Table) -> Figure | None:
     size = width, min(width, 2.2)
     cells = [row * n + column for row in range(n) for column in range(row + 1)]
     made, panels = laid_out(cells, n, size, gap=(gap, gap), left=left, bottom=0.88)
-    bars = int(np.clip(2.0 * table.n_ok ** (1.0 / 3.0), 4, _BARS))
-    dense = int(np.clip(math.sqrt(table.n_ok / 10), 4, _BARS))
+    drawn = np.count_nonzero(table.ok)
+    bars = int(np.clip(2.0 * drawn ** (1.0 / 3.0), 4, _BARS))
+    dense = int(np.clip(math.sqrt(drawn / 10), 4, _BARS))
     for ax, cell in zip(panels, cells, strict=True):
         row, column = divmod(cell, n)
         x, y = shown[column], shown[row]
@@ -75,7 +76,7 @@ def draw_corner(table: Table) -> Figure | None:
         ax.tick_params(labelsize=7.0)
     empty = [c for c in considered if c.empty]
     there = len(table.axes) + len(table.results) - len(empty)
-    without = f"no finite value: {', '.join(short(c.name, 24) for c in empty)}"
+    without = f"{nothing(table)}: {', '.join(short(c.name, 24) for c in empty)}"
     head(panels[0], "Axes and results", table, [
         *marked(table, _MARKS),
         *[f"results are means over {c.flights} flights" for c in results if c.flights][:1],

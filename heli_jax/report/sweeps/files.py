@@ -30,7 +30,7 @@ def write_figures(directory: Path, ds: xr.Dataset, found: Mapping[str, np.ndarra
     They are slices-RESULT, maps-RESULT (the first six results), corner and worst; what a file
     should not be called becomes `_`.
     """
-    table = Table(ds)
+    table = Table(ds, found.values())
     draw: dict[str, Callable[[], Figure | None]] = {}
     for result, stem in _stems(table.results[:_RESULTS]).items():
         draw[f"slices-{stem}"] = functools.partial(draw_slices, table, result)

@@ -68,7 +68,8 @@ def head(ax: Axes, what: str, table: Table, said: Sequence[str]) -> None:
     """Title with the number of elements that are ok, and a quiet line below."""
     counted = f"{table.n_ok} of {table.size} elements ok"
     ax.set_title(f"{short(what, 78 - len(counted))}: {counted}", loc="left")
-    style.subtitle(ax, "; ".join(said))
+    lot = [f"{table.elements.size} drawn, by lot"] if table.some else []
+    style.subtitle(ax, "; ".join([*lot, *said]))
 
 
 # What is said: words for the line below the title.
@@ -76,7 +77,8 @@ def head(ax: Axes, what: str, table: Table, said: Sequence[str]) -> None:
 
 def nothing(table: Table) -> str:
     """Why there is no number to draw."""
-    return "no finite value" if table.n_ok else "no element is ok"
+    drawn = " drawn" if table.some else ""
+    return f"no finite value{drawn}" if table.n_ok else "no element is ok"
 
 
 def marked(table: Table, most: int = MARKS) -> list[str]:
@@ -92,5 +94,5 @@ def first(shown: int, of: int, what: str) -> list[str]:
 
 def not_finite(table: Table, y: Column) -> list[str]:
     """How many values of a result are not drawn for that."""
-    count = table.n_ok - int(np.count_nonzero(y.used))
+    count = int(np.count_nonzero(table.ok)) - int(np.count_nonzero(y.used))
     return [f"{count} not finite"] if count and not y.empty else []

@@ -30,7 +30,7 @@ def worst(ds: xr.Dataset, found: Mapping[str, np.ndarray]) -> Figure | None:
 
     `found` has the elements of each result, worst first. None where it has none.
     """
-    return draw_worst(Table(ds), found)
+    return draw_worst(Table(ds, found.values()), found)
 
 
 def draw_worst(table: Table, found: Mapping[str, np.ndarray]) -> Figure | None:
@@ -57,9 +57,10 @@ def draw_worst(table: Table, found: Mapping[str, np.ndarray]) -> Figure | None:
     crosses(ax, at, places[:, lost].ravel(), ms=2.5, alpha=0.5, transform=aside)
     for k, (column, elements) in enumerate(chosen):
         for dashes, e in zip(_DASHES, elements, strict=False):
-            text = f"{short(column.name, 24)}: element {e}, {_value(column, int(e))}"
+            here = int(table.at(e))
+            text = f"{short(column.name, 24)}: element {e}, {_value(column, here)}"
             ax.plot(
-                x, places[:, e], color=_COLOURS[k], ls=dashes, lw=2.6 - 0.3 * k, marker="o",
+                x, places[:, here], color=_COLOURS[k], ls=dashes, lw=2.6 - 0.3 * k, marker="o",
                 ms=5.0 - 0.5 * k, label=text, zorder=4 + k,
             )  # fmt: skip
     _upright(ax, axes)
@@ -87,9 +88,9 @@ def _bundle(ax: Axes, x: np.ndarray, places: np.ndarray) -> None:
     ax.add_collection(drawn, autolim=False)
 
 
-def _value(column: Column, element: int) -> str:
+def _value(column: Column, at: int) -> str:
     unit = "" if pretty(column.unit) == "–" else f" {pretty(column.unit)}"
-    return f"{number(float(column.values[element]))}{unit}"
+    return f"{number(float(column.values[at]))}{unit}"
 
 
 def _upright(ax: Axes, axes: list[Column]) -> None:

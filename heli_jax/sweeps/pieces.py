@@ -1,0 +1,16 @@
+"""Variables of a sweep read piece by piece, so that one of any size takes little memory."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import xarray as xr
+
+_ELEMENTS = 1 << 20
+
+
+def pieces(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Which elements, and what the variable has for them, (k, ...); all of them in turn."""
+    variable = variable.transpose("element", ...)
+    for start in range(0, variable.sizes["element"], _ELEMENTS):
+        which = slice(start, min(start + _ELEMENTS, variable.sizes["element"]))
+        yield which, variable.isel(element=which).to_numpy()
