@@ -64,13 +64,9 @@ def test_killed_and_resumed(tmp_path, monkeypatch):
     """The experiment that shows it at full size, in small."""
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))
     survives = __import__("sweep_survives")
-    import subprocess
-
     config = survives.configuration(tmp_path, n=6144, chunk=256, duration=20.0)
-    subprocess.run(
-        survives.command(config, tmp_path / "whole"), check=True, capture_output=True, cwd=tmp_path
-    )
-    found = survives.kills(config, tmp_path / "whole", tmp_path / "killed", 2, seed=1)
+    first = survives.run_through(config, tmp_path / "whole")
+    found = survives.kills(config, tmp_path / "whole", tmp_path / "killed", 2, first, seed=1)
     assert found.equal
     assert found.hit >= 1
     assert found.rewritten == 0
