@@ -15,7 +15,7 @@ from heli_jax.simulation.solvers import Held, at
 
 
 def blockwise(held: Held, m: int, x0: Any) -> Any:
-    """The states (N,) of a record from x0, cut into blocks of m samples, m a power of two.
+    """The states (N,) of a record from x0, cut into blocks of m samples.
 
     From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.

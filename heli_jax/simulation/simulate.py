@@ -100,8 +100,8 @@ def simulate(
         key: a JAX random key: the model's own noise is drawn with it, by the discrete process
             noise of a sample: exact for linear models with solver "exact", of the model linearised
             at each sample for others with fixed steps; without it there is none.
-        block: samples per step of solver "exact", a power of two; 32 is three times as fast as 1
-            for a single record, 1 is best for large batches.
+        block: samples per step of solver "exact"; 32 is three times as fast as 1 for a single
+            record, 1 is best for large batches.
         feedback: feedback(state, inputs) -> Inputs that act, once a sample; `inputs` are the given
             ones at that sample (references, or what is added).
         events: by name, event(params, state, inputs) -> a number that is above zero while the run
@@ -130,7 +130,7 @@ def simulate(
         method = Fed(method, feedback)
     if key is not None:
         method, held = _with_noise(model, held, method, dt, key)
-    if block > 1:
+    if block != 1:
         _require_blocks(method, block, events)
         states, result = blockwise(held, block, x0), dfx.RESULTS.successful
     else:
@@ -238,10 +238,10 @@ def held_columns(
 
 
 def _require_blocks(method: Any, block: int, events: Any) -> None:
+    if block < 1:
+        raise ValueError(f"block is {block}, wanted is at least 1")
     if not isinstance(method, Exact) or events:
         raise ValueError("block is for solver='exact' without feedback and events only")
-    if block & (block - 1):
-        raise ValueError(f"block is {block}, wanted is a power of two")
 
 
 def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tuple[Any, Held]:

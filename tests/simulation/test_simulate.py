@@ -63,13 +63,13 @@ def start(x=X0):
 
 
 @functools.cache
-def compiled(solver="exact", delayed=False, substeps=4, adjoint=None):
+def compiled(solver="exact", delayed=False, substeps=4, adjoint=None, block=1):
     made = {"exact": "exact", "rk4": "rk4", "tsit5": dfx.Tsit5(), "heun": dfx.Heun()}[solver]
 
     def run(p, u, x0, delay):
         return simulate(
             STAND, p, models.roll.Inputs(u), dt=DT, initial_state=x0, solver=made,
-            substeps=substeps, delay=delay if delayed else None, adjoint=adjoint,
+            substeps=substeps, delay=delay if delayed else None, adjoint=adjoint, block=block,
         )  # fmt: skip
 
     return jax.jit(run)
@@ -116,6 +116,13 @@ def test_exact_is_a_digital_filter(bench30):
 
 def test_exact_against_integration_interval_by_interval():
     close(table(run(BENCH)), switching(BENCH, U, X0, 0.0), 1e-9)
+
+
+@pytest.mark.parametrize("delay", [None, 0.033])
+@pytest.mark.parametrize("block", [2, 7, 32, N, 3 * N])
+def test_blocks_of_any_size_give_the_same(block, delay):
+    wanted = recurrence(BENCH, U, X0) if delay is None else switching(BENCH, U, X0, delay)
+    close(table(run(BENCH, block=block, delay=delay)), wanted, 1e-9)
 
 
 def test_rk4_converges_with_order_four():
@@ -358,6 +365,8 @@ bent = Model(
         (bent, U, {"solver": "exact"}, "'bent' is not linear: use solver='rk4'"),
         (STAND, U, {"solver": "euler"}, "unknown solver 'euler': use 'exact', 'rk4'"),
         (STAND, U, {"solver": "rk4", "substeps": 0}, "substeps is 0, wanted is at least 1"),
+        (STAND, U, {"block": 0}, "block is 0, wanted is at least 1"),
+        (STAND, U, {"solver": "rk4", "block": 4}, "block is for solver='exact'"),
         (STAND, U, {"dt": None}, "need dt"),
         (STAND, U[:1], {}, r"shapes \[\(1,\)\], wanted is \(N,\)"),
         (STAND, U[None], {}, r"shapes \[\(1, 60\)\], wanted is \(N,\)"),
