@@ -318,6 +318,9 @@ def _sweep(options: argparse.Namespace) -> int:
     assert wanted is not None
     out = out or run_directory.default_directory(config)
     resolved = output.as_yaml(configuration.resolved(experiment))
+    notes = []
+    if experiment.config.disturbance is not None and "seed" not in job.design.names:
+        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
     with output.sweep_progress() as progress, _client(options, config) as client:
         how = Options(
             resume=options.resume,
@@ -337,6 +340,7 @@ def _sweep(options: argparse.Namespace) -> int:
                 files={"config.yaml": resolved},
                 attributes={"configuration": resolved},
                 seed=wanted.seed or 0,
+                notes=notes,
             )
         except KeyboardInterrupt:
             kept = f"what is finished is kept: --out {out} --resume goes on"
@@ -348,7 +352,8 @@ def _sweep(options: argparse.Namespace) -> int:
             raise InputError(f"{config}: sweep: {e}") from e
     if not options.no_figures:
         _say("drawing figures")
-        output.draw_sweep(out, dataset, job)
+        for words in output.draw_sweep(out, dataset, job):
+            _say(words)
     output.print_sweep(out)
     return DONE
 

@@ -247,19 +247,27 @@ def _progress_words(p: "Progress") -> str:
     return f"{words}, {left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left"
 
 
-def draw_sweep(out: Path, dataset: Any, job: "Job") -> None:
-    """The figures of a sweep.
+def draw_sweep(out: Path, dataset: Any, job: "Job") -> list[str]:
+    """The figures of a sweep; returns what they leave out, in words.
 
     Raises:
         InputError: the figures cannot be written.
     """
-    from heli_jax.report.sweeps import write_figures
+    from heli_jax.report.sweeps import RESULTS, write_figures
     from heli_jax.sweeps.summary import worst
 
     try:
         write_figures(out / "figures", dataset, worst(dataset, job))
     except OSError as e:
         raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
+    drawn = [n for n in dataset.data_vars if not str(n).startswith("trajectory_")]
+    if len(drawn) <= RESULTS:
+        return []
+    return [f"slices and maps are of the first {RESULTS} of {len(drawn)} results"]
+
+
+def _counted(elements: int) -> str:
+    return "1 element" if elements == 1 else f"{elements} elements"
 
 
 def print_sweep(out: Path) -> None:
@@ -267,7 +275,7 @@ def print_sweep(out: Path) -> None:
     found = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     counts = {k: v for k, v in found["status"].items() if v}
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
-    print(f"{found['elements']} elements of {found['model']}: {words}")
+    print(f"{_counted(found['elements'])} of {found['model']}: {words}")
     rows = []
     for name, one in found["results"].items():
         numbers = [
@@ -284,10 +292,18 @@ def print_sweep(out: Path) -> None:
         print(f"worst {name}: element {one['element']}, {at}")
     for note in found["notes"]:
         print(f"! {note}")
+    for name, one in found["results"].items():
+        apart = {"infinite": one.get("infinite", 0), "not a number": one.get("nan", 0)}
+        if sum(apart.values()):
+            words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
+            of = one["n"] + sum(apart.values())
+            print(f"! {name}: of {of} values {words}, which its line leaves out")
+    if not found["status"].get("ok"):
+        print("! no element is ok: see docs/sweeps.md for what each status means")
     timing = found["timing"]
     if timing["computed_elements"]:
         print(
-            f"{timing['computed_elements']} elements in {timing['seconds']:.3g} s "
+            f"{_counted(timing['computed_elements'])} in {timing['seconds']:.3g} s "
             f"({timing['elements_per_s']:.3g} a second, with compilation)"
         )
     print(f"store: {out / 'sweep.zarr'}")

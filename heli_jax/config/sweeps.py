@@ -117,7 +117,14 @@ def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
     seed = seed if one.seed is None else one.seed
     if one.design in ("product", "zip"):
         _refuse(one, ("axes", "n", "file"), f"a {one.design} has designs in 'of'")
-        parts = [_design(part, model, path, seed + i) for i, part in enumerate(one.of)]
+        parts = []
+        for i, part in enumerate(one.of):
+            try:
+                parts.append(_design(part, model, path, _another(seed, i)))
+            except InputError:
+                raise
+            except ValueError as e:
+                raise ValueError(f"of[{i}].{e}") from e
         made: Callable[..., Design] = {"product": designs.product, "zip": designs.zipped}[
             one.design
         ]
@@ -135,6 +142,11 @@ def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
     _refuse(one, ("n",), f"a {one.design} has its axes' points: wanted is n in an axis")
     axes = {n: _points(n, a, model, path) for n, a in one.axes.items()}
     return {"grid": designs.grid, "list": designs.listed}[one.design](axes)
+
+
+def _another(seed: int, i: int) -> int:
+    """A seed for the i-th part of a design: no two parts, however deep, draw the same."""
+    return int(np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0])
 
 
 def _refuse(one: DesignConfig, keys: tuple[str, ...], why: str) -> None:

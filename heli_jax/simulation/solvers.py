@@ -4,7 +4,6 @@ A Runge-Kutta method that reads the input by time sees the next sample in its la
 of first order. Here the input of an interval is picked once and held while the step is made.
 """
 
-import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -321,6 +320,10 @@ class Accumulating(_Around):
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
+NAMED = ("Euler", "Midpoint", "Heun", "Ralston", "Bosh3", "Tsit5", "Dopri5", "Dopri8")
+"""Solvers of diffrax that have a name here: explicit ones, of fixed steps."""
+
+
 def solver_named(name: str) -> str | dfx.AbstractSolver:
     """ "exact", "rk4", or a diffrax solver of fixed steps by its name there, such as "Tsit5".
 
@@ -329,19 +332,7 @@ def solver_named(name: str) -> str | dfx.AbstractSolver:
     """
     if name in ("exact", "rk4"):
         return name
-    found = getattr(dfx, name, None)
-    if isinstance(found, type) and issubclass(found, dfx.AbstractSolver):
-        try:
-            return found()
-        except TypeError:  # an abstract one, or one that has to be given something
-            pass
-    known = [n for n in dir(dfx) if _is_solver(getattr(dfx, n))]
-    raise ValueError(f"solver: unknown solver {name!r}{nearest(name, ['exact', 'rk4', *known])}")
-
-
-def _is_solver(found: Any) -> bool:
-    return (
-        isinstance(found, type)
-        and issubclass(found, dfx.AbstractSolver)
-        and not inspect.isabstract(found)
-    )
+    if name in NAMED:
+        return getattr(dfx, name)()
+    known = ("exact", "rk4", *NAMED)
+    raise ValueError(f"solver: unknown solver {name!r}{nearest(name, known)}")

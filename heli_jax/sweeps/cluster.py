@@ -6,6 +6,7 @@ common. A worker that dies has its chunks computed by another.
 
 import contextlib
 import logging
+import signal
 import sys
 import threading
 import uuid
@@ -15,7 +16,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from distributed import Client, LocalCluster, WorkerPlugin, as_completed
+from distributed import CancelledError, Client, LocalCluster, WorkerPlugin, as_completed
+from distributed.comm.core import CommClosedError
+from distributed.scheduler import KilledWorker
 
 from heli_jax.errors import InputError
 from heli_jax.sweeps.job import Job
@@ -27,6 +30,10 @@ _RETRIES = 5
 _AHEAD = 3
 """chunks that each thread of a worker has in hand or waiting"""
 _CONNECT_S = 20
+_IMPORTS = (
+    "wanted is that modules of your own can be imported there too: begin scheduler and workers "
+    "with PYTHONPATH set to their folder"
+)
 
 _workers: dict[str, Worker] = {}
 _building = threading.Lock()
@@ -63,6 +70,7 @@ def connected(
     """
     cache: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_quiet())
         if scheduler is not None:
             try:
                 client = stack.enter_context(Client(scheduler, timeout=_CONNECT_S))
@@ -74,18 +82,67 @@ def connected(
             cache = None
         else:
             made: Any = LocalCluster  # which takes None too
-            cluster = made(
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-            )
+            with _deaf():
+                cluster = made(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
             client = stack.enter_context(Client(stack.enter_context(cluster)))
         x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
         _check_versions(client, scheduler or "--workers")
         client.register_plugin(Prepared(x64, None if folder is None else str(folder), cache))
         yield client
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Processes that are started meanwhile do not hear Ctrl-C: they end with this one, which
+    does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The client does not log a lost scheduler at length: `_answering` says it."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@contextlib.contextmanager
+def _answering() -> Iterator[None]:
+    """What dask says of lost schedulers and of workers that cannot compute, as a sentence.
+
+    Raises:
+        InputError: the scheduler or too many workers are gone, or one's own modules are not there.
+    """
+    try:
+        yield
+    except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
+        raise InputError(
+            f"dask: the scheduler or its workers are lost ({type(e).__name__}), wanted is that "
+            "they run to the end; what is finished is kept: --resume goes on"
+        ) from e
+    except ImportError as e:
+        raise InputError(f"dask: {e} on the scheduler or a worker, {_IMPORTS}") from e
+    except RuntimeError as e:
+        if "deserialization" not in str(e):
+            raise
+        raise InputError(f"dask: the scheduler cannot read the sweep, {_IMPORTS}") from e
 
 
 def _versions() -> dict[str, str]:
@@ -118,7 +175,8 @@ def split_there(client: Client, job: Job, **asked: Any) -> Split:
     """How a worker would cut the sweep: it may have other devices than this process."""
     asked.pop("memory", None)  # a file of this machine
     asked["shares"] = _threads(client)
-    return Split(*client.submit(_split, job, asked, pure=False).result())
+    with _answering():
+        return Split(*client.submit(_split, job, asked, pure=False).result())
 
 
 def _threads(client: Client) -> int:
@@ -147,7 +205,8 @@ def computed(
     first = [submitted(k) for _, k in zip(range(_AHEAD * threads), waiting, strict=False)]
     running = as_completed(first)
     for future in running:
-        chunk, results = future.result()
+        with _answering():
+            chunk, results = future.result()
         future.release()
         following = next(waiting, None)
         if following is not None:

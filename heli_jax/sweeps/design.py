@@ -98,7 +98,10 @@ def _points(name: str, axis: Between | Sequence[float] | np.ndarray) -> np.ndarr
         if axis.n is None or axis.n < 2:
             found = "none" if axis.n is None else axis.n
             raise ValueError(f"axes.{name}: found n: {found}, wanted are at least 2 points")
-        return axis.at(np.linspace(0.0, 1.0, axis.n))
+        values = axis.at(np.linspace(0.0, 1.0, axis.n))
+        even = axis.scale == "linear" and (axis.upper - axis.lower) % (axis.n - 1) == 0.0
+        # From 0 to 9 in ten points: 7 and not 6.999999999999999, which as a seed would be 6.
+        return np.round(values) if even and axis.lower == round(axis.lower) else values
     values = np.asarray(axis)
     if values.ndim != 1 or values.size == 0:
         raise ValueError(f"axes.{name}: no values, wanted is at least one")
@@ -310,6 +313,15 @@ def sobol(axes: Mapping[str, Between], n: int, seed: int = 0) -> Design:
         ValueError: no axis, ends that do not fit, or no points.
     """
     return _Sampled(axes, n, seed, "sobol")
+
+
+def log_axes(design: Design) -> set[str]:
+    """The axes that a design fills evenly in the logarithm."""
+    if isinstance(design, _Combined):
+        return set().union(*map(log_axes, design.parts))
+    if isinstance(design, _Sampled):
+        return {n for n, axis in design.axes.items() if axis.scale == "log"}
+    return set()
 
 
 def _check_parts(parts: tuple[Design, ...]) -> None:

@@ -58,6 +58,12 @@ class Plan(NamedTuple):
     simulated: bool
 
 
+_MOST = 10**10
+"""elements: more take months"""
+_LOOKED_AT = 1 << 16
+"""elements whose seeds are checked"""
+
+
 class Job(NamedTuple):
     """All that a chunk of a sweep needs."""
 
@@ -134,8 +140,10 @@ def job(
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
         raise ValueError("flights: none given, wanted is at least one")
-    if design.size < 1:
-        raise ValueError("axes: the design has no element, wanted is at least one")
+    if not 1 <= design.size <= _MOST:
+        raise ValueError(
+            f"axes: the design has {design.size:.3g} elements, wanted are 1 to {_MOST:.0e}"
+        )
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, trajectories)
@@ -203,6 +211,9 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
             )
         if "delay" in design.names and "delay" not in params:
             raise ValueError("axes.seed: noise is drawn without a delay only")
+        seeds = design.values(0, min(design.size, _LOOKED_AT))["seed"]
+        if not np.all((seeds == np.round(seeds)) & (seeds >= 0) & (seeds < 2**32)):
+            raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1, as values")
 
 
 def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
@@ -229,7 +240,7 @@ def _check_results(
     for name, one in reduce.items():
         reducers.check(name, one, outputs, inputs)
         stream = reducers.streaming(one)
-        if name in design.names or name in ("status", "element", "flight", "time"):
+        if name in design.names or name in ("status", "element"):
             raise ValueError(f"reduce.{name}: the name is taken, wanted is another")
         if stream is None or not stream.against_flight:
             continue

@@ -104,6 +104,9 @@ def element(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | N
         **{n.removeprefix("initial."): v for n, v in moved.items() if n.startswith("initial.")},
     )
     inputs = _moved(inputs, moved)
+    if start is not None and numbers.pilot is not None:
+        # The gains are those for the vehicle as it is given, the flight is this one's own.
+        numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=start.state))
     results: dict[str, Any] = {}
     kept: dict[str, Any] = {}
     if plan.simulated:
@@ -200,6 +203,34 @@ def _finished(plan: Plan, numbers: Given, value: dict[str, Any], n: int) -> dict
     return found
 
 
+def _own(name: str, how: Callable[[Trajectory], Any], run: Trajectory) -> dict[str, Any]:
+    """What one's own function of a run gives, by name.
+
+    Raises:
+        ValueError: it fails, or gives no real number.
+    """
+    called = getattr(how, "__qualname__", str(how))
+    try:
+        given = how(run)
+        found = {n: jnp.asarray(v) for n, v in _named(name, given).items()}
+    except Exception as e:
+        # JAX's own sentences go on for pages.
+        first = str(e).partition("\n")[0]
+        raise ValueError(
+            f"reduce.{name}: {called} cannot be computed ({type(e).__name__}: {first:.200}), "
+            "wanted is a function of a Trajectory, of jax.numpy and without branches on its "
+            "values, that gives a number or numbers by name"
+        ) from e
+    for n, v in found.items():
+        if not (jnp.issubdtype(v.dtype, jnp.number) or v.dtype == jnp.bool_) or (
+            jnp.issubdtype(v.dtype, jnp.complexfloating)
+        ):
+            raise ValueError(
+                f"reduce.{name}: {called} gives {n} as {v.dtype}, wanted is a real number"
+            )
+    return found
+
+
 def _named(name: str, result: Any) -> dict[str, Any]:
     """A result by name; several of one function by name and key."""
     if isinstance(result, dict):
@@ -252,7 +283,7 @@ def _whole(
     results = _finished(plan, numbers, value, n)
     for name, one in plan.reduce:
         if callable(one.how) and reducers.streaming(one) is None:
-            results |= _named(name, one.how(run))
+            results |= _own(name, one.how, run)
     kept = {}
     if plan.trajectories is not None:
         every = plan.trajectories.every

@@ -180,6 +180,12 @@ def check(name: str, one: Reduce, outputs: tuple[str, ...], inputs: tuple[str, .
         )
     if one.input is not None and one.how != "margins":
         raise ValueError(f"{where}.input: only margins take one")
+    if one.how != "margins" and one.gain != 1.0:
+        raise ValueError(f"{where}.gain: only margins take one")
+    whole = callable(one.how) and not isinstance(one.how, Streaming)
+    if one.signal is not None and (whole or one.how == "modes"):
+        what = "modes are" if one.how == "modes" else "a function of a Trajectory is"
+        raise ValueError(f"{where}.signal: {what} of no one signal, wanted is none")
     if one.how == "margins" and not (np.isfinite(one.gain) and one.gain != 0):
         raise ValueError(f"{where}.gain: found {one.gain}, wanted is a number that is not zero")
 

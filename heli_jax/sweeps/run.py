@@ -127,14 +127,25 @@ def carry_out(
     files: Mapping[str, str] | None = None,
     attributes: Mapping[str, Any] | None = None,
     seed: int = 0,
+    notes: Sequence[str] = (),
 ) -> xr.Dataset:
-    """Carry out a checked sweep; `files` are written beside the store when it is made.
+    """Carry out a checked sweep; `files` are written beside the store when it is made, `notes` are
+    said and kept.
 
     Raises:
         InputError: as `sweep`.
     """
     notes = [
-        f"axes.{n}: {job.model.name} does not read {n}: no run depends on it" for n in unread(job)
+        *notes,
+        *(
+            f"axes.{n}: {job.model.name} does not read {n}: no run depends on it"
+            for n in unread(job)
+        ),
+        *(
+            f"reduce.{n}: the margins are those of the loop without the delay"
+            for n, r in job.reduce.items()
+            if r.how == "margins" and "delay" in job.design.names
+        ),
     ]
     for note in notes:
         options.say(note)
@@ -144,8 +155,10 @@ def carry_out(
         _compute(job, store, options)
         return store.dataset().load()
     where = f"--out {out}"
-    if not (options.resume and out.exists()):
-        run_directory.require_free(out, ", or --resume")
+    empty = out.is_dir() and not any(out.iterdir())
+    if not (options.resume and out.exists() and not empty):
+        if not (options.resume and empty):
+            run_directory.require_free(out, ", or --resume")
         split, words = _cut(job, options, words)
         try:
             with run_directory.whole(out) as directory:
@@ -158,12 +171,14 @@ def carry_out(
         raise InputError(f"{where}: is no directory that can be written to")
     with stores.only_writer(out, where):
         store = stores.reopen(out / "sweep.zarr", job, where)
-        _same_cut(store, options, where)
+        store.require_whole_chunks()
+        _same_cut(store, job, options, where)
         for note in _changes(store.attributes.get("versions", {}), versions()):
             options.say(f"{where}: {note}")
         timing = _compute(job, store, options)
         dataset = store.dataset()
-        write_summary(out / "summary.json", dataset, job, timing, where)
+        with stores.readable(where):
+            write_summary(out / "summary.json", dataset, job, timing, where)
     return dataset
 
 
@@ -173,7 +188,8 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
         given = getattr(options, name)
         if given is not None and given < 1:
             raise ValueError(f"{name} is {given}, wanted is at least 1")
-    asked = {"chunk": options.chunk, "lanes": options.lanes, "memory": options.memory}
+    lanes = None if options.lanes is None else min(options.lanes, job.design.size)
+    asked = {"chunk": options.chunk, "lanes": lanes, "memory": options.memory}
     if options.client is not None:
         from heli_jax.sweeps.cluster import split_there
 
@@ -185,10 +201,11 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
     return split, words
 
 
-def _same_cut(store: stores.Store, options: Options, where: str) -> None:
+def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> None:
     for name in ("chunk", "lanes"):
         given, kept = getattr(options, name), getattr(store.split, name)
-        if given is not None and given != kept:
+        taken = job.design.size if name == "lanes" else math.inf
+        if given is not None and min(given, taken) != kept:
             raise InputError(
                 f"{where}: was begun with {name} {kept}, found {given}, wanted is the same"
             )

@@ -34,6 +34,7 @@ class Store:
         attributes: Any = dict(group.attrs)
         self.split = Split(**attributes["split"])
         self.attributes = attributes
+        self._results: list[str] = list(attributes["results"])
         # Looked up once: it takes as long as a write.
         self._arrays: dict[str, Any] = dict(group.arrays())
 
@@ -48,6 +49,22 @@ class Store:
         count = self.split.chunks(status.shape[0])
         firsts = [status[k * self.split.chunk] for k in range(count)]
         return np.asarray(firsts).reshape(-1) != NOT_RUN
+
+    def require_whole_chunks(self) -> None:
+        """Refuse a store that lacks a file of a finished chunk.
+
+        Raises:
+            InputError: it does, or cannot be read.
+        """
+        with readable(self.where):
+            finished = int(np.count_nonzero(self.done()))
+            for name in self._results:
+                found = self._arrays[name].nchunks_initialized
+                if found < finished:
+                    raise InputError(
+                        f"{self.where}: {name} has {found} chunks of {finished} that are finished, "
+                        "wanted is a store from which nothing was taken, or another --out"
+                    )
 
     def write(self, chunk: int, results: Mapping[str, np.ndarray]) -> None:
         """Write a chunk's variables, its status last.
@@ -68,6 +85,20 @@ class Store:
         found = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
         # The order of files in a directory is none.
         return found[self.attributes["results"]]
+
+
+@contextlib.contextmanager
+def readable(where: str) -> Iterator[None]:
+    """What Zarr says of a damaged file, as a sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as e:
+        raise InputError(
+            f"{where}: a file of sweep.zarr cannot be read ({e}), wanted is an undamaged store, or "
+            "another --out"
+        ) from e
 
 
 @contextlib.contextmanager
@@ -119,7 +150,12 @@ def create(
 
 
 def _label(job: Job, i: int) -> str:
-    return job.flights[i].name or f"flight {i + 1}"
+    """The flight's name; with its place where another has the same."""
+    name = job.flights[i].name
+    if not name:
+        return f"flight {i + 1}"
+    alone = sum(f.name == name for f in job.flights) == 1
+    return name if alone else f"{name} ({i + 1})"
 
 
 def _array(group: zarr.Group, name: str, one: Variable, size: int, split: Split) -> None:

@@ -1,5 +1,6 @@
 """What a sweep came to, in a page of JSON."""
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,12 @@ def write_summary(
     Raises:
         InputError: it cannot be written.
     """
-    text = json.dumps(summary(dataset, job, timing), indent=1, allow_nan=False)
+    found = summary(dataset, job, timing)
+    if not timing["computed_chunks"] and path.exists():
+        # Resumed when it was finished: what it took stays.
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            found["timing"] = json.loads(path.read_text(encoding="utf-8"))["timing"]
+    text = json.dumps(found, indent=1, allow_nan=False)
     with run_directory.whole_file(path, f"{where}: summary.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -76,15 +82,21 @@ def _ends(variable: xr.DataArray) -> dict[str, Any]:
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
     # The values are held once: the partition for the quantiles is made where they are.
     values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
+    infinite = nan = 0
     for which, piece in pieces(variable):
-        found = _finite(piece[fine[which]])
+        used = piece[fine[which]]
+        infinite += int(np.count_nonzero(np.isinf(used)))
+        nan += int(np.count_nonzero(np.isnan(used)))
+        found = _finite(used)
         values[n : n + found.size] = found
         n += found.size
+    others = {"infinite": infinite, "nan": nan}
+    counts = {"n": n} | {k: v for k, v in others.items() if v}
     if not n:
-        return {**_unit(variable), "n": 0}
+        return {**_unit(variable), **counts}
     q = np.quantile(values[:n], [0.0, 0.05, 0.5, 0.95, 1.0], overwrite_input=True)
     names = ("min", "q05", "median", "q95", "max")
-    return {**_unit(variable), "n": n, **dict(zip(names, map(float, q), strict=True))}
+    return {**_unit(variable), **counts, **dict(zip(names, map(float, q), strict=True))}
 
 
 def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.ndarray]:

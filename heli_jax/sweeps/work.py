@@ -1,6 +1,7 @@
 """Chunks of a sweep, computed: what one process does, here or on another machine."""
 
 import functools
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.margins import margins
 from heli_jax.sweeps import reducers
+from heli_jax.sweeps.design import log_axes
 from heli_jax.sweeps.job import Job, axis_unit
 from heli_jax.sweeps.program import (
     DIVERGED,
@@ -25,6 +27,11 @@ from heli_jax.vehicle import of_helicopter, possible
 BLOCKS = 2
 """Blocks that a device has at least, unless it is alone: XLA writes other code for one block than
 for several, and how many devices there are shall change no digit."""
+
+
+_NAME = re.compile(r"(?!\.|__)[^/\\\x00-\x1f]+")
+"""of a result: it is a folder of the store"""
+_TAKEN = ("element", "flight", "time", "mode", "zarr.json")
 
 
 class Variable(NamedTuple):
@@ -70,13 +77,19 @@ def variables(job: Job) -> dict[str, Variable]:
 
     def add(name: str, dims: tuple[tuple[str, int], ...], kind: str, words: dict[str, Any]) -> None:
         dims = (*more, *dims)
+        if not _NAME.fullmatch(name) or name in _TAKEN:
+            raise ValueError(
+                f"reduce: a result would be called {name!r}, wanted is another name: not "
+                f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
+            )
         if name in found:
             raise ValueError(f"reduce: two results or axes would be called {name!r}")
         found[name] = Variable(
             ("element", *(d for d, _ in dims)), tuple(k for _, k in dims), kind, words
         )
 
-    for name, one in shape.results.items():
+    order = list(job.reduce)
+    for name, one in sorted(shape.results.items(), key=lambda r: _place(r[0], order)):
         if one.shape:
             raise ValueError(
                 f"reduce.{name}: the result has shape {one.shape}, wanted is one number"
@@ -102,6 +115,13 @@ def variables(job: Job) -> dict[str, Variable]:
     return found
 
 
+def _place(name: str, order: list[str]) -> int:
+    """Where a result stands: with the reducer that it is of, named alike or before a key."""
+    if name in order:
+        return order.index(name)
+    return next((i for i, n in enumerate(order) if name.startswith(f"{n}_")), len(order))
+
+
 def _words(unit: str | None, meaning: str) -> dict[str, Any]:
     words = {"units": unit} if unit is not None else {}
     return words | ({"long_name": meaning} if meaning else {})
@@ -119,7 +139,8 @@ def _axis_words(job: Job, name: str) -> dict[str, Any]:
             "delay": "the inputs act this much later",
             "seed": "seed of the disturbance",
         }[kind]
-    return _words(axis_unit(job.model, name), meaning)
+    words = _words(axis_unit(job.model, name), meaning)
+    return words | ({"scale": "log"} if name in log_axes(job.design) else {})
 
 
 def _result_words(job: Job, name: str) -> dict[str, Any]:
@@ -175,7 +196,7 @@ class Worker:
         status = functools.reduce(_worst, [one.status for one in found])
         impossible = self._impossible(pending.columns)
         finite = [np.isfinite(v) for v in pending.columns.values()]
-        status = np.where(impossible & (status != DIVERGED), OUT_OF_RANGE, status)
+        status = np.where(impossible, OUT_OF_RANGE, status)
         status = np.where(functools.reduce(np.logical_and, finite), status, DIVERGED)
         # What a run that diverged or a vehicle that cannot be left behind is no result.
         lost = impossible | (status == DIVERGED)

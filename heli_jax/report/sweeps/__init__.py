@@ -7,9 +7,9 @@ get the report's look.
 """
 
 from heli_jax.report.sweeps.corner import corner
-from heli_jax.report.sweeps.files import write_figures
+from heli_jax.report.sweeps.files import RESULTS, write_figures
 from heli_jax.report.sweeps.maps import maps
 from heli_jax.report.sweeps.slices import slices
 from heli_jax.report.sweeps.worst import worst
 
-__all__ = ["corner", "maps", "slices", "worst", "write_figures"]
+__all__ = ["RESULTS", "corner", "maps", "slices", "worst", "write_figures"]

@@ -40,6 +40,7 @@ class Column:
         self.finite = np.isfinite(self.values)
         self.used = self.finite & ok
         self.axis = axis
+        self._declared_log = axis and variable.attrs.get("scale") == "log"
         self._alone = alone
         self._seen = self.finite if axis else self.used
         self._cells: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -88,6 +89,8 @@ class Column:
         ends = self._at(0.0), self._at(1.0)
         if ends[0] <= 0.0 <= ends[1] or (self.whole and not self.axis):
             return False
+        if self._declared_log:
+            return True
         low, high = ends if self.axis else (self._at(0.01), self._at(0.99))
         return max(abs(low), abs(high)) > WIDE * min(abs(low), abs(high))
 

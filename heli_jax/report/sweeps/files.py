@@ -18,7 +18,7 @@ from heli_jax.report.sweeps.maps import draw_maps
 from heli_jax.report.sweeps.slices import draw_slices
 from heli_jax.report.sweeps.worst import draw_worst
 
-_RESULTS = 6
+RESULTS = 6
 """results with figures of their own"""
 _DPI = 160
 """of what is pixels in an SVG"""
@@ -32,7 +32,7 @@ def write_figures(directory: Path, ds: xr.Dataset, found: Mapping[str, np.ndarra
     """
     table = Table(ds, found.values())
     draw: dict[str, Callable[[], Figure | None]] = {}
-    for result, stem in _stems(table.results[:_RESULTS]).items():
+    for result, stem in _stems(table.results[:RESULTS]).items():
         draw[f"slices-{stem}"] = functools.partial(draw_slices, table, result)
         draw[f"maps-{stem}"] = functools.partial(draw_maps, table, result)
     draw["corner"] = functools.partial(draw_corner, table)
