@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from distributed import CancelledError
+from distributed.comm.core import CommClosedError
 
 from heli_jax import models, sweep
 from heli_jax.errors import InputError
-from heli_jax.sweeps import Between, Reduce, sobol
+from heli_jax.sweeps import Between, Reduce, cluster, sobol
 
 ROOT = Path(__file__).parents[2]
 ROLL = models.roll_on_stand
@@ -58,6 +60,23 @@ def test_no_scheduler_ends_in_words(monkeypatch):
         cluster.connected("tcp://127.0.0.1:9"),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (CancelledError("x"), "the scheduler or its workers are lost"),
+        (CommClosedError("x"), "--resume goes on"),
+        (ModuleNotFoundError("No module named 'mine'"), "No module named 'mine' on the scheduler"),
+        (RuntimeError("Error during deserialization of the task graph"), "PYTHONPATH"),
+    ],
+)
+def test_what_dask_says_ends_in_one_sentence(error, words):
+    with pytest.raises(InputError, match=words) as e, cluster._answering():
+        raise error
+    assert "\n" not in str(e.value)
+    with pytest.raises(RuntimeError, match="another"), cluster._answering():
+        raise RuntimeError("another")
 
 
 def test_killed_and_resumed(tmp_path, monkeypatch):

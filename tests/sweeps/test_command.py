@@ -174,6 +174,35 @@ WRONG = {
         lambda c: c["sweep"].update(design="sobol", axes={"a": {"lower": 4, "upper": 5}}),
         ["n: missing"],
     ),
+    "n that is missing, deep down": (
+        lambda c: c["sweep"].update(
+            design="product", axes={},
+            of=[{"design": "list", "axes": {"a": {"values": [5]}}},
+                {"design": "zip", "of": [{"design": "lhs", "axes": {"If": {}}}]}],
+        ),
+        ["of[1].of[0].n: missing"],
+    ),
+    "more than anyone can wait for": (
+        lambda c: c["sweep"].update(
+            axes={n: {"lower": 1, "upper": 2, "n": 100_000} for n in ("Ixx", "If", "a")}
+        ),
+        ["1e+15 elements"],
+    ),
+    "a name that is no folder": (
+        lambda c: c["sweep"]["reduce"].update({"a/b": {"how": "rms", "signal": "roll"}}),
+        ["'a/b'", "no slash"],
+    ),
+    "a name of a dimension": (
+        lambda c: c["sweep"]["reduce"].update(mode={"how": "rms", "signal": "roll"}),
+        ["'mode'", "another name"],
+    ),
+    "a gain of no loop": (
+        lambda c: c["sweep"]["reduce"]["rms"].update(gain=2.0), ["rms.gain: only margins"],
+    ),
+    "a signal of modes": (
+        lambda c: c["sweep"]["reduce"].update(m={"how": "modes", "signal": "roll"}),
+        ["m.signal: modes are of no one signal"],
+    ),
     "points for a sample": (
         lambda c: c["sweep"].update(design="lhs", n=3, axes={"a": {"values": [4]}}),
         ["axes.a.values", "lower and upper"],
@@ -192,7 +221,10 @@ WRONG = {
     ),
     "an unknown solver": (lambda c: c["sweep"].update(solver="Tsit6"), ["solver", "Tsit5"]),
     "an abstract solver": (
-        lambda c: c["sweep"].update(solver="AbstractSolver"), ["unknown solver"],
+        lambda c: c["sweep"].update(solver="AbstractSolver"), ["unknown solver", "Dopri5"],
+    ),
+    "a solver that steps cannot be fixed for": (
+        lambda c: c["sweep"].update(solver="Kvaerno5"), ["unknown solver 'Kvaerno5'", "Dopri5"],
     ),
     "trim of a roll model": (
         lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
@@ -209,6 +241,113 @@ WRONG = {
         lambda c: c.update(model="helicopter"), ["vehicle", "missing"],
     ),
 }  # fmt: skip
+
+
+DRAWN = {"disturbance": {"axis": "roll", "sigma_w": 1.0, "tau_w": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("design", "axis"),
+    [("grid", {"lower": 0, "upper": 3, "n": 7}), ("list", {"values": [0.5]}),
+     ("sobol", {"lower": 0, "upper": 3}), ("list", {"values": [-1]})],
+)  # fmt: skip
+def test_seeds_that_are_no_whole_numbers_are_refused(design, axis, write, tmp_path, capsys):
+    more = {"n": 4} if design == "sobol" else {}
+    config = content(design=design, axes={"seed": axis}, **more) | DRAWN
+    assert cli.main(["sweep", str(write(config)), "--out", str(tmp_path / "out")]) == 2
+    assert "axes.seed: wanted are whole numbers from 0 to 2^32 - 1" in capsys.readouterr().err
+
+
+def test_seeds_from_a_range_are_exact(write, tmp_path):
+    config = content(axes={"seed": {"lower": 0, "upper": 9, "n": 10}}) | DRAWN
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(config)), "--out", str(out), "--no-figures"]) == 0
+    found = opened(out)
+    assert found["seed"].values.tolist() == list(range(10))
+    assert len(set(found["rms"].values.tolist())) == 10
+
+
+def test_a_disturbance_that_nothing_draws_is_said(write, tmp_path, capsys):
+    out = tmp_path / "out"
+    config = content() | DRAWN
+    assert cli.main(["sweep", str(write(config)), "--out", str(out), "--no-figures"]) == 0
+    shown = capsys.readouterr()
+    assert "disturbance: nothing is drawn without an axis seed" in shown.err
+    assert "! disturbance: nothing is drawn" in shown.out
+    assert "nothing is drawn" in opened(out).attrs["notes"][0]
+
+
+def test_nested_designs_draw_each_their_own(write, tmp_path):
+    def lhs(name, **more):
+        axes = {name: {"lower": 1e-4, "upper": 1e-3}}
+        return {"design": "lhs", "n": 200, "axes": axes, **more}
+
+    one = {"design": "list", "axes": {"a": {"values": [5.0]}}}
+    nested = {"design": "product", "of": [one, lhs("If")]}
+    deeper = {"design": "zip", "of": [nested, lhs("Ixx")]}
+    parts = [deeper, lhs("L1"), lhs("L2", seed=1)]
+    config = content(design="zip", axes={}, of=parts)
+    path = write(config)
+    from heli_jax import config as configuration
+    from heli_jax import generate
+    from heli_jax.config.sweeps import sweep_job
+
+    values = sweep_job(*generate.drive(configuration.load(path, []))).design.values(0, 200)
+    r = np.corrcoef([values[n] for n in ("If", "Ixx", "L1", "L2")])
+    assert np.abs(r - np.eye(4)).max() < 0.3
+
+
+OWN = {
+    "turned into NumPy": ("np.max(np.asarray(run.outputs.roll))", "TracerArrayConversionError"),
+    "a branch": ("1.0 if run.outputs.roll[0] > 0 else 2.0", "TracerBoolConversionError"),
+    "no such output": ("run.outputs.rol", "no attribute 'rol'"),
+    "nothing": ("None", "None is not a valid value"),
+    "complex": ("run.outputs.roll[0].astype(complex)", "wanted is a real number"),
+    "a text": ("'hello'", "TypeError"),
+    "its own error": ("1 / 0", "ZeroDivisionError: division by zero"),
+    "an array": ("run.outputs.roll", "has shape (50,), wanted is one number"),
+    "a name that is none": ("{'a/b': 1.0}", "'own_a/b', wanted is another name"),
+}
+
+
+@pytest.mark.parametrize("case", OWN)
+def test_a_function_that_cannot_be_computed_is_named(case, write, tmp_path, capsys):
+    body, words = OWN[case]
+    (tmp_path / "own_functions.py").write_text(
+        f"import numpy as np\n\n\ndef of_mine(run):\n    return {body}\n"
+    )
+    sys.modules.pop("own_functions", None)
+    config = content(reduce={"own": {"how": "own_functions:of_mine"}})
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(write(config)), "--out", str(out)]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert len(shown.splitlines()) == 1
+    assert "study.yaml: sweep: reduce" in shown
+    assert words in shown
+    assert not out.exists()
+
+
+def test_numbers_that_the_summary_leaves_out_are_counted(write, tmp_path, capsys):
+    loop = {"how": "margins", "signal": "roll", "input": "x_roll"}
+    reduce = {"far": {**loop, "gain": -1e-9}, "lost": {**loop, "gain": -1e6}}
+    out = tmp_path / "out"
+    path = write(content(reduce=reduce))
+    assert cli.main(["sweep", str(path), "--out", str(out), "--no-figures"]) == 0
+    found = json.loads((out / "summary.json").read_text())
+    data = opened(out)
+    for name in ("far_gain", "far_phase", "lost_gain", "lost_phase"):
+        values, one = data[name].values, found["results"][name]
+        assert one.get("infinite", 0) == np.count_nonzero(np.isinf(values))
+        assert one.get("nan", 0) == np.count_nonzero(np.isnan(values))
+        assert one["n"] == np.count_nonzero(np.isfinite(values))
+    shown = capsys.readouterr().out
+    assert found["results"]["far_phase"]["infinite"] == 6
+    assert "! far_phase: of 6 values 6 infinite, which its line leaves out" in shown
+    assert "! lost_gain: of 6 values 6 not a number, which its line leaves out" in shown
+    # Gone on with when it is finished, it still says what it took.
+    before = found["timing"]
+    assert cli.main(["sweep", str(path), "--out", str(out), "--no-figures", "--resume"]) == 0
+    assert json.loads((out / "summary.json").read_text())["timing"] == before
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -9,6 +9,7 @@ import pytest
 
 from heli_jax import Flight, Model, linearize, models, naming, simulate, sweep
 from heli_jax.analysis.linear import modes
+from heli_jax.analysis.pilot import attitude_hold
 from heli_jax.analysis.trim import Condition, trim
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.metrics import metrics
@@ -304,6 +305,32 @@ def test_a_model_that_runs_away_is_flagged(pushed):
     assert found["status"].values.tolist() == [OK, DIVERGED, OK, DIVERGED]
 
 
+def test_a_vehicle_that_cannot_be_is_out_of_range_however_it_flies(bench30, record):
+    found = sweep(
+        ROLL, bench30, record, listed({"Ixx": [0.03, -1e-6]}), {"rms": Reduce("rms", "roll")}
+    )
+    assert found["status"].values.tolist() == [OK, OUT_OF_RANGE]
+    assert np.isnan(found["rms"][1])
+
+
+def test_flights_of_one_name_are_told_apart(bench30, record):
+    reduce = {"rms": Reduce("rms", "roll")}
+    found = sweep(ROLL, bench30, [record, record], listed({"Ixx": [0.03]}), reduce)
+    assert found["flight"].values.tolist() == [f"{record.name} ({k})" for k in (1, 2)]
+
+
+def test_results_stand_as_they_were_asked_for(bench30, record):
+    reduce = {n: Reduce("rms", "roll") for n in ("z", "b", "a")}
+    assert list(sweep(ROLL, bench30, record, listed({"Ixx": [0.03]}), reduce)) == ["z", "b", "a"]
+
+
+def test_an_axis_in_the_logarithm_says_so(bench30, record):
+    axes = {"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}
+    found = sweep(ROLL, bench30, record, sobol(axes, 4), {"rms": Reduce("rms", "roll")})
+    assert found["Ixx"].attrs["scale"] == "log"
+    assert "scale" not in found["a"].attrs
+
+
 @pytest.fixture(scope="module")
 def xcell(vehicles_folder):
     from heli_jax import load_vehicle
@@ -331,3 +358,17 @@ def test_helicopters_begin_in_a_trim_of_their_own(xcell):
         values = modes(model, params, at.state, at.inputs)
         mine = found["mode_real"].values[k] + 1j * found["mode_imag"].values[k]
         np.testing.assert_allclose(np.sort(np.abs(mine)), np.sort(np.abs(values)), atol=1e-5)
+
+
+def test_the_pilot_holds_each_element_in_its_own_trim(xcell):
+    model = models.helicopter("consistent")
+    still = {n: np.zeros(51) for n in naming.names(model.Inputs)}
+    flight = Flight(dt=0.02, inputs=still, outputs={}, name="still")
+    begin = Condition(ahead=10.0)
+    pilot = attitude_hold(model, xcell, trim(model, xcell, begin))
+    design = listed({"m": [0.7 * float(xcell.m), float(xcell.m), 1.3 * float(xcell.m)]})
+    reduce = {n: Reduce("final", n) for n in ("roll_rate", "y", "z")}
+    found = sweep(model, xcell, flight, design, reduce, trimmed=Trimmed(begin), pilot=pilot)
+    assert not found["status"].any()
+    for name in reduce:
+        np.testing.assert_allclose(found[name], 0.0, atol=1e-9)

@@ -262,6 +262,34 @@ def test_a_full_disk_ends_in_words_and_keeps_what_is_done(run, whole, tmp_path, 
     assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
 
 
+def test_a_store_that_lacks_something_is_refused(run, whole, tmp_path):
+    short, gone = tmp_path / "short", tmp_path / "gone"
+    for out in (short, gone):
+        shutil.copytree(whole, out)
+    with (short / "sweep.zarr" / "rms" / "c" / "3").open("r+b") as file:
+        file.truncate(7)
+    with pytest.raises(InputError, match=r"short: a file of sweep\.zarr cannot be read"):
+        run(short, resume=True)
+    (gone / "sweep.zarr" / "fit" / "c" / "5").unlink()
+    with pytest.raises(InputError, match="gone: fit has 9 chunks of 10 that are finished"):
+        run(gone, resume=True)
+
+
+def test_an_empty_folder_may_be_gone_on_with(run, whole, tmp_path):
+    out = tmp_path / "made"
+    out.mkdir()
+    with pytest.raises(InputError, match="exists already"):
+        run(out)
+    found = run(out, resume=True)
+    assert equal(found, xr.open_zarr(whole / "sweep.zarr", consolidated=False, chunks=None))
+
+
+def test_more_lanes_than_elements_are_as_many(run, tmp_path):
+    found = run(tmp_path / "out", lanes=10**6)
+    assert found.attrs["split"]["lanes"] == 300
+    run(tmp_path / "out", lanes=10**6, resume=True)
+
+
 def test_a_store_that_is_no_store_is_refused(run, whole, tmp_path):
     out = tmp_path / "broken"
     shutil.copytree(whole, out)
