@@ -35,8 +35,10 @@ class Store:
         self.split = Split(**attributes["split"])
         self.attributes = attributes
         self._results: list[str] = list(attributes["results"])
-        # Looked up once: it takes as long as a write.
-        self._arrays: dict[str, Any] = dict(group.arrays())
+        # An all-NaN chunk is a result too: its file tells it from one that was taken away.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            # Looked up once: it takes as long as a write.
+            self._arrays: dict[str, Any] = dict(group.arrays())
 
     @property
     def names(self) -> set[str]:
@@ -168,8 +170,6 @@ def _array(group: zarr.Group, name: str, one: Variable, size: int, split: Split)
         fill_value=_FILL[dtype.kind],
         dimension_names=one.dims,
         attributes=one.attributes,
-        # An all-NaN chunk is a result too: without its file it would be computed again.
-        config={"write_empty_chunks": True},
     )
 
 
