@@ -253,17 +253,17 @@ def draw_sweep(out: Path, dataset: Any, job: "Job") -> list[str]:
     Raises:
         InputError: the figures cannot be written.
     """
-    from heli_jax.report.sweeps import RESULTS, write_figures
+    from heli_jax.report.sweeps import RESULTS, results, write_figures
     from heli_jax.sweeps.summary import worst
 
     try:
         write_figures(out / "figures", dataset, worst(dataset, job))
     except OSError as e:
         raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
-    drawn = [n for n in dataset.data_vars if not str(n).startswith("trajectory_")]
-    if len(drawn) <= RESULTS:
+    count = len(results(dataset))
+    if count <= RESULTS:
         return []
-    return [f"slices and maps are of the first {RESULTS} of {len(drawn)} results"]
+    return [f"slices and maps are of the first {RESULTS} of {count} results"]
 
 
 def _counted(elements: int) -> str:

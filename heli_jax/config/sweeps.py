@@ -179,12 +179,7 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
 
 def _as_column(name: str, values: np.ndarray) -> np.ndarray:
     """Seeds are whole numbers."""
-    if name != "seed":
-        return values
-    whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
-    if not np.all(whole & (values < 2**32)):
-        raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1")
-    return values.astype(np.int64)
+    return designs.whole_seeds(values) if name == "seed" else values
 
 
 def _table(one: DesignConfig, model: Model, path: Path) -> Design:

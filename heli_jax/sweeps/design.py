@@ -315,6 +315,18 @@ def sobol(axes: Mapping[str, Between], n: int, seed: int = 0) -> Design:
     return _Sampled(axes, n, seed, "sobol")
 
 
+def whole_seeds(values: np.ndarray) -> np.ndarray:
+    """Seeds (k,) as whole numbers.
+
+    Raises:
+        ValueError: one is none.
+    """
+    whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
+    if not np.all(whole & (values < 2**32)):
+        raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1")
+    return values.astype(np.int64)
+
+
 def log_axes(design: Design) -> set[str]:
     """The axes that a design fills evenly in the logarithm."""
     if isinstance(design, _Combined):

@@ -18,7 +18,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import Design, digest
+from heli_jax.sweeps.design import Design, digest, whole_seeds
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]
@@ -211,9 +211,7 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
             )
         if "delay" in design.names and "delay" not in params:
             raise ValueError("axes.seed: noise is drawn without a delay only")
-        seeds = design.values(0, min(design.size, _LOOKED_AT))["seed"]
-        if not np.all((seeds == np.round(seeds)) & (seeds >= 0) & (seeds < 2**32)):
-            raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1, as values")
+        whole_seeds(design.values(0, min(design.size, _LOOKED_AT))["seed"])
 
 
 def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:

@@ -6,10 +6,11 @@ mean over them. Draw within `matplotlib.rc_context(style.STYLE)`, as `write_figu
 get the report's look.
 """
 
+from heli_jax.report.sweeps.columns import results
 from heli_jax.report.sweeps.corner import corner
 from heli_jax.report.sweeps.files import RESULTS, write_figures
 from heli_jax.report.sweeps.maps import maps
 from heli_jax.report.sweeps.slices import slices
 from heli_jax.report.sweeps.worst import worst
 
-__all__ = ["RESULTS", "corner", "maps", "slices", "worst", "write_figures"]
+__all__ = ["RESULTS", "corner", "maps", "results", "slices", "worst", "write_figures"]

@@ -169,7 +169,7 @@ class Table:
         """which elements, ascending, (n,)"""
         self.ok = ok[self.elements]
         self._axes = [str(n) for n in ds.attrs["axes"]]
-        self.results = [str(n) for n, v in ds.data_vars.items() if _is_result(v)]
+        self.results = results(ds)
         self._columns: dict[str, Column] = {}
 
     def column(self, name: str) -> Column:
@@ -224,6 +224,11 @@ def by_lot(elements: np.ndarray, most: int) -> np.ndarray:
     if elements.size <= most:
         return elements
     return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
+
+
+def results(ds: xr.Dataset) -> list[str]:
+    """The results that are drawn: those with a number for each element."""
+    return [str(n) for n, v in ds.data_vars.items() if _is_result(v)]
 
 
 def _is_result(variable: xr.DataArray) -> bool:
