@@ -152,7 +152,7 @@ def carry_out(
     words = {**(attributes or {}), "seed": seed, "versions": versions(), "notes": notes}
     if out is None:
         store = stores.create(None, job, *_cut(job, options, words), "the sweep")
-        _compute(job, store, options)
+        _compute(job, store, store.done(), options)
         return store.dataset().load()
     where = f"--out {out}"
     empty = out.is_dir() and not any(out.iterdir())
@@ -171,11 +171,11 @@ def carry_out(
         raise InputError(f"{where}: is no directory that can be written to")
     with stores.only_writer(out, where):
         store = stores.reopen(out / "sweep.zarr", job, where)
-        store.require_whole_chunks()
+        done = store.whole()
         _same_cut(store, job, options, where)
         for note in _changes(store.attributes.get("versions", {}), versions()):
             options.say(f"{where}: {note}")
-        timing = _compute(job, store, options)
+        timing = _compute(job, store, done, options)
         dataset = store.dataset()
         with stores.readable(where):
             write_summary(out / "summary.json", dataset, job, timing, where)
@@ -211,9 +211,8 @@ def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> No
             )
 
 
-def _compute(job: Job, store: stores.Store, options: Options) -> dict[str, Any]:
-    """Compute what the store lacks; returns what it took."""
-    done = store.done()
+def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) -> dict[str, Any]:
+    """Compute the chunks that are not done; returns what it took."""
     todo = [int(k) for k in np.flatnonzero(~done)]
     total, size = job.design.size, store.split.chunk
     before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))

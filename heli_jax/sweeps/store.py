@@ -52,14 +52,15 @@ class Store:
         firsts = [status[k * self.split.chunk] for k in range(count)]
         return np.asarray(firsts).reshape(-1) != NOT_RUN
 
-    def require_whole_chunks(self) -> None:
-        """Refuse a store that lacks a file of a finished chunk.
+    def whole(self) -> np.ndarray:
+        """Which chunks are finished, as `done`, with no file of them missing.
 
         Raises:
-            InputError: it does, or cannot be read.
+            InputError: one is, or the store cannot be read.
         """
         with readable(self.where):
-            finished = int(np.count_nonzero(self.done()))
+            done = self.done()
+            finished = int(np.count_nonzero(done))
             for name in self._results:
                 found = self._arrays[name].nchunks_initialized
                 if found < finished:
@@ -67,6 +68,7 @@ class Store:
                         f"{self.where}: {name} has {found} chunks of {finished} that are finished, "
                         "wanted is a store from which nothing was taken, or another --out"
                     )
+        return done
 
     def write(self, chunk: int, results: Mapping[str, np.ndarray]) -> None:
         """Write a chunk's variables, its status last.

@@ -392,6 +392,13 @@ def test_worst_elements_are_named_and_lie_where_they_are():
     assert bundle.get_zorder() < lines[0].get_zorder()
 
 
+def test_what_is_no_number_of_an_element_is_no_result_drawn():
+    ds = sweep(20)
+    ds["m_real"] = ("element", "mode"), np.zeros((20, 4))
+    ds["trajectory_roll"] = ("element", "time"), np.zeros((20, 5))
+    assert sweeps.results(ds) == ["misfit"]
+
+
 def test_a_large_sweep_is_drawn_by_lot(monkeypatch):
     ds = sweep(4000)
     ds["rare"] = ds["misfit"] * np.nan
