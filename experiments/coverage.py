@@ -1,56 +1,103 @@
-"""Do the 95 % intervals cover? Many white-noise runs of the bench machine, fitted one by one.
+"""Do the 95 % intervals cover, and are the reported standard deviations the real ones?
 
-    .venv/bin/python experiments/coverage.py [RUNS]
+    .venv/bin/python experiments/coverage.py [--runs N] [--only WORDS] [--out FOLDER]
 
-The records come from scipy and the closed form of eq. 23, not from our own simulation.
+Many records of each case in experiments/coverage_cases are fitted one by one; each case runs at its
+full size unless N is given. FOLDER (runs/coverage) keeps one line a run, so that what was stopped
+goes on where it was; table.md is made of all of them.
 """
 
+import argparse
+import dataclasses
+import importlib
+import json
+import pkgutil
+import re
 import sys
-from typing import Any
+import time
+from pathlib import Path
 
+import coverage_cases
 import jax
 import numpy as np
-import scipy.signal
-
-from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
-from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.simulation.inputs import random_steps
+from coverage_cases import Case, Interval, Run
 
 jax.config.update("jax_enable_x64", True)
-N, DT, NOISE = 4000, 0.02, 2e-3
 
 
-def main(runs: int) -> None:
-    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
-    num, den = roll_transfer_function(vehicle, stand=True)
-    discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
-    b, a = discrete[:2]
-    truth = {"Ixx": float(vehicle.Ixx), "If": float(vehicle.If)}
-    inside = dict.fromkeys(truth, 0)
-    scores: dict[str, list[float]] = {name: [] for name in truth}
+def all_cases() -> list[Case]:
+    found = []
+    for module in pkgutil.iter_modules(coverage_cases.__path__):
+        found += importlib.import_module(f"coverage_cases.{module.name}").cases()
+    return found
+
+
+def run_case(case: Case, runs: int, folder: Path) -> list[Run]:
+    """The runs of seeds 0 to runs - 1, those already on file read from there."""
+    log = folder / (re.sub(r"\W+", "-", case.name) + ".jsonl")
+    lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+    done = {}
+    for line in lines:
+        one = json.loads(line)
+        seed = one.pop("seed")
+        one["parameters"] = {n: Interval(*v) for n, v in one["parameters"].items()}
+        done[seed] = Run(**one)
+    begin = time.monotonic()
     for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
-        y = scipy.signal.lfilter(np.ravel(b), a, u) + NOISE * rng.standard_normal(N)
-        flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
-        free = {"Ixx": Free(0.05), "If": Free(5e-4)}
-        found = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
-        assert found.status == "converged", (seed, found.status)
-        for name, value in truth.items():
-            e = found.estimates[name]
-            assert e.sd is not None
-            assert e.lower95 is not None
-            assert e.upper95 is not None
-            inside[name] += e.lower95 < value < e.upper95
-            scores[name].append((e.value - value) / e.sd)
-    print(f"{runs} runs of {N} samples, noise {NOISE} rad")
-    for name, values in scores.items():
-        print(
-            f"{name}: 95 % intervals cover {100 * inside[name] / runs:.1f} %, "
-            f"mean error {np.mean(values):+.2f} sd, spread {np.std(values):.2f} sd, "
-            f"largest {np.max(np.abs(values)):.1f} sd"
+        if seed in done:
+            continue
+        done[seed] = case.one_run(seed)
+        with log.open("a", encoding="utf-8") as f:
+            f.write(json.dumps({"seed": seed, **dataclasses.asdict(done[seed])}) + "\n")
+        if seed % 10 == 9 or seed == runs - 1:
+            seconds = time.monotonic() - begin
+            print(
+                f"{case.name}: {seed + 1} of {runs}, {seconds:.0f} s", file=sys.stderr, flush=True
+            )
+    return [done[s] for s in range(runs)]
+
+
+HEAD = "| case | parameter | runs | mean error | reported/real sd | coverage | not converged |"
+
+
+def rows(case: Case, runs: list[Run]) -> list[str]:
+    """A line for each parameter, then one for what must not happen."""
+    good = [r for r in runs if r.status != "not-converged"]
+    lost, lines = len(runs) - len(good), []
+    names = list(dict.fromkeys(n for r in good for n in r.parameters))
+    for name in names:
+        found = [r.parameters[name] for r in good if name in r.parameters]
+        error = np.array([i.value - i.truth for i in found])
+        real = error.std(ddof=1) if error.size > 1 else np.nan
+        # The median: one run that reports absurdly much must not speak for all.
+        reported = np.median([i.sd for i in found])
+        covered = np.mean([i.lower < i.truth < i.upper for i in found])
+        lines.append(
+            f"| {case.name} | {name} | {len(found)} | {error.mean() / real:+.2f} sd "
+            f"| {reported / real:.2f} | {100 * covered:.1f} % | {lost} |"
         )
+    flags = dict.fromkeys(n for r in runs for n in r.flags)
+    for name in flags:
+        count = sum(r.flags.get(name, False) for r in runs)
+        lines.append(f"| {case.name} | {name}: {count} of {len(runs)} | | | | | {lost} |")
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Do the 95 % intervals cover?")
+    parser.add_argument("--runs", type=int, help="runs of each case, instead of its full size")
+    parser.add_argument("--only", default="", help="cases whose name has these words in it")
+    parser.add_argument("--out", type=Path, default=Path("runs/coverage"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    lines = [HEAD, "|" + "---|" * 7]
+    for case in all_cases():
+        if options.only in case.name:
+            lines += rows(case, run_case(case, options.runs or case.runs, options.out))
+    text = "\n".join(lines) + "\n"
+    (options.out / "table.md").write_text(text, encoding="utf-8")
+    print(text, end="")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    main()
