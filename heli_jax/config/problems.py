@@ -32,7 +32,10 @@ def problem(experiment: Experiment) -> Problem:
     if not config.fit.free:
         raise InputError(f"{path}: fit.free: nothing is free, wanted is a parameter to estimate")
     _check_intervals(config.fit, path)
-    nuisance = Nuisance(**config.fit.nuisance.model_dump())
+    asked = config.fit.nuisance.model_dump()
+    if isinstance(asked["input_offset"], list):
+        asked["input_offset"] = tuple(asked["input_offset"])
+    nuisance = Nuisance(**asked)
     flights = read_flights(experiment, gain=nuisance.input_gain)
     free = {
         name: Free(f.start, f.lower, f.upper, Prior(f.prior.mean, f.prior.sd) if f.prior else None)

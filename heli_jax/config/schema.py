@@ -63,6 +63,9 @@ class NuisanceConfig(_Strict):
     bias: bool = True
     time_shift: bool = False
     input_gain: bool = False
+    input_offset: StrictBool | list[str] | None = None
+    """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
+    the sticks of a machine in free flight"""
 
 
 class IntervalsConfig(_Strict):

@@ -96,7 +96,7 @@ def _records(
 def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
     """By name the outputs (runs, N) with a disturbance drawn for each key."""
     flight, layout = at.data.flights[i], at.layout
-    params, inputs = driven(layout, at.data, u, flight)
+    params, inputs = driven(layout, at.data, u, i)
     start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
     spread = layout.model.spread(params) if layout.model.spread is not None else {}
 

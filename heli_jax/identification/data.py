@@ -59,6 +59,7 @@ def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightDat
         bias_scale={
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
+        offset_scale={n: np.asarray(10.0 * _moved(u), dtype) for n, u in inputs.items()},
     )
 
 
@@ -67,6 +68,12 @@ def _size(values: Any) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(np.square(np.asarray(values)))))
     return rms if np.isfinite(rms) and rms > 0 else 1.0
+
+
+def _moved(u: np.ndarray) -> float:
+    """How far an input moves (rms about its mean), or its size where it never does."""
+    moved = float(np.std(u))
+    return moved if np.isfinite(moved) and moved > 0 else _size(u)
 
 
 def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:

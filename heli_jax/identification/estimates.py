@@ -125,7 +125,7 @@ def flight_nuisances(
     quantile: float,
     wider: np.ndarray,
 ) -> dict[str, Estimate]:
-    """The disturbance, then initial states and biases with the weak priors they carry."""
+    """The disturbance, then initial states, biases and input offsets with their weak priors."""
     q = len(layout.named)
     if layout.size == q:
         return {}
@@ -156,6 +156,10 @@ def flight_nuisances(
                 (f"bias {n}", flight.bias_scale[n], naming.unit(layout.model.Outputs, n))
                 for n in outputs
             ]
+        parts += [
+            (f"offset {n}", flight.offset_scale[n], _offset_unit(problem, n))
+            for n in layout.offsets
+        ]
         for name, scale, unit in parts:
             value, sd = float(z[at] * scale), float(sds[at] * scale)
             share = min(1.0, float(sds[at] / wider[at]) ** 2)
@@ -163,6 +167,13 @@ def flight_nuisances(
             out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
             at += 1
     return out
+
+
+def _offset_unit(problem: Problem, name: str) -> str | None:
+    """Of an input's offset: the log's plain number where the estimated gain carries the unit."""
+    if problem.gain_units.get(name, "1") != "1":
+        return "1"
+    return naming.unit(problem.model.Inputs, name)
 
 
 def labels(flights: tuple[Flight, ...]) -> list[str]:

@@ -1,7 +1,7 @@
 """The unknowns of a problem: one vector z, what stands where in it, and the numbers beside it.
 
 z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, then
-for each flight the initial state and the biases.
+for each flight the initial state, the biases and the offsets of the inputs.
 """
 
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import coordinates
+from heli_jax.identification.offsets import offset_inputs
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 
 _BLOCK = 32
@@ -32,6 +33,8 @@ class FlightData(NamedTuple):
     """sd of the weak prior on the initial state"""
     bias_scale: dict[str, Any]
     """sd of the weak prior on the bias"""
+    offset_scale: dict[str, Any]
+    """sd of the weak prior on the offset of each input"""
 
 
 class Data(NamedTuple):
@@ -58,6 +61,8 @@ class Layout(eqx.Module):
     shift: bool = eqx.field(static=True)
     initial_state: bool = eqx.field(static=True)
     bias: bool = eqx.field(static=True)
+    offsets: tuple[str, ...] = eqx.field(static=True)
+    """inputs with an offset of their own in each flight"""
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """by flight, sorted by name: the order of the residuals"""
     noise: tuple[str, ...] = eqx.field(static=True)
@@ -93,7 +98,7 @@ class Layout(eqx.Module):
 
     @property
     def weak(self) -> int:
-        """Where in z the initial states and biases begin."""
+        """Where in z the initial states, biases and input offsets begin."""
         return len(self.named) + len(self.noise) + len(self.scaled)
 
     def noise_at(self, name: str) -> int:
@@ -104,9 +109,13 @@ class Layout(eqx.Module):
     def size(self) -> int:
         """The number of unknowns."""
         return self.weak + sum(
-            count * len(self.states) + (len(outputs) if self.bias else 0)
+            count * len(self.states) + self.constants(outputs)
             for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
         )
+
+    def constants(self, outputs: tuple[str, ...]) -> int:
+        """The biases and input offsets of a flight with these outputs."""
+        return (len(outputs) if self.bias else 0) + len(self.offsets)
 
     @property
     def determined(self) -> int:
@@ -148,6 +157,8 @@ class Unknowns(NamedTuple):
     """by flight the State at the first sample, with arrays (windows,) where there are several; None
     where it is the model's own"""
     biases: tuple[dict[str, Any], ...]
+    offsets: tuple[dict[str, Any], ...]
+    """of the inputs, by flight"""
 
 
 def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
@@ -170,6 +181,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
         bias=nuisance.bias,
+        offsets=offset_inputs(problem),
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         noise=tuple(problem.noise),
         scaled=measured[concentrated:] if unknown else (),
@@ -212,7 +224,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     at += len(layout.noise)
     scales = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.scaled)}
     at = layout.weak
-    states, biases = [], []
+    states, biases, offsets = [], [], []
     for flight, outputs, (count, _) in zip(
         data.flights, layout.outputs, layout.windows, strict=True
     ):
@@ -228,6 +240,10 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         if layout.bias:
             bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
             at += len(outputs)
+        offset = {n: z[at + i] * flight.offset_scale[n] for i, n in enumerate(layout.offsets)}
+        at += len(layout.offsets)
         states.append(state)
         biases.append(bias)
-    return Unknowns(params, noise, scales, gains, shift, tuple(states), tuple(biases))
+        offsets.append(offset)
+    by_flight = (tuple(states), tuple(biases), tuple(offsets))
+    return Unknowns(params, noise, scales, gains, shift, *by_flight)

@@ -34,15 +34,20 @@ class Free(NamedTuple):
 class Nuisance(NamedTuple):
     """Unknowns of the experiment, estimated beside the parameters.
 
-    `initial_state` and `bias` belong to each flight; `input_gain` (one factor an input) and
-    `time_shift` [s] (the stick acted this much later, or earlier where negative, than logged)
-    are shared by all flights.
+    `initial_state`, `bias` and `input_offset` belong to each flight; `input_gain` (one factor an
+    input) and `time_shift` [s] (the stick acted this much later, or earlier where negative, than
+    logged) are shared by all flights.
+
+    `input_offset` is a constant that is added to the logged input, since no stick is centred: True
+    for all inputs, or their names; None leaves it to the machine: on for the sticks of one in free
+    flight, where an offset is integrated (`heli_jax.identification.offsets`).
     """
 
     initial_state: bool = True
     bias: bool = True
     time_shift: bool = False
     input_gain: bool = False
+    input_offset: bool | tuple[str, ...] | None = None
 
 
 Method = Literal["output-error", "filter-error"]
@@ -96,6 +101,7 @@ class Problem:
             _check_free(name, one, self.model)
         _check_possible(self)
         _check_windows(self)
+        _check_offsets(self)
         if not self.training:
             raise ValueError("no flight to fit: every one is held out")
         for flight in self.flights:
@@ -150,6 +156,17 @@ def _check_method(problem: Problem) -> None:
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
             raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
+
+
+def _check_offsets(problem: Problem) -> None:
+    asked = problem.nuisance.input_offset
+    known = naming.names(problem.model.Inputs)
+    for name in () if asked is None or isinstance(asked, bool) else asked:
+        if name not in known:
+            raise ValueError(
+                f"nuisance.input_offset: model {problem.model.name} has no input {name!r}"
+                f"{nearest(name, known)}"
+            )
 
 
 def _check_windows(problem: Problem) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.kalman import Innovations, innovations
-from heli_jax.identification.layout import Data, FlightData, Layout, Noise, Unknowns, unpack
+from heli_jax.identification.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.identification.sparsity import seeded, spread_out
 from heli_jax.simulation.simulate import Trajectory, simulate
 
@@ -23,10 +23,12 @@ _FLOOR = 1e-3
 """The likelihood's row stays real however far the noise falls; the next round has another level."""
 
 
-def driven(layout: Layout, data: Data, u: Unknowns, flight: FlightData) -> tuple[Any, Any]:
-    """Parameters and inputs of one flight at the unknowns."""
+def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> tuple[Any, Any]:
+    """Parameters and inputs of the i-th flight at the unknowns: (logged + offset) * gain."""
+    flight, offsets = data.flights[i], u.offsets[i]
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
+    inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
     return params, layout.model.Inputs(**inputs)
 
@@ -54,7 +56,7 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     for (m, _), members in groups.items():
         if len(members) == 1 and layout.windows[members[0]][0] == 1:
             i = members[0]
-            params, inputs = driven(layout, data, u, data.flights[i])
+            params, inputs = driven(layout, data, u, i)
             run = _simulated_one(layout, params, inputs, data.flights[i].dt, u.states[i], u.shift)
             measured = [getattr(run.outputs, n) for n in layout.outputs[i]]
             alone[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
@@ -88,7 +90,7 @@ def _together(
     each = []
     for i in members:
         flight, count = data.flights[i], layout.windows[i][0]
-        _, inputs = driven(layout, data, u, flight)
+        _, inputs = driven(layout, data, u, i)
         n = jax.tree.leaves(inputs)[0].shape[0]
         # With several windows one sample more, at which the next begins.
         at = np.minimum(m * np.arange(count)[:, None] + np.arange(m + chained)[None, :], n - 1)
@@ -128,8 +130,9 @@ def _together(
 def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Innovations, ...]:
     """The innovations of every flight."""
     out = []
-    for flight, state, bias, sd in zip(data.flights, u.states, u.biases, noise.sd, strict=True):
-        params, inputs = driven(layout, data, u, flight)
+    by_flight = zip(data.flights, u.states, u.biases, noise.sd, strict=True)
+    for i, (flight, state, bias, sd) in enumerate(by_flight):
+        params, inputs = driven(layout, data, u, i)
         out.append(
             innovations(
                 layout.model,
@@ -205,7 +208,7 @@ def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array
 
 
 def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
-    """Weak priors of the initial states and biases: their coordinates are in units of its sd."""
+    """Weak priors of initial states, biases, offsets: coordinates are in units of its sd."""
     return z[layout.weak :]
 
 

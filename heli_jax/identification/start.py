@@ -51,7 +51,7 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> A
                 scale = float(flight.state_scale[name])
                 z = z.at[at + i].set(jnp.asarray(value / scale, z.dtype))
             at += len(layout.states)
-        at += len(outputs) if layout.bias else 0
+        at += layout.constants(outputs)
     return z
 
 

@@ -1,0 +1,153 @@
+"""Sticks that are not centred: a constant offset of each input, in each flight."""
+
+from typing import Annotated, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
+from heli_jax.identification.data import data_of
+from heli_jax.identification.layout import layout_of
+from heli_jax.identification.offsets import offset_inputs
+from heli_jax.identification.residual import differentiate, rows_of
+from heli_jax.naming import Scalar
+from tests.identification.bench import BENCH, amplitude_for, response, steps, vehicle
+
+FREE = {"Ixx": Free(0.05), "If": Free(5e-4)}
+DT, N = 0.02, 2000
+
+
+def flown(seed: int, share: float) -> tuple[Flight, float]:
+    """A free roll whose stick stands off by a share of its amplitude; the log does not show it."""
+    amplitude = amplitude_for(BENCH, DT, False)
+    rng = np.random.default_rng(seed)
+    u = steps(rng, N, DT, amplitude)
+    y = response(BENCH, u + share * amplitude, DT, False) + 2e-3 * rng.standard_normal(N)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y}), share * amplitude
+
+
+@pytest.mark.parametrize("share", [0.007, 0.03])
+def test_an_offset_of_the_stick_does_not_move_the_inertia(share):
+    flight, offset = flown(3, share)
+    found = fit(Problem(models.roll, vehicle(BENCH), [flight], FREE))
+    assert found.white
+    for name in FREE:
+        e = found.estimates[name]
+        assert e.lower95 < BENCH[name] < e.upper95
+        assert e.sd < 0.01 * e.value
+    e = found.nuisance["flight 1/offset x_roll"]
+    assert e.unit == "m"
+    assert e.value == pytest.approx(offset, abs=4 * e.sd)
+    assert e.sd < 0.02 * offset
+
+
+def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
+    flights, offsets = zip(
+        *(flown(seed, share) for seed, share in ((1, 0.02), (2, -0.03))), strict=True
+    )
+    problem = Problem(models.roll, vehicle(BENCH), flights, FREE, window=10.0)
+    found = fit(problem)
+    for name in FREE:
+        e = found.estimates[name]
+        assert e.lower95 < BENCH[name] < e.upper95
+    for i, offset in enumerate(offsets):
+        e = found.nuisance[f"flight {i + 1}/offset x_roll"]
+        assert e.value == pytest.approx(offset, abs=4 * e.sd)
+    # The derivatives of many windows at once are the derivatives.
+    at = found.reached
+    J = np.asarray(differentiate(at.layout, at.data, at.noise, at.z).J)
+    column = at.layout.size - 1
+    h = 1e-4
+    low, high = (rows_of(at.layout, at.data, at.noise, at.z.at[column].add(s)) for s in (-h, h))
+    slope = (np.asarray(high) - np.asarray(low)) / (2 * h)
+    assert np.abs(J[:, column] - slope).max() < 1e-6 * np.abs(slope).max()
+
+
+def test_the_identifiability_analysis_knows_the_offset():
+    flight, _ = flown(3, 0.0)
+    sds = []
+    for asked in (None, False):
+        nuisance = Nuisance(input_offset=asked)
+        verdict = check(Problem(models.roll, vehicle(BENCH), [flight], FREE, nuisance)).verdict
+        sds.append(np.sqrt(np.diag(verdict.covariance)))
+    assert np.all(sds[0] >= sds[1])
+    assert sds[0][1] > 1.02 * sds[1][1]
+
+
+class Params(NamedTuple):
+    Lp: Annotated[Scalar, "1/s", "damping"]
+    Ld: Annotated[Scalar, "1/s^2", "effectiveness"]
+    L0: Annotated[Scalar, "rad/s^2", "constant"]
+
+
+class State(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "rate"]
+    phi: Annotated[Scalar, "rad", "angle"]
+
+
+class Inputs(NamedTuple):
+    d: Annotated[Scalar, "1", "stick"]
+
+
+class Outputs(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "rate"]
+    phi: Annotated[Scalar, "rad", "angle"]
+
+
+AIRCRAFT = Model(
+    "aircraft-roll",
+    lambda p, s, u: State(p=p.Lp * s.p + p.Ld * u.d + p.L0, phi=s.p),
+    lambda p, s, u: Outputs(p=s.p, phi=s.phi),
+    Params,
+    State,
+    Inputs,
+    Outputs,
+)
+
+
+def problem_of(free: dict[str, Free], outputs: tuple[str, ...], nuisance: Nuisance) -> Problem:
+    rng = np.random.default_rng(0)
+    signals = {n: rng.standard_normal(100) for n in outputs}
+    flight = Flight(dt=0.1, inputs={"d": rng.standard_normal(100)}, outputs=signals)
+    params = Params(*(jnp.asarray(v) for v in (-3.0, 10.0, 0.0)))
+    return Problem(AIRCRAFT, params, [flight], free, nuisance)
+
+
+@pytest.mark.parametrize(
+    ("free", "outputs", "expected"),
+    [
+        (("Lp", "Ld"), ("phi",), ("d",)),
+        (("Lp", "Ld"), ("p", "phi"), ("d",)),
+        (("Lp", "Ld"), ("p",), ()),  # the bias takes it up
+        (("Lp", "Ld", "L0"), ("phi",), ()),  # a parameter stands for it
+    ],
+)
+def test_where_the_offset_is_estimated_unless_told(free, outputs, expected):
+    starts = {n: Free(s) for n, s in (("Lp", -2.0), ("Ld", 5.0), ("L0", 0.1)) if n in free}
+    assert offset_inputs(problem_of(starts, outputs, Nuisance())) == expected
+    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=True))) == ("d",)
+    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=False))) == ()
+    assert offset_inputs(problem_of(starts, outputs, Nuisance(input_offset=("d",)))) == ("d",)
+
+
+def test_a_stand_takes_the_offset_up_in_the_bias():
+    rng = np.random.default_rng(0)
+    flight = Flight(dt=DT, inputs={"x_roll": steps(rng, N, DT, 1e-6)}, outputs={"roll": np.ones(N)})
+    assert offset_inputs(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE)) == ()
+    limp = vehicle(BENCH | {"kappa": 0.0})
+    assert offset_inputs(Problem(models.roll_on_stand, limp, [flight], FREE)) == ("x_roll",)
+
+
+def test_an_input_that_the_model_lacks_is_named():
+    with pytest.raises(ValueError, match=r"input_offset: model aircraft-roll has no input 'dd'"):
+        problem_of({"Lp": Free(-2.0)}, ("p",), Nuisance(input_offset=("dd",)))
+
+
+def test_the_scale_of_the_offset_is_that_of_the_stick():
+    flight, _ = flown(3, 0.0)
+    problem = Problem(models.roll, vehicle(BENCH), [flight], FREE)
+    data, layout = data_of(problem, problem.training), layout_of(problem, problem.training)
+    assert layout.size == len(FREE) + 4 + 1 + 1
+    scale = float(data.flights[0].offset_scale["x_roll"])
+    assert scale == pytest.approx(10 * np.std(flight.inputs["x_roll"]))
