@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+HOLDS = ("zero-order", "linear")
+"""What an input may do between samples: stay until the next, or follow a straight line to it."""
+
 
 @dataclass(frozen=True)
 class Signal:
@@ -15,12 +18,15 @@ class Signal:
         unit: the unit in the log, such as `deg`.
         si: the SI unit that the model wants, such as `rad`.
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
+        hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
+            log shows of it.
     """
 
     name: str
     unit: str
     si: str
     sd: float | None = None
+    hold: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -40,17 +46,20 @@ class Flight:
 
     Attributes:
         dt: time between samples [s].
-        inputs: samples (N,) by the model's name; each holds until the next sample.
+        inputs: samples (N,) by the model's name.
         outputs: samples (N,) by the model's name; NaN where one is missing.
         t0: time in the log of the first sample [s].
         sd: standard deviation of the measurement noise by output, only where it was stated.
         known: parameters that differ in this run, SI.
         hold_out: whether the run serves for validation alone.
+        hold: by input, what it does between samples: "zero-order" (it stays until the next
+            sample), as all do that are not named, or "linear".
+        hold_reason: by input, why the reader of a log took that hold, where the log decided.
 
     Raises:
         ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
             not finite (outputs may be NaN); `sd` names no output or is not positive; `known` is
-            not finite.
+            not finite; `hold` names no input or no hold.
     """
 
     dt: float
@@ -62,6 +71,8 @@ class Flight:
     hold_out: bool = False
     name: str = ""
     source: Source | None = None
+    hold: dict[str, str] = field(default_factory=dict)
+    hold_reason: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dt) and self.dt > 0):
@@ -80,6 +91,7 @@ class Flight:
         object.__setattr__(self, "sd", dict(self.sd))
         object.__setattr__(self, "known", dict(self.known))
         self._check_numbers()
+        self._check_holds()
 
     def _check_numbers(self) -> None:
         for name, sd in self.sd.items():
@@ -90,6 +102,17 @@ class Flight:
         for name, value in self.known.items():
             if not math.isfinite(value):
                 raise ValueError(f"known {name!r} is {value}, wanted is a finite number")
+
+    def _check_holds(self) -> None:
+        for name, value in self.hold.items():
+            if name not in self.inputs:
+                raise ValueError(f"hold is stated for {name!r}, which is no input of this flight")
+            if value not in HOLDS:
+                raise ValueError(
+                    f"hold of {name!r}: expected one of {', '.join(HOLDS)}, got {value!r:.60}"
+                )
+        object.__setattr__(self, "hold", {**dict.fromkeys(self.inputs, HOLDS[0]), **self.hold})
+        object.__setattr__(self, "hold_reason", dict(self.hold_reason))
 
     @property
     def n_samples(self) -> int:

@@ -20,6 +20,7 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, spread_of
 from heli_jax.simulation.discretize import moved, process_noise, product
+from heli_jax.simulation.hold import Hold, linear_inputs, segments
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
 
@@ -47,21 +48,24 @@ def innovations(
     initial_state: Any = None,
     delay: Any = None,
     substeps: int = 4,
+    hold: Hold = None,
 ) -> Innovations:
     """Run the (extended) Kalman filter of a model over one record.
 
     Args:
-        inputs: the model's Inputs, arrays (N,), each sample held until the next.
+        inputs: the model's Inputs, arrays (N,).
         measured: outputs (N,); NaN where there is none.
         sd: standard deviation of the white measurement noise, by output, SI.
         initial_state: the model's State at the first sample; the states that `model.spread`
             names are uncertain about it by that standard deviation, the others not at all.
         delay: as in `simulate`.
         substeps: linearisations a sample, for models that are not linear.
+        hold: as in `simulate`.
 
     Source: Kalman (1960); the covariance's integral in Van Loan (1978); local linearisation by
     Ozaki (1985).
     """
+    linear = linear_inputs(model, inputs, hold)
     x0 = model.initial_state(params) if initial_state is None else initial_state
     dtype = jax.tree.leaves(inputs)[0].dtype
     x = _vector(x0, dtype)
@@ -71,10 +75,10 @@ def innovations(
     y = jnp.stack(list(measured.values()), axis=1)
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
     if model.linear:
-        system = _linear(model, params, inputs, rows, dt, delay)
+        system = _linear(model, params, inputs, rows, dt, delay, linear)
         e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(system, x, P, y, R)
     else:
-        filter_ = _local(model, params, inputs, rows, dt, delay, substeps)
+        filter_ = _local(model, params, inputs, rows, dt, delay, substeps, linear)
         e, s = _run(filter_, x, P, y, R)
     return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
 
@@ -89,9 +93,17 @@ class _Linear(NamedTuple):
     feed: Float[Array, "N p"]
 
 
-def _linear(model: Model, params: Any, inputs: Any, rows: Array, dt: Any, delay: Any) -> _Linear:
+def _linear(
+    model: Model,
+    params: Any,
+    inputs: Any,
+    rows: Array,
+    dt: Any,
+    delay: Any,
+    linear: tuple[bool, ...],
+) -> _Linear:
     _, _, C, D = jacobians(model, params)
-    Ad, drive, acting = held_columns(model, params, inputs, dt, delay)
+    Ad, drive, acting = held_columns(model, params, inputs, dt, delay, linear)
     return _Linear(Ad, process_noise(model, params, dt), C[rows], drive, acting @ D[rows].T)
 
 
@@ -183,7 +195,14 @@ def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Arra
 
 
 def _local(
-    model: Model, params: Any, inputs: Any, rows: Array, dt: Any, delay: Any, substeps: int
+    model: Model,
+    params: Any,
+    inputs: Any,
+    rows: Array,
+    dt: Any,
+    delay: Any,
+    substeps: int,
+    linear: tuple[bool, ...],
 ) -> _Filter:
     names = naming.names(model.State)
     dtype = jax.tree.leaves(inputs)[0].dtype
@@ -200,13 +219,17 @@ def _local(
     def outputs(x: Array, u: Any) -> Array:
         return _vector(model.output(params, state(x), u), dtype)[rows]
 
-    parts, held, acting = (dt,), (inputs,), inputs
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    parts, held, acting, slopes = (dt,), (inputs,), inputs, None
     if delay is not None:
-        n = jax.tree.leaves(inputs)[0].shape[0]
+        acting = acting_inputs(inputs, dt, delay, n, linear)
+    if linear:
+        late = None if delay is None else split_delay(delay, dt)
+        parts, held, slopes = zip(*segments(inputs, dt, late, jnp.arange(n), linear), strict=True)
+    elif delay is not None:
         whole, late = split_delay(delay, dt)
         k = jnp.arange(n) - whole
         parts, held = (late * dt, (1.0 - late) * dt), (at(inputs, k - 1), at(inputs, k))
-        acting = acting_inputs(inputs, dt, delay, n)
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
         u = sample[1]
@@ -218,8 +241,35 @@ def _local(
         step = moved(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
         return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
 
+    def ramped(carry: tuple[Array, Array], h: Array, u: Any, slope: Any) -> tuple[Array, Array]:
+        """`along` where the inputs move: time is a state more, so that a linear model's step is
+        exact (local linearisation of an equation that depends on time)."""
+        x, P = carry
+        m = len(names)
+        _, b = jax.jvp(lambda u: rates(x, u), (u,), (slope,))
+        one, none = jnp.ones(1, dtype), jnp.zeros(1, dtype)
+        A = jnp.zeros((m + 1, m + 1), dtype).at[:m, :m].set(jax.jacfwd(rates)(x, u))
+        step = moved(
+            A.at[:m, m].set(b), jnp.concatenate([rates(x, u), one]), jnp.concatenate([g, none]), h
+        )
+        Phi = step.Phi[:m, :m]
+        return x + step.shift[:m], product(product(Phi, P), Phi.T) + step.Q[:m, :m]
+
+    def follow(carry: tuple[Array, Array], length: Array, u: Any, slope: Any) -> Any:
+        h = length / substeps
+
+        def one(carry: tuple[Array, Array], j: Array) -> tuple[Any, None]:
+            here = jax.tree.map(lambda u, slope: u + slope * (j * h), u, slope)
+            return ramped(carry, h, here, slope), None
+
+        return jax.lax.scan(one, carry, jnp.arange(substeps, dtype=dtype))[0]
+
     def move(x: Array, P: Array, sample: Any) -> tuple[Array, Array]:
         carry = (x, P)
+        if slopes is not None:
+            for length, u, slope in zip(parts, sample[0], sample[2], strict=True):
+                carry = follow(carry, length, u, slope)
+            return carry
         for length, u in zip(parts, sample[0], strict=True):
             carry, _ = jax.lax.scan(
                 lambda c, _, h=length / substeps, u=u: (along(c, h, u), None),
@@ -229,7 +279,7 @@ def _local(
             )
         return carry
 
-    return _Filter((held, acting), measure, move)
+    return _Filter((held, acting, slopes), measure, move)
 
 
 def _vector(record: Any, dtype: Any) -> Array:

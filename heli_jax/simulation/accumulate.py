@@ -11,8 +11,10 @@ from jaxtyping import Array, Bool
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
+from heli_jax.simulation.blocks import without_next
 from heli_jax.simulation.discretize import product, scalars
 from heli_jax.simulation.hoist import hoisted
+from heli_jax.simulation.hold import Hold, linear_inputs
 from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
 from heli_jax.simulation.solvers import Accumulating, Held, advance, at, dot
 
@@ -63,6 +65,7 @@ def accumulated(
     block: int = 1,
     adjoint: dfx.AbstractAdjoint | None = None,
     limits: bool = False,
+    hold: Hold = None,
 ) -> Accumulated:
     """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
 
@@ -73,9 +76,10 @@ def accumulated(
     Raises:
         ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact.
     """
+    linear = linear_inputs(model, flight, hold)
     inputs, dt = held_inputs(model, flight, dt)
     x0 = start_state(model, params, initial_state, inputs, dt)
-    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, None, None)
+    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, None, None, linear)
     if block != 1 and (held.discrete is None or block < 1):
         raise ValueError(f"block is {block}, wanted is 1, or more with solver='exact'")
     n = jax.tree.leaves(inputs)[0].shape[0]
@@ -128,9 +132,15 @@ def _in_blocks(
     of it; written out sample by sample it would compute every sample from x[k] again.
     """
     assert held.discrete is not None
-    A, B, _ = held.discrete
-    space = jacobians(model, held.params)
-    C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
+    space, Bn = jacobians(model, held.params), held.discrete.Bn
+    C, D = space.C.astype(held.discrete.Ad.dtype), space.D.astype(held.discrete.Ad.dtype)
+    ahead = None if Bn is None else scalars(Bn)
+    if Bn is not None:
+        # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
+        # held ones.
+        held, D = without_next(held)[0], D + product(C, Bn)
+        x0 = _plus(x0, ahead, at(held.inputs, 0), -1.0)
+    A, B, *_ = held.discrete
     rows, columns, power = [C], [B], A
     for _ in range(m - 1):
         rows.append(product(rows[-1], A))
@@ -138,8 +148,9 @@ def _in_blocks(
         power = product(A, power)
     free = [scalars(row) for row in rows[1:]]
     forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
-    ahead, driven = scalars(power), [scalars(column) for column in reversed(columns)]
-    free, forced, ahead, driven = jax.lax.optimization_barrier((free, forced, ahead, driven))
+    onward, driven = scalars(power), [scalars(column) for column in reversed(columns)]
+    once = jax.lax.optimization_barrier((free, forced, onward, driven, ahead))
+    free, forced, onward, driven, ahead = once
 
     names = naming.names(model.Outputs)
     structure, inputs = jax.tree.structure(x0), jax.tree.structure(held.inputs)
@@ -151,7 +162,8 @@ def _in_blocks(
         """The outputs of the j-th sample of a step that begins at x with the inputs u[0..j]."""
         if j == 0:
             now = jax.tree.unflatten(inputs, u[0])
-            return model.output(held.params, jax.tree.unflatten(structure, x), now)
+            state = _plus(jax.tree.unflatten(structure, x), ahead, now)
+            return model.output(held.params, state, now)
         found = {}
         for i, name in enumerate(names):
             total = dot(free[j - 1][i], x)
@@ -170,7 +182,7 @@ def _in_blocks(
         rows, now = given
         u = [[v[j] for v in rows] for j in range(m)]
         value = samples(x, value, u, now, m)
-        new = [dot(row, x) for row in ahead]
+        new = [dot(row, x) for row in onward]
         for j in range(m):
             new = [v + dot(row, u[j]) for v, row in zip(new, driven[j], strict=True)]
         return (new, value), None
@@ -188,4 +200,14 @@ def _in_blocks(
     last, discrete = list(x), held.discrete.in_scalars()
     for j in range(rest - 1):
         last = advance(discrete, last, u[j])
-    return value, jax.tree.unflatten(structure, last)
+    end = jax.tree.unflatten(structure, last)
+    return value, _plus(end, ahead, jax.tree.unflatten(inputs, u[rest - 1]))
+
+
+def _plus(state: Any, rows: Any, inputs: Any, sign: float = 1.0) -> Any:
+    """A State plus (or minus) a matrix, row by row in scalars, times the inputs; None adds none."""
+    if rows is None:
+        return state
+    u = jax.tree.leaves(inputs)
+    new = [x + sign * dot(row, u) for x, row in zip(jax.tree.leaves(state), rows, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(state), new)

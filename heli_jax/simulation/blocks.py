@@ -4,13 +4,14 @@ For one record this takes a fraction of the time of a step per sample; for large
 vehicles a step per sample is better, since the products grow with m.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from heli_jax.simulation.discretize import product
+from heli_jax.simulation.discretize import Discrete, product
 from heli_jax.simulation.solvers import Held, at
 
 
@@ -21,6 +22,10 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
     """
     assert held.discrete is not None
+    if held.discrete.Bn is not None:
+        held, ahead = without_next(held)
+        x0 = jax.tree.map(lambda x, a: x - a[0], x0, ahead(x0))
+        return jax.tree.map(jnp.add, blockwise(held, m, x0), ahead(x0))
     A, (B, U) = held.discrete.Ad, columns(held)
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
@@ -46,16 +51,36 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
 
 
 def columns(held: Held) -> tuple[Array, Array]:
-    """B (n, r) and what it multiplies (N, r): the inputs now, then those still held before."""
+    """B (n, r) and what it multiplies (N, r): the inputs now, those before, and the next ones."""
     assert held.discrete is not None
-    now = jax.tree.leaves(held.inputs)
-    n = now[0].shape[0]
-    B = held.discrete.Bd
-    if held.delay is None:
-        return B, jnp.stack(now, axis=1)
-    k = jnp.arange(n) - held.delay[0]
-    both = [*jax.tree.leaves(at(held.inputs, k)), *jax.tree.leaves(at(held.inputs, k - 1))]
-    return jnp.concatenate([B, held.discrete.Bp], axis=1), jnp.stack(both, axis=1)
+    _, B, before, after = held.discrete
+    if before is None and after is None:
+        return B, jnp.stack(jax.tree.leaves(held.inputs), axis=1)
+    n = jax.tree.leaves(held.inputs)[0].shape[0]
+    k = jnp.arange(n) if held.delay is None else jnp.arange(n) - held.delay[0]
+    taps = [(B, k), *((M, k + i) for M, i in ((before, -1), (after, 1)) if M is not None)]
+    U = [u for _, at_k in taps for u in jax.tree.leaves(at(held.inputs, at_k))]
+    return jnp.concatenate([M for M, _ in taps], axis=1), jnp.stack(U, axis=1)
+
+
+def without_next(held: Held) -> tuple[Held, Callable[[Any], Any]]:
+    """The recurrence without the inputs one sample ahead: linear inputs cost what held ones do.
+
+    z[k] = x[k] - Bn u[k] turns x[k+1] = Ad x[k] + Bd u[k] + Bn u[k+1] into
+    z[k+1] = Ad z[k] + (Ad Bn + Bd) u[k]. Returns what makes z, and a function of any State that
+    gives Bn u as one, arrays (N,).
+    """
+    assert held.discrete is not None
+    A, B, before, after = held.discrete
+    n = jax.tree.leaves(held.inputs)[0].shape[0]
+    k = jnp.arange(n) if held.delay is None else jnp.arange(n) - held.delay[0]
+    U = jnp.stack(jax.tree.leaves(at(held.inputs, k)), axis=1)
+
+    def ahead(like: Any) -> Any:
+        return jax.tree.unflatten(jax.tree.structure(like), list((U @ after.T).T))
+
+    plain = Discrete(A, product(A, after) + B, before, None)
+    return held._replace(discrete=plain), ahead
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:

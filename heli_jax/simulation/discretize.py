@@ -1,10 +1,11 @@
-"""Exact discretisation of a linear model under a zero-order hold."""
+"""Exact discretisation of a linear model whose inputs are held, or linear between samples."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.dynamics.jacobians import jacobians
@@ -177,32 +178,61 @@ def _balance(M: Float[Array, "n n *L"]) -> Float[Array, "n *L"]:
 class Discrete(NamedTuple):
     """x[k+1] = Ad x[k] + Bd u[k], in matrices, or in nested tuples of scalars (`in_scalars`).
 
-    With a delayed input, `Bp` multiplies the sample that is still held at the start of the
-    interval; otherwise it is None.
+    With a delayed input, `Bp` multiplies the sample before, u[k-1]; otherwise it is None. With
+    inputs that are linear between samples, `Bn` multiplies the next one, u[k+1]; its columns of
+    inputs that are held are zero, and without such inputs it is None.
     """
 
     Ad: Any
     Bd: Any
     Bp: Any
+    Bn: Any = None
 
     def in_scalars(self) -> "Discrete":
         """As nested tuples."""
         return _once(Discrete(*(None if M is None else scalars(M) for M in self)))
 
 
-def discretize(model: Model, params: Any, dt: Any, late: Any = None) -> Discrete:
-    """The zero-order-hold equivalent of a linear model for steps of `dt` [s], in matrices.
+def discretize(
+    model: Model, params: Any, dt: Any, late: Any = None, linear: tuple[bool, ...] = ()
+) -> Discrete:
+    """The exact equivalent of a linear model for steps of `dt` [s], in matrices.
 
-    `late` [s], within [0, dt], is the part of each interval in which the sample before is still
-    held: x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] + G(dt-late) u[k].
+    Args:
+        late: [s], within [0, dt]: the part of each interval before the delayed sample u[k] acts.
+            Under a zero-order hold x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] +
+            G(dt-late) u[k].
+        linear: of each input whether it is linear between samples; () holds all.
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
+    if linear:
+        return _once(_first_order(A, B, dt, late, linear))
     if late is None:
         return _once(Discrete(*_held(A, B, dt), None))
     late = jnp.asarray(late, A.dtype)
     first, second = _held(A, B, late), _held(A, B, dt - late)
     return _once(Discrete(second[0] @ first[0], second[1], second[0] @ first[1]))
+
+
+def _first_order(A: Array, B: Array, dt: Array, late: Any, linear: tuple[bool, ...]) -> Discrete:
+    """`discretize` with some inputs on straight lines between samples (first-order hold)."""
+    if late is None:
+        Ad, G, R = _ramped(A, B, dt, dt, linear)
+        return Discrete(Ad, G - R, None, R)
+    late = jnp.asarray(late, A.dtype)
+    first, second = _ramped(A, B, late, dt, linear), _ramped(A, B, dt - late, dt, linear)
+    # The interval begins on the line from u[k-1] to u[k], `late` before its end: what is held is
+    # still u[k-1] there.
+    arrived = jnp.asarray(linear, A.dtype)[None, :] * (1.0 - late / dt)
+    before = first[1] * (1.0 - arrived) - first[2]
+    now = first[1] * arrived + first[2]
+    return Discrete(
+        product(second[0], first[0]),
+        product(second[0], now) + second[1] - second[2],
+        product(second[0], before),
+        second[2],
+    )
 
 
 def _once(discrete: Discrete) -> Discrete:
@@ -231,6 +261,24 @@ def _held(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
     M = jnp.zeros((n + m, n + m), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     E = expm(M * dt)
     return E[:n, :n], E[:n, n:]
+
+
+def _ramped(
+    A: Array, B: Array, h: Array, dt: Array, linear: tuple[bool, ...]
+) -> tuple[Array, Array, Array]:
+    """Over h [s]: e^{A h}, what inputs of 1 add, and what inputs that rise by 1 every dt [s] add.
+
+    One exponential of [[A, B, 0], [0, 0, I/dt], [0, 0, 0]] h (Franklin, Powell and Workman, 1998,
+    section 6.3.2); the last is zero for inputs that are not linear.
+    """
+    n, m = B.shape
+    moving = np.flatnonzero(linear)
+    q = n + m + moving.size
+    M = jnp.zeros((q, q), A.dtype).at[:n, :n].set(A).at[:n, n : n + m].set(B)
+    M = M.at[n + moving, n + m + np.arange(moving.size)].set(1.0 / dt)
+    E = expm(M * h)
+    ramps = jnp.zeros((n, m), A.dtype).at[:, moving].set(E[:n, n + m :])
+    return E[:n, :n], E[:n, n : n + m], ramps
 
 
 def scalars(M: Float[Array, "n m"]) -> tuple[tuple[Any, ...], ...]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from heli_jax.dynamics.model import Model
+from heli_jax.simulation.hold import at_end
 
 type Event = Callable[[Any, Any, Any], Any]
 """event(params, state, inputs) -> a number, above zero while the run goes on"""
@@ -32,12 +33,19 @@ def any_over(events: Mapping[str, Event], params: Any, state: Any, inputs: Any) 
 
 
 def stopped(
-    model: Model, params: Any, events: Mapping[str, Event], times: Array, states: Any, inputs: Any
+    model: Model,
+    params: Any,
+    events: Mapping[str, Event],
+    times: Array,
+    states: Any,
+    inputs: Any,
+    linear: tuple[bool, ...] = (),
 ) -> tuple[Any, tuple[Array, Array]]:
     """The states (N,) with the moment of the first event in place of all that follow it.
 
     Within the sample the states are followed by Hermite's cubic, of fourth order in the sample
-    time. Returns the states, and the time [s] and the index of the event.
+    time. `linear` says of each input whether it moves there. Returns the states, and the time [s]
+    and the index of the event.
     """
 
     def values(state: Any, u: Any) -> Array:
@@ -50,7 +58,11 @@ def stopped(
     k = jnp.clip(last - 1, 0, n - 2)
     x0, x1, u = _pick(states, k), _pick(states, k + 1), _pick(inputs, k)
     h = times[k + 1] - times[k]
-    f0, f1 = model.vector_field(params, x0, u), model.vector_field(params, x1, u)
+    u1 = at_end(inputs, k, linear)
+    f0, f1 = model.vector_field(params, x0, u), model.vector_field(params, x1, u1)
+
+    def acting(s: Array) -> Any:
+        return jax.tree.map(lambda a, b: a + s * (b - a), u, u1) if linear else u
 
     def along(s: Array) -> Any:
         def one(a: Array, b: Array, da: Array, db: Array) -> Array:
@@ -63,13 +75,13 @@ def stopped(
     def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        after = jnp.any(values(along(middle), u) <= 0)
+        after = jnp.any(values(along(middle), acting(middle)) <= 0)
         return jnp.where(after, low, middle), jnp.where(after, middle, high)
 
     one = jnp.ones((), times.dtype)
     _, s = jax.lax.fori_loop(0, _BISECTIONS, halve, (0.0 * one, one))
     s = jnp.where(over[0], 0.0, s)
-    which = jnp.argmin(values(along(s), u))
+    which = jnp.argmin(values(along(s), acting(s)))
     came = jnp.any(over)
     moment = jnp.where(over[0], times[0], times[k] + s * h)
     rest = jnp.where(came, jnp.arange(n) >= last, False)

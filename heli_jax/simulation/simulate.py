@@ -17,12 +17,14 @@ from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import blockwise, columns
 from heli_jax.simulation.discretize import discretize, moved, process_noise, square_root
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
+from heli_jax.simulation.hold import Hold, delayed, linear_inputs
 from heli_jax.simulation.solvers import (
     RK4,
     Adaptive,
     Exact,
     Fed,
     Held,
+    Moving,
     Noisy,
     PerSample,
     Stopping,
@@ -80,8 +82,9 @@ def simulate(
     block: int = 1,
     feedback: Callable[[Any, Any], Any] | None = None,
     events: Mapping[str, Event] | None = None,
+    hold: Hold = None,
 ) -> Trajectory:
-    """Simulate one machine; each input sample is held until the next (zero-order hold).
+    """Simulate one machine; each input is held until the next sample, or linear between the two.
 
     Args:
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
@@ -107,19 +110,26 @@ def simulate(
         events: by name, event(params, state, inputs) -> a number that is above zero while the run
             goes on (see `heli_jax.simulation.events`). The first to fall to zero or below ends
             the run: from there on the state stays as it was at that moment.
+        hold: what the inputs do between samples: "zero-order" (each sample stays until the next)
+            or "linear" (straight lines), for all or by input. Unless given, as the Flight says;
+            given as arrays they stay.
 
     Returns:
         A Trajectory; a failed integration is in its `status`, never an exception.
 
     Raises:
         ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, a key
-            for a model without noise or with adaptive steps, or feedback with a delay.
+            for a model without noise or with adaptive steps, feedback with a delay or with a
+            linear hold, or an unknown hold.
     """
+    linear = linear_inputs(model, flight, hold)
     inputs, dt = held_inputs(model, flight, dt)
     n = jax.tree.leaves(inputs)[0].shape[0]
     x0 = start_state(model, params, initial_state, inputs, dt)
     adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
-    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, delay, controller)
+    method, held, term = per_sample(
+        model, params, inputs, dt, solver, substeps, delay, controller, linear
+    )
     if isinstance(method, Adaptive):
         method = dataclasses.replace(method, adjoint=adjoint, max_steps=max_steps)
         if key is not None:
@@ -127,6 +137,11 @@ def simulate(
     if feedback is not None:
         if delay is not None:
             raise ValueError("feedback is for runs without a delay only")
+        if linear:
+            raise ValueError(
+                "feedback acts once a sample and is held until the next, expected are inputs with "
+                "hold='zero-order'"
+            )
         method = Fed(method, feedback)
     if key is not None:
         method, held = _with_noise(model, held, method, dt, key)
@@ -139,20 +154,20 @@ def simulate(
         if events:
             over = functools.partial(any_over, events, params)
             first = 1.0 - over(x0, at(inputs, 0)).astype(dtype)
-            stopping = Stopping(method, over)
+            stopping = Stopping(method, over, linear)
             (states, _), result = _stepwise(stopping, held, term, (x0, first), n, adjoint)
         else:
             states, result = _stepwise(method, held, term, x0, n, adjoint)
     acting = inputs
     if delay is not None:
-        acting = acting_inputs(inputs, dt, delay, n)
+        acting = acting_inputs(inputs, dt, delay, n, linear)
     if feedback is not None:
         acting = jax.vmap(feedback)(states, inputs)
     step = jnp.asarray(dt, jnp.result_type(dt) if hasattr(dt, "dtype") else float)
     times = jnp.arange(n, dtype=step.dtype) * step
     end = NO_END
     if events:
-        states, end = stopped(model, params, events, times, states, acting)
+        states, end = stopped(model, params, events, times, states, acting, linear)
     outputs = jax.vmap(lambda x, u: model.output(params, x, u))(states, acting)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
     outside = {}
@@ -205,6 +220,7 @@ def per_sample(
     substeps: int,
     delay: Any,
     controller: dfx.AbstractStepSizeController | None,
+    linear: tuple[bool, ...] = (),
 ) -> tuple[dfx.AbstractSolver, Held, dfx.ODETerm]:
     """The solver, its arguments and the term for time counted in samples."""
     method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
@@ -216,24 +232,31 @@ def per_sample(
     dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         late = None if parts is None else parts[1] * dt
-        return method, Held(params, inputs, dt, parts, discretize(model, params, dt, late)), term
+        discrete = discretize(model, params, dt, late, linear)
+        return method, Held(params, inputs, dt, parts, discrete), term
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, wanted is at least 1")
     held = Held(params, inputs, dt, parts, None)
     if controller is not None:
-        return Adaptive(method, 1, controller, dfx.DirectAdjoint(), 4096), held, term
-    return PerSample(method, substeps), held, term
+        adaptive = Adaptive(method, 1, controller, dfx.DirectAdjoint(), 4096, linear=linear)
+        return adaptive, held, term
+    return PerSample(method, substeps, linear=linear), held, term
 
 
 def held_columns(
-    model: Model, params: Any, inputs: Any, dt: Any, delay: Any
+    model: Model,
+    params: Any,
+    inputs: Any,
+    dt: Any,
+    delay: Any,
+    linear: tuple[bool, ...] = (),
 ) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
     """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k."""
-    _, held, _ = per_sample(model, params, inputs, dt, "exact", 1, delay, None)
+    _, held, _ = per_sample(model, params, inputs, dt, "exact", 1, delay, None, linear)
     assert held.discrete is not None
     B, U = columns(held)
     n = U.shape[0]
-    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n)
+    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
     return held.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
 
 
@@ -260,6 +283,10 @@ def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tup
     L = square_root(process_noise(model, held.params, dt))
     draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
     discrete = held.discrete._replace(Bd=jnp.concatenate([held.discrete.Bd, L], axis=1))
+    if discrete.Bn is not None:
+        # The draws are no inputs: nothing of them comes from the next sample.
+        Bn = jnp.concatenate([discrete.Bn, jnp.zeros_like(L)], axis=1)
+        discrete = discrete._replace(Bn=Bn)
     return method, held._replace(inputs=(held.inputs, tuple(draws.T)), discrete=discrete)
 
 
@@ -296,6 +323,8 @@ class _Field(eqx.Module):
             return jax.tree.map(jnp.zeros_like, x)
         if isinstance(now, Held):
             return x  # only the shapes are asked for; the inputs may not be the model's
+        if isinstance(now, Moving):
+            now = now.after(t)
         return self.vector_field(now.params, x, now.inputs)
 
 
@@ -327,7 +356,6 @@ def _stepwise(
     return sol.ys, sol.result
 
 
-def acting_inputs(inputs: Any, dt: Any, delay: Any, n: int) -> Any:
+def acting_inputs(inputs: Any, dt: Any, delay: Any, n: int, linear: tuple[bool, ...] = ()) -> Any:
     """The inputs that act at the n samples when they come late."""
-    whole, rest = split_delay(delay, dt)
-    return at(inputs, jnp.arange(n) - whole - (rest > 0).astype(int))
+    return delayed(inputs, *split_delay(delay, dt), n, linear)

@@ -1,7 +1,8 @@
-"""Solver classes of our own: one step a sample, the input held, named scalar leaves.
+"""Solver classes of our own: one step a sample, named scalar leaves.
 
-A Runge-Kutta method that reads the input by time sees the next sample in its last stage, an error
-of first order. Here the input of an interval is picked once and held while the step is made.
+A Runge-Kutta method that reads a held input by time sees the next sample in its last stage, an
+error of first order. Here the input of an interval is picked once and held while the step is made;
+one that is linear between samples is followed along its line by every stage.
 """
 
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 
 from heli_jax.errors import nearest
 from heli_jax.simulation.discretize import Discrete
+from heli_jax.simulation.hold import at, at_end, segments
 
 
 class Held(NamedTuple):
@@ -44,9 +46,17 @@ class Now(NamedTuple):
     inputs: Any
 
 
-def at(inputs: Any, k: Any) -> Any:
-    """The inputs of sample k; before the first the first, after the last the last."""
-    return jax.tree.map(lambda u: u[jnp.clip(k, 0, u.shape[0] - 1)], inputs)
+class Moving(NamedTuple):
+    """As `Now`, for inputs that move: those at the begin of a step, and their slope per second."""
+
+    params: Any
+    inputs: Any
+    slope: Any
+
+    def after(self, t: Any) -> "Moving":
+        """As of t [s] later."""
+        inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
+        return self._replace(inputs=inputs)
 
 
 def _sample(t: Any) -> Any:
@@ -78,7 +88,7 @@ class _Around(_Stateless):
 
 
 class Exact(_Stateless):
-    """Exact zero-order hold for linear models: a recurrence with scalar coefficients."""
+    """Exact for linear models, held inputs or linear ones: a recurrence of scalar coefficients."""
 
     def order(self, terms: Any) -> None:
         return None
@@ -94,17 +104,20 @@ class Exact(_Stateless):
         if args.delay is not None:
             k = k - args.delay[0]
         before = None if args.delay is None else jax.tree.leaves(at(args.inputs, k - 1))
+        after = None if args.discrete.Bn is None else jax.tree.leaves(at(args.inputs, k + 1))
         u = jax.tree.leaves(at(args.inputs, k))
-        new = advance(args.discrete, jax.tree.leaves(y0), u, before)
+        new = advance(args.discrete, jax.tree.leaves(y0), u, before, after)
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
-def advance(discrete: Discrete, x: Any, u: Any, before: Any = None) -> list[Any]:
-    """x[k+1] from lists of scalars; `before` is the input still held from the sample before."""
+def advance(discrete: Discrete, x: Any, u: Any, before: Any = None, after: Any = None) -> list[Any]:
+    """x[k+1] from lists of scalars; `before` and `after` are the inputs of the samples beside."""
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
         new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
+    if discrete.Bn is not None:
+        new = [v + dot(b, after) for v, b in zip(new, discrete.Bn, strict=True)]
     return new
 
 
@@ -171,13 +184,15 @@ class RK4(_Stateless):
 
 
 class PerSample(_Around):
-    """Any solver inside one sample: the input held, `substeps` equal steps.
+    """Any solver inside one sample: `substeps` equal steps.
 
     With a delayed input the interval has two parts, before and after the change of the input,
     with `substeps` steps each.
     """
 
     substeps: int = eqx.field(static=True)
+    linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
+    """of each input whether it is linear between samples; () holds all"""
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
@@ -185,44 +200,53 @@ class PerSample(_Around):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
     ) -> Any:
-        k = _sample(t0)
-        if args.delay is None:
-            parts = [(args.dt, k)]
-        else:
-            whole, rest = args.delay
-            parts = [(rest * args.dt, k - whole - 1), ((1.0 - rest) * args.dt, k - whole)]
         y, result = y0, dfx.RESULTS.successful
-        for length, sample in parts:
-            now = Now(args.params, at(args.inputs, sample))
+        for length, now in self._parts(args, _sample(t0)):
             y, one = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)
         return y, None, {"y0": y0, "y1": y}, None, result
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: Now) -> Any:
-        """`substeps` steps of h [s]. Nothing depends on time while the input is held, so each
-        begins at 0: a step length that is the same number in all steps makes the code faster.
+    def _parts(self, args: Held, k: Any) -> list[tuple[Any, Now | Moving]]:
+        """The parts of the interval from sample k on: how long [s], and with which inputs."""
+        if self.linear:
+            parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
+            return [(p.length, Moving(args.params, p.inputs, p.slope)) for p in parts]
+        if args.delay is None:
+            return [(args.dt, Now(args.params, at(args.inputs, k)))]
+        whole, rest = args.delay
+        return [
+            (rest * args.dt, Now(args.params, at(args.inputs, k - whole - 1))),
+            ((1.0 - rest) * args.dt, Now(args.params, at(args.inputs, k - whole))),
+        ]
+
+    def _steps(self, terms: Any, h: Any, y0: Any, now: Now | Moving) -> Any:
+        """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
+        moves it is counted from the step's begin, so each begins at 0: a step length that is the
+        same number in all steps makes the code faster.
         """
         begin = jnp.zeros_like(h)
 
-        def body(carry: Any, _: Any) -> Any:
+        def body(carry: Any, j: Any) -> Any:
             y, result = carry
-            state = self.solver.init(terms, begin, h, y, now)
-            y, _, _, _, one = self.solver.step(terms, begin, h, y, now, state, False)
+            here = now.after(j * h) if isinstance(now, Moving) else now
+            state = self.solver.init(terms, begin, h, y, here)
+            y, _, _, _, one = self.solver.step(terms, begin, h, y, here, state, False)
             return (y, dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)), None
 
         carry = (y0, dfx.RESULTS.successful)
-        (y, result), _ = jax.lax.scan(body, carry, None, length=self.substeps)
+        steps = jnp.arange(self.substeps, dtype=h.dtype) if isinstance(now, Moving) else None
+        (y, result), _ = jax.lax.scan(body, carry, steps, length=self.substeps)
         return y, result
 
 
 class Adaptive(PerSample):
-    """A diffrax solver with a step-size controller inside one sample: the input held."""
+    """A diffrax solver with a step-size controller inside one sample."""
 
     controller: dfx.AbstractStepSizeController
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: Now) -> Any:
+    def _steps(self, terms: Any, h: Any, y0: Any, now: Now | Moving) -> Any:
         sol = dfx.diffeqsolve(
             terms,
             self.solver,
@@ -266,6 +290,7 @@ class Stopping(_Around):
     """
 
     over: Callable[..., Any]
+    linear: tuple[bool, ...] = eqx.field(static=True, default=())
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
@@ -274,7 +299,8 @@ class Stopping(_Around):
         new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
         new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
         result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
-        ended = self.over(new, at(args.inputs, _sample(t0)))
+        # The inputs at the end of the interval: those held since its begin, or the next ones.
+        ended = self.over(new, at_end(args.inputs, _sample(t0), self.linear))
         y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
         return y1, None, {"y0": y0, "y1": y1}, None, result
 

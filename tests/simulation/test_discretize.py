@@ -170,7 +170,8 @@ def test_discretisation_with_a_late_input(stand_discrete, seed, late):
 
     whole, rest = held(dt), held((1.0 - late) * dt)
     wanted = whole[0], rest[1], whole[1] - rest[1]  # what acted before is the rest of the interval
-    for one, other in zip(found, wanted, strict=True):
+    assert found.Bn is None
+    for one, other in zip(found[:3], wanted, strict=True):
         size = np.abs(other).max() + np.abs(whole[1]).max()
         np.testing.assert_allclose(np.array(one), other, rtol=1e-9, atol=1e-11 * size)
 
