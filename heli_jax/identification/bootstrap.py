@@ -115,6 +115,7 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
             solver=layout.solver,
             substeps=layout.substeps,
             key=second,
+            hold=layout.hold(i),
         ).outputs
 
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))

@@ -81,6 +81,8 @@ class Layout(eqx.Module):
     """by flight: how many windows, and the samples of each"""
     continuity: float | None = eqx.field(static=True)
     """see `Problem.continuity`"""
+    holds: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -116,6 +118,10 @@ class Layout(eqx.Module):
     def constants(self, outputs: tuple[str, ...]) -> int:
         """The biases and input offsets of a flight with these outputs."""
         return (len(outputs) if self.bias else 0) + len(self.offsets)
+
+    def hold(self, i: int) -> dict[str, str]:
+        """What the inputs of the i-th flight do between samples, by name."""
+        return dict(zip(naming.names(self.model.Inputs), self.holds[i], strict=True))
 
     @property
     def determined(self) -> int:
@@ -192,7 +198,12 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         block=_BLOCK if exact else 1,
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
+        holds=tuple(_holds(problem.model, flight) for flight in flights),
     )
+
+
+def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
+    return tuple(flight.hold[n] for n in naming.names(model.Inputs))
 
 
 def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:

@@ -51,13 +51,14 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     """
     alone, groups = {}, {}
     for i, flight in enumerate(data.flights):
-        key = (layout.windows[i][1], tuple(flight.known))
+        key = (layout.windows[i][1], tuple(flight.known), layout.holds[i])
         groups.setdefault(key, []).append(i)
-    for (m, _), members in groups.items():
+    for (m, *_), members in groups.items():
         if len(members) == 1 and layout.windows[members[0]][0] == 1:
             i = members[0]
             params, inputs = driven(layout, data, u, i)
-            run = _simulated_one(layout, params, inputs, data.flights[i].dt, u.states[i], u.shift)
+            dt, state = data.flights[i].dt, u.states[i]
+            run = _simulated_one(layout, i, params, inputs, dt, state, u.shift)
             measured = [getattr(run.outputs, n) for n in layout.outputs[i]]
             alone[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
         else:
@@ -66,8 +67,9 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
 
 
 def _simulated_one(
-    layout: Layout, params: Any, inputs: Any, dt: Any, state: Any, shift: Any
+    layout: Layout, i: int, params: Any, inputs: Any, dt: Any, state: Any, shift: Any
 ) -> Trajectory:
+    """A run with inputs that move between samples as those of the i-th flight."""
     return simulate(
         layout.model,
         params,
@@ -79,6 +81,7 @@ def _simulated_one(
         delay=shift,
         block=layout.block,
         adjoint=dfx.ForwardMode(),
+        hold=layout.hold(i),
     )
 
 
@@ -104,7 +107,7 @@ def _together(
 
     def one(inputs: Any, known: Any, dt: Any, state: Any) -> Any:
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
-        run = _simulated_one(layout, params, inputs, dt, state, u.shift)
+        run = _simulated_one(layout, members[0], params, inputs, dt, state, u.shift)
         return run.states, run.outputs
 
     states, outputs = jax.vmap(one)(*stacked)
@@ -130,8 +133,8 @@ def _together(
 def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Innovations, ...]:
     """The innovations of every flight."""
     out = []
-    by_flight = zip(data.flights, u.states, u.biases, noise.sd, strict=True)
-    for i, (flight, state, bias, sd) in enumerate(by_flight):
+    each = zip(data.flights, u.states, u.biases, noise.sd, strict=True)
+    for i, (flight, state, bias, sd) in enumerate(each):
         params, inputs = driven(layout, data, u, i)
         out.append(
             innovations(
@@ -144,6 +147,7 @@ def filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> tuple[Inn
                 initial_state=state,
                 delay=u.shift,
                 substeps=layout.substeps,
+                hold=layout.hold(i),
             )
         )
     return tuple(out)

@@ -56,6 +56,13 @@ class Plan(NamedTuple):
     trimmed: Trimmed | None
     streamed: bool
     simulated: bool
+    linear: tuple[str, ...] = ()
+    """inputs that are linear between samples; the others are held"""
+
+    @property
+    def hold(self) -> dict[str, str]:
+        """What the inputs do between samples, as `simulate` takes it."""
+        return dict.fromkeys(self.linear, "linear")
 
 
 _MOST = 10**10
@@ -79,9 +86,8 @@ class Job(NamedTuple):
     trimmed: Trimmed | None
     pilot: Pilot | None
 
-    @property
-    def plan(self) -> Plan:
-        """The part of it that is compiled."""
+    def plan(self, index: int) -> Plan:
+        """The part of it that is compiled for one of its flights."""
         return Plan(
             self.model,
             tuple(self.reduce.items()),
@@ -92,6 +98,7 @@ class Job(NamedTuple):
             self.trimmed,
             self.streamed,
             self.simulated,
+            _linear(self.model, self.flights[index]),
         )
 
     @property
@@ -106,6 +113,10 @@ class Job(NamedTuple):
         """Whether anything has to be simulated at all."""
         kept = [r for r in self.reduce.values() if r.how not in reducers.LINEAR]
         return bool(kept) or self.trajectories is not None
+
+
+def _linear(model: Model, flight: Flight) -> tuple[str, ...]:
+    return tuple(n for n in naming.names(model.Inputs) if flight.hold.get(n) == "linear")
 
 
 def _needs_whole_run(one: Reduce) -> bool:
@@ -276,6 +287,7 @@ def described(one: Job) -> dict[str, Any]:
             "dt": f.dt,
             "known": dict(f.known),
             "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
+            **({"linear": list(linear)} if (linear := _linear(model, f)) else {}),
         }
         for f in one.flights
     ]

@@ -256,6 +256,7 @@ def _streamed(
         substeps=plan.substeps,
         block=_BLOCK if plan.solver == "exact" else 1,
         limits=True,
+        hold=plan.hold,
     )
     n = jax.tree.leaves(inputs)[0].shape[0]
     return _finished(plan, numbers, found.value, n), {}, found.state, list(found.outside.values())
@@ -276,6 +277,7 @@ def _whole(
         delay=moved.get("delay"),
         key=jax.random.key(moved["seed"]) if "seed" in moved else None,
         feedback=numbers.pilot,
+        hold=plan.hold,
     )
     update, start, data = _updating(plan, numbers)
     value, _ = jax.lax.scan(lambda v, now: (update(v, *now), None), start, (run.outputs, data))
@@ -307,7 +309,7 @@ def shapes(job: Job, index: int) -> Found:
     columns = arguments(job, job.design.values(0, 1))
     taken = (given(job, index), {n: v[0] for n, v in columns.items()})
     leaves, structure = jax.tree.flatten(taken)
-    return _shapes(job.plan, structure, tuple((v.shape, v.dtype) for v in leaves))
+    return _shapes(job.plan(index), structure, tuple((v.shape, v.dtype) for v in leaves))
 
 
 @functools.lru_cache(maxsize=32)
@@ -350,7 +352,7 @@ class Program:
     def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         self._step = lanes * len(devices)
         self._numbers = given(job, index)
-        self._starts, self._run, self._split = _compiled(job.plan, tuple(devices), lanes)
+        self._starts, self._run, self._split = _compiled(job.plan(index), tuple(devices), lanes)
 
     def __call__(self, values: dict[str, np.ndarray], size: int) -> Found:
         """Begin to compute a chunk of values (k,), filled up to `size` elements; arrays (size,)

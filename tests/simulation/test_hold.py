@@ -283,13 +283,12 @@ def test_an_event_is_found_where_the_moving_input_brings_it():
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"hold": "foh"}, ["zero-order, linear", "'foh'"]),
-        ({"hold": {"de": "cubic"}}, ["'cubic'"]),
-        ({"hold": {"da": "linear"}}, ["'da'"]),
-        ({"hold": "linear", "feedback": lambda s, u: u}, ["feedback", "zero-order"]),
+        ({"hold": "foh"}, "zero-order, linear, got 'foh'"),
+        ({"hold": {"de": "cubic"}}, "got 'cubic'"),
+        ({"hold": {"da": "linear"}}, "no input 'da'"),
+        ({"hold": "linear", "feedback": lambda s, u: u}, "feedback .* hold='zero-order'"),
     ],
 )
 def test_what_cannot_be_is_said(how, words):
-    with pytest.raises(ValueError) as e:
+    with pytest.raises(ValueError, match=words):
         simulate(LINEAR, Params(), inputs(), dt=DT, **how)
-    assert all(w in str(e.value) for w in words)
