@@ -21,6 +21,7 @@ from heli_jax.config import (
 from heli_jax.dynamics.model import Model, needed_but_missing, zeros
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import decide
 from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate, substeps_for
@@ -84,6 +85,7 @@ def generate(experiment: Experiment) -> Simulated:
         outputs[name] = outputs[name] + draws[: outputs[name].size]
     acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
+    notes = (*notes, *_held_notes(experiment, acted))
     return Simulated(columns, plain.model, {experiment.path.stem: run}, notes)
 
 
@@ -263,6 +265,24 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
             first = run.times[np.argmax(beyond)]
             found.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
     return tuple(found)
+
+
+def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[str]:
+    """Sticks are held here whatever they do; what to say where a reader of the log would not know.
+
+    A chirp and a pilot's feedback move at every sample, as sampled sticks do.
+    """
+    if not experiment.config.flights:
+        return []
+    signals = experiment.config.flights[0].signals.inputs
+    auto = [n for n, one in signals.items() if one.hold == "auto" and n in acted]
+    moving = [n for n in auto if decide(acted[n]).hold == "linear"]
+    if not moving:
+        return []
+    return [
+        f"{', '.join(moving)}: held between samples here, but moving at nearly every one; to fit "
+        "this log say hold: zero-order in flights[].signals.inputs (docs/inputs.md)"
+    ]
 
 
 def follow(experiment: Experiment) -> Simulated:

@@ -91,7 +91,8 @@ def signals(
         place = f"{where}.{role}.{name}.unit"
         si = naming.unit(record, name)
         unit = one.unit if one.unit is not None else (si or "1")
-        out[name] = Signal(one.signal, unit, _si(unit, si, place, gain), getattr(one, "sd", None))
+        sd, hold = getattr(one, "sd", None), getattr(one, "hold", "auto")
+        out[name] = Signal(one.signal, unit, _si(unit, si, place, gain), sd, hold)
     return out
 
 

@@ -22,6 +22,8 @@ class TimeConfig(_Strict):
 class InputConfig(_Strict):
     signal: str
     unit: str | None = None
+    hold: Literal["auto", "zero-order", "linear"] = "auto"
+    """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
 
 
 class OutputConfig(_Strict):

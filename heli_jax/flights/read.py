@@ -10,6 +10,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
 from heli_jax.flights.table import Table, column, open_table, shown, wrong
@@ -36,7 +37,8 @@ def read_flight(
     Args:
         path: the log, ending in .csv, .txt, .tsv or .parquet.
         time: the column of time stamps, in seconds where only its name is given.
-        inputs: the log's signals by the model's names; two inputs may share a column.
+        inputs: the log's signals by the model's names; two inputs may share a column. What one
+            does between samples is its `hold`; "auto" decides by how it moves in the log.
         outputs: the same for what was measured.
         rate: resample to this rate [Hz]. Without it the stamps must be a uniform grid.
         window: first and last time to use [s], counted from the log's first sample.
@@ -59,7 +61,8 @@ def read_flight(
     grid = uniform_grid(seconds[rows], rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and rate is None:
         raise _uneven(table, request.time.name, seconds[rows], rows.start, grid)
-    dt, samples, more = _on_grid(table, request, seconds, rows, signals, grid)
+    holds = _holds(request, signals)
+    dt, samples, more = _on_grid(table, request, seconds, rows, signals, grid, holds)
     flight = Flight(
         dt=dt,
         inputs={key: samples[key, "input"] for key in inputs},
@@ -70,6 +73,8 @@ def read_flight(
         hold_out=hold_out,
         name=name,
         source=Source(table.path, table.sha256, (*notes, *_missing(request, signals), *more)),
+        hold={key: one.hold for key, one in holds.items()},
+        hold_reason={key: one.reason for key, one in holds.items() if one.reason},
     )
     if moving_inputs:
         require_moving_inputs(flight)
@@ -175,6 +180,16 @@ def _to_si(
     return samples
 
 
+def _holds(request: Request, signals: _Samples) -> dict[str, Decision]:
+    """What each input does between samples: as stated, or by what the log itself shows."""
+    found = {}
+    for (key, kind), signal in request.signals.items():
+        if kind == "input":
+            given = Decision(signal.hold, "")
+            found[key] = decide(signals[key, kind]) if signal.hold == "auto" else given
+    return found
+
+
 def _missing(request: Request, signals: _Samples) -> list[str]:
     """A note for every output with missing samples."""
     found = []
@@ -217,6 +232,7 @@ def _on_grid(
     rows: slice,
     signals: _Samples,
     grid: Grid | Uneven,
+    holds: Mapping[str, Decision],
 ) -> tuple[float, _Samples, tuple[str, ...]]:
     """The time step, the signals on the uniform grid, and notes on how they came there."""
     stamps, rate = seconds[rows], request.rate
@@ -231,8 +247,10 @@ def _on_grid(
     assert rate is not None
     _check_rate(table, request.time.name, stamps, rows.start, rate)
     clock = new_clock(stamps, rate)
-    move = {"input": hold, "output": interpolate}
-    samples = {k: move[k[1]](stamps, x, clock.times) for k, x in signals.items()}
+    samples = {}
+    for (key, kind), x in signals.items():
+        stays = kind == "input" and holds[key].hold == "zero-order"
+        samples[key, kind] = (hold if stays else interpolate)(stamps, x, clock.times)
     return clock.dt, samples, notes + clock.notes
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 from heli_jax import units
-from heli_jax.flights.flight import Signal
+from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.table import column, wrong
 
 
@@ -34,6 +34,7 @@ class Request:
         self._check_columns()
         self._check_units()
         self._check_noise()
+        self._check_holds()
         self._check_numbers(window)
 
     @property
@@ -79,6 +80,17 @@ class Request:
             scale = abs(units.factor(signal.unit, signal.si))
             if not (sd > 0 and 0 < sd * scale < math.inf):
                 problem = f"the sd of {use} is {sd:g}, wanted is a positive number"
+                raise wrong(self.path, problem, column(signal.name))
+
+    def _check_holds(self) -> None:
+        for (key, kind), signal in self.signals.items():
+            use = f"{kind} {key!r}"
+            if kind == "output" and signal.hold != "auto":
+                problem = f"a hold is stated for {use}, expected is one for inputs alone"
+                raise wrong(self.path, problem, column(signal.name))
+            if signal.hold not in ("auto", *HOLDS):
+                known = ", ".join(("auto", *HOLDS))
+                problem = f"the hold of {use}: expected one of {known}, got {signal.hold!r:.60}"
                 raise wrong(self.path, problem, column(signal.name))
 
     def _check_numbers(self, window: tuple[float, float] | None) -> None:

@@ -46,3 +46,12 @@ def test_refused(case):
     good = {"dt": 0.1, "inputs": {"x_roll": X}, "outputs": {"roll": X}}
     with pytest.raises(ValueError, match=r"wanted|differ|needs|no output"):
         Flight(**(good | BAD[case]))
+
+
+def test_inputs_stay_between_samples_unless_told():
+    flight = Flight(dt=0.1, inputs={"a": np.arange(3.0), "b": np.arange(3.0)}, outputs={})
+    assert flight.hold == {"a": "zero-order", "b": "zero-order"}
+    with pytest.raises(ValueError, match="hold is stated for 'c'"):
+        Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"c": "linear"})
+    with pytest.raises(ValueError, match="expected one of zero-order, linear, got 'auto'"):
+        Flight(dt=0.1, inputs={"a": np.arange(3.0)}, outputs={}, hold={"a": "auto"})

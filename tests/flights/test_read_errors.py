@@ -178,6 +178,14 @@ BAD_REQUEST = {
     "wrong kind": ({"outputs": {"roll": Signal("phi", "mm", "rad")}}, ["'phi'", "angle"]),
     "time in metres": ({"time": Signal("t", "m", "s")}, ["'t'", "a time"]),
     "input with sd": ({"inputs": {"x_roll": Signal("stick", "mm", "m", 1.0)}}, ["'stick'", "sd"]),
+    "output with hold": (
+        {"outputs": {"roll": Signal("phi", "deg", "rad", hold="linear")}},
+        ["'phi'", "hold", "inputs alone"],
+    ),
+    "no such hold": (
+        {"inputs": {"x_roll": Signal("stick", "mm", "m", hold="foh")}},
+        ["'x_roll'", "auto, zero-order, linear", "'foh'"],
+    ),
     "rate zero": ({"rate": 0.0}, ["rate is 0"]),
     "rate nan": ({"rate": math.nan}, ["rate is nan"]),
     "rate infinite": ({"rate": math.inf}, ["rate is inf"]),

@@ -246,3 +246,47 @@ def test_missing_outputs_are_read_and_told(tmp_path):
     fast = read_flight(path, **ASKED, rate=100).outputs["roll"]
     assert np.array_equal(np.flatnonzero(np.isnan(fast)), [5, 6, 7, 13, 14, 15])
     np.testing.assert_allclose(fast[[0, 4, 8, 22]], PHI[[0, 2, 4, 11]], rtol=1e-12)
+
+
+STEPPED, SMOOTH = np.repeat([0.0, 1.0, -0.4, 0.7, 0.1], 10), np.sin(0.3 * np.arange(50))
+
+
+def two_sticks(tmp_path, **how):
+    path = tmp_path / "two.csv"
+    table = np.stack([0.02 * np.arange(50), STEPPED, SMOOTH, np.cos(np.arange(50))], axis=1)
+    np.savetxt(path, table, delimiter=",", header="t,a,b,phi", comments="", fmt="%.12g")
+    holds = how.pop("holds", {})
+    inputs = {n: Signal(n, "1", "1", hold=holds.get(n, "auto")) for n in ("a", "b")}
+    phi = {"phi": Signal("phi", "rad", "rad")}
+    return read_flight(path, time="t", inputs=inputs, outputs=phi, **how)
+
+
+def test_the_record_decides_what_inputs_do_between_samples(tmp_path):
+    flight = two_sticks(tmp_path)
+    assert flight.hold == {"a": "zero-order", "b": "linear"}
+    assert flight.hold_reason == {
+        "a": "stays for 10 samples at a time and jumps",
+        "b": "moves at 100 % of the samples",
+    }
+
+
+def test_what_is_stated_stands(tmp_path):
+    flight = two_sticks(tmp_path, holds={"a": "linear", "b": "zero-order"})
+    assert flight.hold == {"a": "linear", "b": "zero-order"}
+    assert flight.hold_reason == {}
+
+
+def test_resampling_goes_by_the_hold_of_the_raw_record(tmp_path):
+    flight = two_sticks(tmp_path, rate=200.0)
+    t, k = flight.times, np.floor(flight.times / 0.02 + 1e-6).astype(int)
+    assert flight.hold == {"a": "zero-order", "b": "linear"}
+    np.testing.assert_allclose(flight.inputs["a"], STEPPED[k], atol=1e-9)
+    np.testing.assert_allclose(
+        flight.inputs["b"], np.interp(t, 0.02 * np.arange(50), SMOOTH), atol=1e-9
+    )
+
+
+def test_only_the_window_decides(tmp_path):
+    """Beside the window the stick may do what it likes."""
+    flight = two_sticks(tmp_path, window=(0.0, 0.17))
+    assert flight.hold_reason["a"] == "never moves"

@@ -16,7 +16,8 @@ def read(path, stamps: list[str], x: np.ndarray | None = None, **request) -> Fli
     x = np.arange(len(stamps)) ** 1.5 if x is None else x
     rows = (f"{t},{float(v)!r},{float(v)!r}" for t, v in zip(stamps, x, strict=True))
     path.write_text("\n".join(["t,u,y", *rows]))
-    asked = {"inputs": {"u": Signal("u", "1", "1")}, "outputs": {"y": Signal("y", "1", "1")}}
+    stick = Signal("u", "1", "1", hold="zero-order")
+    asked = {"inputs": {"u": stick}, "outputs": {"y": Signal("y", "1", "1")}}
     return read_flight(path, time=request.pop("time", "t"), **asked, **request)
 
 
