@@ -22,7 +22,9 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     $\dot w = -w/\tau_w + \sigma_w\sqrt{2/\tau_w}\,n$ with white noise n of unit intensity, so that
     w has the standard deviation sigma_w [rad/s^2] and correlation time tau_w [s]. With two poles
     w follows a second lag of the same time constant, scaled to the same standard deviation. The
-    model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s).
+    model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s). At the first sample
+    the disturbance is what it is at any other: all its states have the standard deviation sigma_w,
+    and the two of two poles the correlation 1/sqrt(2).
 
     Raises:
         ValueError: the model has no such axis, or `poles` is neither 1 nor 2.
@@ -73,6 +75,10 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         zero = 0.0 * p.sigma_w
         return State(**{**naming.asdict(model.initial_state(p)), **dict.fromkeys(chain, zero)})
 
+    def correlation(p: Any) -> Any:
+        # The Lyapunov equation of two equal lags: E[w1 w2] = gain/2 E[w1^2], whatever tau_w is.
+        return {(chain[0], chain[1]): 0.5 * gain + 0.0 * p.sigma_w}
+
     return Model(
         f"{model.name}-disturbed",
         vector_field,
@@ -85,5 +91,6 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         start=start,
         noise=noise,
         spread=lambda p: dict.fromkeys(chain, p.sigma_w),
+        correlation=None if poles == 1 else correlation,
         limits=None if limits is None else lambda p, s, u: limits(p, inner(s), u),
     )

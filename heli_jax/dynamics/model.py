@@ -38,6 +38,11 @@ class Model(eqx.Module):
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
     """spread(params): standard deviation at the first sample of the states that are random there,
     by name; the others begin where `start` puts them"""
+    correlation: Callable[[Any], dict[tuple[str, str], Any]] | None = eqx.field(
+        static=True, default=None
+    )
+    """correlation(params): at the first sample, between two of the states that `spread` names, by
+    pair of names; what is not named is uncorrelated"""
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
     """limits(params, state, inputs): by name, whether the range of validity is left there"""
 
@@ -66,6 +71,27 @@ def spread_of(model: Model, params: Any, dtype: Any) -> Array:
     given = model.spread(params) if model.spread is not None else {}
     values = [given.get(n, 0.0) for n in naming.names(model.State)]
     return jnp.stack([jnp.asarray(v, dtype) for v in values])
+
+
+def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
+    """The correlation matrix (n, n) of all states at the first sample.
+
+    Raises:
+        ValueError: the model correlates a state that is not random there.
+    """
+    names, random = naming.names(model.State), model.spread_names
+    matrix = jnp.eye(len(names), dtype=dtype)
+    pairs = model.correlation(params) if model.correlation is not None else {}
+    for pair, value in pairs.items():
+        if not set(pair) <= set(random):
+            raise ValueError(
+                f"model {model.name}: correlation of {' and '.join(pair)}: expected two of the "
+                f"states that spread names ({', '.join(random) or 'none'})"
+            )
+        i, j = (names.index(n) for n in pair)
+        value = jnp.asarray(value, dtype)
+        matrix = matrix.at[i, j].set(value).at[j, i].set(value)
+    return matrix
 
 
 def linear_misfit(model: Model, params: Any) -> float:

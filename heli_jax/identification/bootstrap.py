@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
+from heli_jax.dynamics.model import correlation_of, spread_of
 from heli_jax.identification.layout import Data, Reached, unpack, value_of
 from heli_jax.identification.optimise import optimise_many
 from heli_jax.identification.residual import driven, predict
@@ -98,14 +99,18 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
     flight, layout = at.data.flights[i], at.layout
     params, inputs = driven(layout, at.data, u, i)
     start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
-    spread = layout.model.spread(params) if layout.model.spread is not None else {}
+    names, random = naming.names(layout.model.State), layout.model.spread_names
+    sds = spread_of(layout.model, params, at.z.dtype)
+    # Factored without the sds, which may be zero.
+    correlation = correlation_of(layout.model, params, at.z.dtype)
+    factor = sds[:, None] * jnp.linalg.cholesky(correlation)
 
     @jax.jit
     def run(key: Array) -> Any:
         first, second = jax.random.split(key)
-        drawn = jax.random.normal(first, (len(spread) or 1,), at.z.dtype)
-        random = {n: getattr(start, n) + s * drawn[j] for j, (n, s) in enumerate(spread.items())}
-        begin = naming.replace(start, **random)
+        drawn = jnp.sum(factor * jax.random.normal(first, (1, len(names)), at.z.dtype), axis=1)
+        values = {n: getattr(start, n) + drawn[names.index(n)] for n in random}
+        begin = naming.replace(start, **values)
         return simulate(
             layout.model,
             params,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import Model, spread_of
+from heli_jax.dynamics.model import Model, correlation_of, spread_of
 from heli_jax.simulation.discretize import moved, process_noise, product
 from heli_jax.simulation.hold import Hold, linear_inputs, segments
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
@@ -57,7 +57,8 @@ def innovations(
         measured: outputs (N,); NaN where there is none.
         sd: standard deviation of the white measurement noise, by output, SI.
         initial_state: the model's State at the first sample; the states that `model.spread`
-            names are uncertain about it by that standard deviation, the others not at all.
+            names are uncertain about it by that standard deviation (and `model.correlation`), the
+            others not at all.
         delay: as in `simulate`.
         substeps: linearisations a sample, for models that are not linear.
         hold: as in `simulate`.
@@ -69,7 +70,8 @@ def innovations(
     x0 = model.initial_state(params) if initial_state is None else initial_state
     dtype = jax.tree.leaves(inputs)[0].dtype
     x = _vector(x0, dtype)
-    P = jnp.diag(spread_of(model, params, dtype) ** 2)
+    sds = spread_of(model, params, dtype)
+    P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
     y = jnp.stack(list(measured.values()), axis=1)

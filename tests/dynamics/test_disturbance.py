@@ -1,5 +1,7 @@
 """The disturbance against the theory of first- and second-order noise."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import scipy.linalg
 
 from heli_jax import models, naming, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.model import correlation_of, spread_of
 from heli_jax.dynamics.roll import on_stand
 from heli_jax.simulation.discretize import process_noise
 from tests.dynamics.paper import BENCH, matrices
@@ -55,6 +58,27 @@ def test_standard_deviation_is_sigma(run):
     assert np.var(w) == pytest.approx(SIGMA**2, rel=0.05)
     assert abs(np.mean(w)) < 5.0 * SIGMA * np.sqrt(2.0 * poles * TAU / (N * DT))
     assert stationary(poles)[-1, -1] == pytest.approx(SIGMA**2)
+
+
+@pytest.mark.parametrize("poles", [1, 2])
+def test_at_the_first_sample_the_disturbance_is_stationary(bench30, poles):
+    model = with_disturbance(models.roll_on_stand, "roll", poles)
+    p = model.Params(**naming.asdict(bench30), sigma_w=jnp.asarray(SIGMA), tau_w=jnp.asarray(TAU))
+    dtype = jnp.result_type(float)
+    sds = np.asarray(spread_of(model, p, dtype))
+    covariance = np.outer(sds, sds) * np.asarray(correlation_of(model, p, dtype))
+    np.testing.assert_allclose(covariance[4:, 4:], stationary(poles)[4:, 4:], rtol=1e-12)
+    np.testing.assert_array_equal(covariance[:4], 0.0)
+
+
+def test_only_random_states_are_correlated(bench30):
+    model = dataclasses.replace(
+        with_disturbance(models.roll_on_stand, "roll"),
+        correlation=lambda p: {("phi", "w1_roll"): 0.5},
+    )
+    p = model.Params(**naming.asdict(bench30))
+    with pytest.raises(ValueError, match=r"correlation of phi and w1_roll: .*names \(w1_roll\)"):
+        correlation_of(model, p, jnp.result_type(float))
 
 
 def test_autocorrelation_is_that_of_its_lags(run):

@@ -9,7 +9,12 @@ import pytest
 
 from heli_jax import Flight, Free, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.identification.bootstrap import _disturbed
+from heli_jax.identification.data import data_of
+from heli_jax.identification.layout import Reached, layout_of, unpack
 from heli_jax.identification.metrics import whiteness
+from heli_jax.identification.noise import first_noise
+from heli_jax.identification.start import start_vector
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
 from tests.dynamics.paper import BENCH, matrices
@@ -234,3 +239,28 @@ def test_swapped_columns_are_told(bench30):
     assert found.metrics["roll"].vaf < 0
     assert any("worse than its mean" in n and "columns, signs" in n for n in found.notes)
     assert not any("output error suffices" in n for n in found.notes)
+
+
+def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
+    """Two poles: the states of the first sample have sd sigma_w and the correlation 1/sqrt(2)."""
+    model, _, start, flight = made(bench30, 0, poles=2)
+    shown = dataclasses.replace(
+        model, output=lambda p, s, u: model.Outputs(roll=s.w1_roll, roll_rate=s.w2_roll)
+    )
+    start = replace(start, sigma_w=jnp.asarray(1.04), tau_w=jnp.asarray(1.0))
+    short = Flight(
+        dt=DT,
+        inputs={n: v[:10] for n, v in flight.inputs.items()},
+        outputs={n: flight.outputs["roll"][:10] for n in ("roll", "roll_rate")},
+    )
+    problem = Problem(shown, start, [short], FREE, method="filter-error")
+    layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
+    z = start_vector(layout, data, problem)
+    at = Reached(layout, data, first_noise(problem, problem.training), z)
+    u = unpack(layout, data, z)
+    made_ = _disturbed(at, u, 0, jax.random.split(jax.random.key(0), 4000))
+    first = np.stack([made_["roll"][:, 0], made_["roll_rate"][:, 0]])
+    sigma = float(u.noise["sigma_w"])
+    np.testing.assert_allclose(
+        np.cov(first) / sigma**2, [[1.0, 0.5**0.5], [0.5**0.5, 1.0]], atol=0.07
+    )

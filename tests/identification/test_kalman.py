@@ -46,8 +46,10 @@ def dense(model, params, u, y, x0):
             for s, w in zip(nodes, weights, strict=True)
         )
     )
-    random = [k for k in names(model.State) if k.startswith("w")]
-    P = np.diag([float(params.sigma_w) ** 2 if k in random else 0.0 for k in names(model.State)])
+    random = np.ix_(*2 * [[i for i, k in enumerate(names(model.State)) if k.startswith("w")]])
+    P = np.zeros_like(A)
+    # Stationary: the disturbance did not begin with the record.
+    P[random] = scipy.linalg.solve_continuous_lyapunov(A[random], -(G @ G)[random])
     x, means, S = np.array(x0), [], [[None] * N for _ in range(N)]
     covariances = []
     for k in range(N):
