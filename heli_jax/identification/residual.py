@@ -183,8 +183,10 @@ def _likelihood_rows(
 
     These alone would hold half of what the variances tell ($\tfrac14 s'^2/s^2$ of $\tfrac12$),
     and the optimiser would go twice as far as it should along the noise. As many rows again, zero
-    themselves, have the derivative $\tfrac12 s'_k/s_k$: with them J'J is Fisher's information
-    (Mehra, 1970; Maine and Iliff, 1985, leave that part out).
+    themselves, have the derivative $\tfrac12 (s'_k/s_k - \overline{s'/s})$: with them J'J is
+    Fisher's information (Mehra, 1970; Maine and Iliff, 1985, leave that part out). The mean is
+    taken off since it is known from elsewhere: with the scale concentrated out it tells nothing,
+    else the one row more tells the same of it.
     """
     y, sd = _measured(layout, data, noise)
     at = _signals(layout)
@@ -198,9 +200,9 @@ def _likelihood_rows(
     above = mean - noise.level
     if layout.concentrated:
         rows, last = rows * jnp.exp(0.5 * above), []
-        log_s = jnp.where(seen, log_s - mean, 0.0)
     else:
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
+    log_s = jnp.where(seen, log_s - mean, 0.0)
     return jnp.concatenate([rows, *last, 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
 
 

@@ -251,7 +251,7 @@ def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
     short = Flight(
         dt=DT,
         inputs={n: v[:10] for n, v in flight.inputs.items()},
-        outputs={n: flight.outputs["roll"][:10] for n in ("roll", "roll_rate")},
+        outputs=dict.fromkeys(("roll", "roll_rate"), flight.outputs["roll"][:10]),
     )
     problem = Problem(shown, start, [short], FREE, method="filter-error")
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
