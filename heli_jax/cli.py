@@ -269,6 +269,9 @@ def _simulate(options: argparse.Namespace) -> int:
         view = Path(options.view) if options.view else beside
         if view.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--view {view}: wanted is a name ending in .html")
+    for option, place in (("--out", out), ("--view", view)):
+        if place is not None:
+            run_directory.require_place(place, f"{option} {place}")
     _prepare_jax()
     from heli_jax import config as configuration
     from heli_jax import generate, output

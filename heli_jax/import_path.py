@@ -1,13 +1,18 @@
 """Anyone's own objects by import path, as a configuration names them."""
 
 import importlib
+import importlib.util
 import re
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
 from heli_jax.errors import InputError
+from heli_jax.regular_file import require_regular
 
+_LARGEST = 10**7
+"""bytes of a module's source"""
 _PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -22,8 +27,8 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     The module may lie in `folder`, as beside the configuration that names it.
 
     Raises:
-        InputError: it is no such path, or the module cannot be imported; `where` begins the
-            sentence.
+        InputError: it is no such path, or the module cannot be imported, whatever goes wrong in
+            it; `where` begins the sentence.
     """
     if not is_path(path):
         raise InputError(f"{where}: found {path!r:.60}, wanted is package.module:name")
@@ -31,7 +36,38 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     if folder is not None and str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
     try:
+        _check_size(module_name, where)
         module = importlib.import_module(module_name)
     except (ImportError, SyntaxError) as e:
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r} ({e})") from e
+    except InputError:
+        raise
+    except (Exception, SystemExit) as e:  # whatever the module does while it is imported
+        raise InputError(f"{where}: cannot import {module_name!r} for {path!r}: {_words(e)}") from e
     return getattr(module, attribute, None)
+
+
+def _check_size(module_name: str, where: str) -> None:
+    """Refuse a source larger than any program: Python would read it as a whole.
+
+    Devices and pipes are no modules to Python, which looks at the kind of file itself.
+    """
+    parts = module_name.split(".")
+    for i in range(1, len(parts) + 1):
+        name = ".".join(parts[:i])
+        if name in sys.modules:
+            continue
+        found = importlib.util.find_spec(name)  # of a part: it imports those before it
+        if found is not None and found.has_location and str(found.origin).endswith(".py"):
+            try:
+                require_regular(str(found.origin), "a module in Python", _LARGEST)
+            except InputError as e:
+                raise InputError(f"{where}: {e}") from e
+
+
+def _words(e: BaseException) -> str:
+    """What went wrong and in which line of which file."""
+    at = traceback.extract_tb(e.__traceback__)
+    line = f"{at[-1].filename}, line {at[-1].lineno}: " if at else ""
+    said = " ".join(str(e).split())[:200]
+    return f"{line}{type(e).__name__}{f': {said}' if said else ''}"

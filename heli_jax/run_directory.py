@@ -1,6 +1,7 @@
 """Directories and files that appear whole or not at all."""
 
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from heli_jax.errors import InputError
+from heli_jax.regular_file import in_the_way
 
 
 def default_directory(config: Path) -> Path:
@@ -22,7 +24,7 @@ def require_free(path: Path, otherwise: str = "") -> None:
     Raises:
         InputError: it exists, or its parent cannot hold it.
     """
-    if path.exists():
+    if os.path.lexists(path):  # a link to nothing is in the way too
         raise InputError(f"--out {path}: exists already, wanted is a new directory{otherwise}")
     parent = path.absolute().parent
     while not parent.exists():
@@ -45,16 +47,30 @@ def whole(path: Path) -> Iterator[Path]:
         raise
 
 
+def require_place(path: Path, where: str) -> None:
+    """Refuse a place in which no file can be put, before any work is done.
+
+    Raises:
+        InputError: a folder, a pipe or a device stands there.
+    """
+    obstacle = in_the_way(path)
+    if obstacle is not None:
+        raise InputError(f"{where}: is {obstacle}, expected a new name or that of a regular file")
+
+
 @contextmanager
 def whole_file(path: Path, where: str) -> Iterator[Path]:
     """A place beside `path` to write to, which becomes `path` at the end.
 
     Raises:
-        InputError: the place cannot be written to.
+        InputError: the place cannot be written to, or is a folder, a pipe or a device.
     """
-    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    require_place(path, where)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # Made here, so that a pipe or a link that has the name already is not written to.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         temporary.replace(path)
     except OSError as e:

@@ -7,10 +7,13 @@ from typing import Any
 import yaml
 
 from heli_jax.errors import InputError
+from heli_jax.regular_file import read_regular
 
 _LIMIT_BYTES = 1_000_000
 _LIMIT_NODES = 100_000
 _LIMIT_DEPTH = 40
+_LONGEST_KEY = 200
+"""characters: a message that names a key stays a sentence"""
 
 
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -44,22 +47,15 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """The mapping that a YAML file holds.
 
     Raises:
-        InputError: no such file, no text, no YAML, not a mapping, a key twice, or more nested or
-            larger (aliases written out) than any configuration would be.
+        InputError: no such file, no regular file of at most 1 MB, no text, no YAML, not a mapping,
+            a key twice, or more nested or larger (aliases written out) than any configuration
+            would be.
     """
-    path = Path(path)
+    data = read_regular(path, "a configuration in YAML", _LIMIT_BYTES)
     try:
-        if path.stat().st_size > _LIMIT_BYTES:
-            raise InputError(f"{path}: larger than 1 MB, wanted is a configuration in YAML")
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as e:
-        raise InputError(f"{path}: no such file") from e
-    except IsADirectoryError as e:
-        raise InputError(f"{path}: is a folder, wanted is a YAML file") from e
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:
         raise InputError(f"{path}: is not text, wanted is a YAML file") from e
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read ({e.strerror})") from e
     return parse_mapping(text, str(path))
 
 
@@ -138,6 +134,11 @@ def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
                 raise InputError(f"{where}, line {line}: a key must be a name")
+            if len(key.value) > _LONGEST_KEY:
+                raise InputError(
+                    f"{where}, line {line}: expected a key of at most {_LONGEST_KEY} characters, "
+                    f"got {len(key.value)}"
+                )
             if key.value in seen and key.value != "<<":
                 raise InputError(f"{where}, line {line}: key {key.value!r} stands here twice")
             seen.add(key.value)

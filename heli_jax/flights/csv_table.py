@@ -13,15 +13,33 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.flights.csv_text import decode, find_delimiter, find_header, header_names
-from heli_jax.flights.table import Survey, column, require_columns, shown, wrong
+from heli_jax.flights.csv_text import (
+    LONGEST_HEADER,
+    decode,
+    find_delimiter,
+    find_header,
+    header_names,
+    lines_of,
+    require_short_lines,
+)
+from heli_jax.flights.table import (
+    Survey,
+    column,
+    require_columns,
+    require_few_columns,
+    shown,
+    wrong,
+)
+from heli_jax.regular_file import read_regular
 
 _NUMBER = re.compile(
     r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
     r"|[+-]?(?:nan|inf|infinity)",
     re.IGNORECASE,
 )
-_LONGEST_LINE = 1_000_000
+_LARGEST = 10**9
+"""bytes: a log in text is read as a whole, and takes about ten times its size meanwhile"""
+_ROWS_AT_ONCE = 1 << 16
 
 
 def open_csv(path: Path) -> "CsvTable":
@@ -31,7 +49,7 @@ def open_csv(path: Path) -> "CsvTable":
         InputError: it is no UTF-8 text, or holds no header or no rows.
         OSError: it cannot be read.
     """
-    data = path.read_bytes()
+    data = read_regular(path, "a log in CSV (convert larger ones to Parquet)", _LARGEST)
     text = decode(str(path), data)
     start, line = find_header(text)
     if start is None:
@@ -42,9 +60,11 @@ def open_csv(path: Path) -> "CsvTable":
     if not body.strip():
         raise wrong(str(path), "holds a header alone, wanted are rows of numbers", f"line {line}")
     header = text[start:end]
-    if len(header) > _LONGEST_LINE:
+    if len(header) > LONGEST_HEADER:
         raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
+    require_short_lines(str(path), body, line + 1)
     delimiter = find_delimiter(header, body.lstrip("\n").split("\n", 1)[0])
+    require_few_columns(str(path), header.count(delimiter) + 1, f"line {line}")
     names = header_names(str(path), header, delimiter, line)
     return CsvTable(
         path=str(path),
@@ -151,11 +171,11 @@ class CsvTable:
     def _records(self) -> Iterator[tuple[int, list[str]]]:
         """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader."""
         if '"' not in self._body:
-            for number, line in enumerate(self._body.split("\n"), self._first_line):
+            for number, line in enumerate(lines_of(self._body), self._first_line):
                 if not _is_blank(line, self.delimiter):
                     yield number, line.split(self.delimiter)
             return
-        lines = (f"{line}\n" for line in self._body.split("\n"))
+        lines = (f"{line}\n" for line in lines_of(self._body))
         reader = csv.reader(lines, delimiter=self.delimiter, skipinitialspace=True, strict=True)
         start = self._first_line
         try:
@@ -169,12 +189,9 @@ class CsvTable:
 
     def _texts(self, indices: Sequence[int]) -> list[Any]:
         """The cells of some columns as pyarrow string arrays (N,)."""
-        import pyarrow as pa
-
         texts = None if '"' in self._body else self._texts_by_pyarrow(indices)
         if texts is None:
-            rows = self._checked_rows()
-            texts = [pa.array([row[i] for row in rows], pa.large_string()) for i in indices]
+            texts = self._texts_row_by_row(indices)
         if texts and not len(texts[0]):
             raise wrong(self.path, "holds a header alone, wanted are rows of numbers")
         return texts
@@ -211,14 +228,34 @@ class CsvTable:
             return None
         return None if ragged else [table.column(name) for name in wanted]
 
-    def _checked_rows(self) -> list[list[str]]:
-        rows, width = [], len(self.names)
-        for line, cells in self._records():
+    def _texts_row_by_row(self, indices: Sequence[int]) -> list[Any]:
+        """As `_texts`; cells are packed as they come: as objects of Python they take many times
+        the file's size."""
+        import pyarrow as pa
+
+        width, kind = len(self.names), pa.large_string()
+        pieces: list[list[Any]] = [[] for _ in indices]
+        cells_of: list[list[str]] = [[] for _ in indices]
+
+        def pack() -> None:
+            for piece, cells in zip(pieces, cells_of, strict=True):
+                piece.append(pa.array(cells, kind))
+                cells.clear()
+
+        for row, (line, cells) in enumerate(self._records()):
             if len(cells) != width:
                 problem = f"{_count(len(cells))}, wanted are {width} as in the header"
                 raise wrong(self.path, problem, f"line {line}")
-            rows.append(cells)
-        return rows
+            for one, i in zip(cells_of, indices, strict=True):
+                one.append(cells[i])
+            if row % self._rows_at_once == self._rows_at_once - 1:
+                pack()
+        pack()
+        return [pa.chunked_array(piece, kind) for piece in pieces]
+
+    @property
+    def _rows_at_once(self) -> int:
+        return max(1, _ROWS_AT_ONCE // len(self.names))
 
 
 def _count(n: int) -> str:
@@ -277,12 +314,13 @@ def _floats(text: Any) -> np.ndarray | int:
     try:
         return np.asarray(filled.cast(pa.float64()).to_numpy(zero_copy_only=False))
     except pa.ArrowInvalid:
-        return _floats_one_by_one(filled.to_pylist())
+        return _floats_one_by_one(filled)
 
 
-def _floats_one_by_one(cells: list[str | None]) -> np.ndarray | int:
-    values = np.full(len(cells), np.nan)
-    for row, cell in enumerate(cells):
+def _floats_one_by_one(filled: Any) -> np.ndarray | int:
+    values = np.full(len(filled), np.nan)
+    pieces = (filled.slice(at, _ROWS_AT_ONCE) for at in range(0, len(filled), _ROWS_AT_ONCE))
+    for row, cell in enumerate(cell for piece in pieces for cell in piece.to_pylist()):
         if cell is None:
             continue
         if not _NUMBER.fullmatch(cell):

@@ -1,6 +1,7 @@
 """The text of a delimited log: its encoding, header and delimiter."""
 
 import csv
+from collections.abc import Iterator
 
 from heli_jax.flights.table import wrong
 
@@ -21,10 +22,20 @@ def decode(path: str, data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
+LONGEST_HEADER = 1_000_000
+"""characters"""
+_LONGEST_LINE = 10_000_000
+"""characters of a row, in which a cell may hold a text"""
+_LONGEST_PREAMBLE = 1_000_000
+"""characters of blank lines and comments before the header"""
+_BLOCK = 1 << 20
+
+
 def find_header(text: str) -> tuple[int | None, int]:
-    """Where the first line that is neither blank nor a comment starts, and its number."""
+    """Where the first line that is neither blank nor a comment starts, and its number; None where
+    there is none within the first 1 MB."""
     start, line = 0, 1
-    while start < len(text):
+    while start < min(len(text), _LONGEST_PREAMBLE):
         end = text.find("\n", start)
         end = len(text) if end < 0 else end
         content = text[start:end].strip()
@@ -32,6 +43,34 @@ def find_header(text: str) -> tuple[int | None, int]:
             return start, line
         start, line = end + 1, line + 1
     return None, line
+
+
+def lines_of(text: str) -> Iterator[str]:
+    """As `text.split("\\n")`, a block at a time: all lines at once take many times the text."""
+    start = 0
+    while (end := text.rfind("\n", start, start + _BLOCK)) >= 0 or start + _BLOCK < len(text):
+        if end < 0:  # a line longer than a block
+            end = text.find("\n", start)
+            if end < 0:
+                break
+        yield from text[start:end].split("\n")
+        start = end + 1
+    yield text[start:]
+
+
+def require_short_lines(path: str, text: str, first_line: int) -> None:
+    """Refuse a line longer than any of a log: its cells alone would fill the memory.
+
+    Raises:
+        InputError: naming the line.
+    """
+    start = 0
+    while len(text) - start > _LONGEST_LINE:
+        end = text.rfind("\n", start, start + _LONGEST_LINE + 1)
+        if end < 0:
+            line = first_line + text.count("\n", 0, start)
+            raise wrong(path, "is longer than a line of a log can be", f"line {line}")
+        start = end + 1
 
 
 def find_delimiter(header: str, first: str) -> str:

@@ -1,35 +1,69 @@
 """Logs in Apache Parquet."""
 
 import hashlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from heli_jax.flights.table import Survey, column, require_columns, wrong
+from heli_jax.flights.table import Survey, column, require_columns, require_few_columns, wrong
+from heli_jax.regular_file import open_regular, size_words
+
+_LARGEST = 16 * 10**9
+"""bytes: the whole file goes through sha256, the columns asked for into memory"""
+_LONGEST_FOOTER = 64 * 10**6
+_MOST_ROWS = 10**8
+"""at 1 kHz more than a day; a few bytes can claim any number of equal rows"""
+_MOST_CELLS = 3 * 10**8
+"""of the columns that are read: 2.4 GB of numbers"""
 
 
 def open_parquet(path: Path) -> "ParquetTable":
     """Open a Parquet file and read its schema.
 
     Raises:
-        InputError: it is no Parquet file, or it is broken.
+        InputError: it is no Parquet file, it is broken, or larger than a log may be.
         OSError: it cannot be read.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    try:
-        file = pq.ParquetFile(path)
-        schema, n_rows = file.schema_arrow, file.metadata.num_rows
-    except (pa.ArrowException, OSError) as e:
-        raise wrong(str(path), "is no whole Parquet file") from e
-    if not len(schema) or not n_rows:
-        raise wrong(str(path), "holds no rows, wanted is a log")
-    return ParquetTable(str(path), path.stat().st_size, sha256, file)
+    with open_regular(path, "a log in Parquet", _LARGEST) as opened:
+        size = os.fstat(opened.fileno()).st_size
+        # Before anything goes through the whole file.
+        _check_end(str(path), opened, size)
+        try:
+            file = pq.ParquetFile(path)
+            schema, metadata = file.schema_arrow, file.metadata
+            n_rows = metadata.num_rows
+        except (pa.ArrowException, OSError) as e:
+            raise wrong(str(path), "is no whole Parquet file") from e
+        if not len(schema) or not n_rows:
+            raise wrong(str(path), "holds no rows, wanted is a log")
+        require_few_columns(str(path), metadata.num_columns)
+        if n_rows > _MOST_ROWS:
+            raise wrong(str(path), f"expected a log of at most {_MOST_ROWS} rows, got {n_rows}")
+        # Text stays as its dictionary: a few words that every row repeats can be large.
+        texts = [f.name for f in schema if _is_text(f.type)]
+        if texts:
+            file = pq.ParquetFile(path, read_dictionary=texts)
+        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
+    return ParquetTable(str(path), size, sha256, file)
+
+
+def _check_end(path: str, file: BinaryIO, size: int) -> None:
+    """Refuse a file whose end is not that of a Parquet file, or says that it is mostly header."""
+    file.seek(max(size - 8, 0))
+    end = file.read(8)
+    file.seek(0)
+    length = int.from_bytes(end[:4], "little")
+    if end[4:] not in (b"PAR1", b"PARE") or length + 12 > size:
+        raise wrong(path, "is no whole Parquet file")
+    if length > _LONGEST_FOOTER:
+        words = f"{size_words(_LONGEST_FOOTER)}, got {size_words(length)}"
+        raise wrong(path, f"expected a footer of at most {words}")
 
 
 class ParquetTable:
@@ -85,15 +119,36 @@ class ParquetTable:
             return str(kind.unit)
         return None
 
+    def _require_few(self, names: Sequence[str] | None) -> None:
+        """Refuse to read more values than memory is for, lists within cells counted too."""
+        metadata, cells = self._file.metadata, 0
+        for i in range(metadata.num_row_groups):
+            group = metadata.row_group(i)
+            for j in range(group.num_columns):
+                one = group.column(j)
+                if names is None or one.path_in_schema in names:
+                    cells += max(one.num_values, group.num_rows)
+        if cells > _MOST_CELLS:
+            problem = f"expected at most {_MOST_CELLS} values in the columns read, got {cells}"
+            raise wrong(self.path, f"{problem}; read fewer columns, or resample the log")
+
     def _read(self, names: Sequence[str] | None) -> Any:
         import pyarrow as pa
 
+        self._require_few(names)
         try:
             data = self._file.read(columns=None if names is None else list(names))
             data.validate(full=True)  # a damaged page can decode to lengths that do not fit
             return data
         except (pa.ArrowException, OSError, MemoryError) as e:
             raise wrong(self.path, "is no whole Parquet file") from e
+
+
+def _is_text(kind: Any) -> bool:
+    import pyarrow as pa
+
+    types = pa.types
+    return types.is_string(kind) or types.is_binary(kind)
 
 
 def _is_number(kind: Any) -> bool:

@@ -1,6 +1,7 @@
 """A log as named columns of numbers, whatever the file's format."""
 
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
+from heli_jax.regular_file import require_regular
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,20 @@ def column(name: str) -> str:
     return f"column {shown(name)}"
 
 
+MOST_COLUMNS = 10_000
+"""of a log: more are none that anybody named"""
+
+
+def require_few_columns(path: str, count: int, *place: str) -> None:
+    """Refuse more columns than any log has.
+
+    Raises:
+        InputError: naming the number.
+    """
+    if count > MOST_COLUMNS:
+        raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
+
+
 def require_columns(path: str, have: Sequence[str], wanted: Sequence[str]) -> None:
     """Refuse a column that is missing or stands in the file twice.
 
@@ -85,7 +101,8 @@ def open_table(path: str | Path) -> Table:
     """Open a log; its columns are read when they are asked for.
 
     Raises:
-        InputError: there is no such file, it cannot be read, or it is of no readable format.
+        InputError: there is no such file, it is no regular one, it is larger than a log of its
+            format may be, it cannot be read, or it is of no readable format.
     """
     from heli_jax.flights.csv_table import open_csv
     from heli_jax.flights.parquet_table import open_parquet
@@ -93,9 +110,7 @@ def open_table(path: str | Path) -> Table:
     path = Path(path)
     readers = {".parquet": open_parquet} | dict.fromkeys((".csv", ".txt", ".tsv"), open_csv)
     try:
-        if path.is_dir():
-            raise wrong(str(path), "is a folder, wanted is a log in CSV or Parquet")
-        if not path.stat().st_size:
+        if not require_regular(path, "a log in CSV or Parquet", sys.maxsize):
             raise wrong(str(path), "is empty, wanted is a log in CSV or Parquet")
         reader = readers.get(path.suffix.lower())
         if reader is None:
@@ -105,11 +120,5 @@ def open_table(path: str | Path) -> Table:
                 " or .parquet; convert other logs to CSV or Parquet first",
             )
         return reader(path)
-    except FileNotFoundError as e:
-        raise wrong(str(path), "no such file") from e
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
-    except ValueError as e:  # pathlib: a name with a null character
-        if isinstance(e, InputError):
-            raise
-        raise wrong(str(path), "is no name of a file") from e

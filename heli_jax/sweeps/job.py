@@ -3,7 +3,6 @@
 import hashlib
 import inspect
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -13,8 +12,9 @@ from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_whole
 from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
-from heli_jax.errors import nearest
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.regular_file import read_regular
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
@@ -367,8 +367,9 @@ def _source(function: Callable[..., Any]) -> str:
         return ""
     try:
         file = inspect.getsourcefile(function)
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
-    except (TypeError, OSError):
+        data = read_regular(file, "a module in Python", 10**7) if file else b""
+        return hashlib.sha256(data).hexdigest() if file else ""
+    except (TypeError, OSError, InputError):
         return ""
 
 

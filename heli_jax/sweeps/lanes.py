@@ -126,7 +126,7 @@ def _measured(
         if lanes not in found and lanes <= limit:
             found[lanes] = _time(job, devices, lanes)
     best = min(found, key=lambda lanes: found[lanes])
-    if memory is not None:
+    if memory is not None and in_the_way(memory) is None:
         with contextlib.suppress(OSError):
             memory.parent.mkdir(parents=True, exist_ok=True)
             memory.write_text(json.dumps({**known, key: best}, indent=1), encoding="utf-8")
@@ -137,8 +137,8 @@ def _remembered(memory: Path | None) -> dict[str, Any]:
     if memory is None:
         return {}
     try:
-        found = json.loads(memory.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(read_regular(memory, "what was measured", 10**6))
+    except ValueError:  # InputError is one
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -169,6 +169,7 @@ def carry_out(
             raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
     if not out.is_dir() or not stores.writable(out):
         raise InputError(f"{where}: is no directory that can be written to")
+    stores.require_files(out, where)
     with stores.only_writer(out, where):
         store = stores.reopen(out / "sweep.zarr", job, where)
         done = store.whole()

@@ -19,6 +19,7 @@ import zarr
 from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
+from heli_jax.regular_file import require_regular
 from heli_jax.sweeps.job import Job, described, differences
 from heli_jax.sweeps.program import NOT_RUN
 from heli_jax.sweeps.work import Split, Variable, variables
@@ -210,6 +211,44 @@ def reopen(path: Path, job: Job, where: str) -> Store:
     if missing:
         raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
     return store
+
+
+_LARGEST_METADATA = 10**8
+_LARGEST_CHUNK = 4 * 10**9
+"""bytes of a file in a store: Zarr reads each as a whole"""
+
+
+def require_files(directory: Path, where: str) -> None:
+    """Refuse a sweep's directory in which what is read and written is no regular file: Zarr would
+    wait for a pipe, and read a device or a sparse file until the memory is full.
+
+    Raises:
+        InputError: naming the file.
+    """
+    beside = (directory / ".lock", directory / "summary.json")
+    for path in beside:
+        if os.path.lexists(path):
+            _require_file(path, _LARGEST_METADATA, where)
+    folders = [directory / "sweep.zarr"]
+    while folders:
+        folder = folders.pop()
+        try:
+            entries = list(os.scandir(folder))
+        except OSError as e:
+            raise InputError(f"{where}: {folder} is no store of a sweep ({e.strerror})") from e
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                folders.append(Path(entry.path))
+                continue
+            metadata = entry.name == "zarr.json"
+            _require_file(entry.path, _LARGEST_METADATA if metadata else _LARGEST_CHUNK, where)
+
+
+def _require_file(path: str | Path, at_most: int, where: str) -> None:
+    try:
+        require_regular(path, "a regular file of a sweep", at_most)
+    except InputError as e:
+        raise InputError(f"{where}: {e}") from e
 
 
 @contextlib.contextmanager

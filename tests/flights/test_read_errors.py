@@ -1,6 +1,7 @@
 """Everything that can be wrong with a log or a request ends in one sentence that says where."""
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -158,7 +159,7 @@ def test_file_that_may_not_be_read(tmp_path, monkeypatch):
     def deny(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", deny)
+    monkeypatch.setattr(os, "open", deny)
     refused(path, "Permission denied")
 
 
