@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from heli_jax import naming
+from heli_jax.regular_file import in_the_way, read_regular
 from heli_jax.sweeps.job import Job
 from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.work import BLOCKS, Split
