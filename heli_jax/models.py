@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.roll import on_stand, pitch, roll
@@ -67,4 +68,8 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not isinstance(model, Model):
         found = "nothing" if model is None else f"a {type(model).__name__}"
         raise InputError(f"{where}: {name!r} is {found}, wanted is a heli_jax.Model")
+    try:
+        check_model(model)
+    except ValueError as e:
+        raise InputError(f"{where}: {e}") from e
     return model

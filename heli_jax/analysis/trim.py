@@ -11,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, needed_but_missing, zeros
 from heli_jax.vehicle import of_helicopter
 
@@ -187,6 +188,7 @@ def is_whole(model: Model) -> bool:
 
 
 def _check_model(model: Model) -> None:
+    check_model(model)
     if not is_whole(model):
         raise ValueError(
             f"trim: model {model.name} is not a whole helicopter, wanted is one of "

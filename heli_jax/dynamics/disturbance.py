@@ -4,6 +4,7 @@ import functools
 from typing import Annotated, Any
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Scalar
 
@@ -29,6 +30,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     Raises:
         ValueError: the model has no such axis, or `poles` is neither 1 nor 2.
     """
+    check_model(model)
     have = disturbable(model)
     if axis not in have:
         raise ValueError(f"model {model.name} has no axis {axis!r} to disturb; it has {have}")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model, zeros
 
 
@@ -20,11 +21,15 @@ class StateSpace(NamedTuple):
     D: Float[Array, "p m"]
 
 
+@explained
 @eqx.filter_jit
 def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) -> StateSpace:
     """The model's A, B, C, D at a state and inputs, by forward mode.
 
     Unless given the state is the model's initial one and the inputs are zero.
+
+    Raises:
+        ValueError: the model's functions cannot be traced; TypeError: it is no Model.
     """
     dtype = jnp.result_type(*(jnp.asarray(v).dtype for v in jax.tree.leaves(params)))
     dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)

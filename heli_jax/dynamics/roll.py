@@ -11,6 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.flybar import cyclic_pitch, flapping_acceleration, flapping_rate_gain
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Scalar
@@ -143,6 +144,7 @@ def on_stand(model: Model) -> Model:
     Raises:
         ValueError: the model has neither phi, dphi nor theta, dtheta among its states.
     """
+    check_model(model)
     have = naming.names(model.State)
     axes = [axis for axis in _AXES if axis.angle in have and axis.rate in have]
     if not axes:

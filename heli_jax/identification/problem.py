@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
@@ -67,6 +68,7 @@ class Problem:
 
     Raises:
         ValueError: something in it does not fit together; the sentence says what and where.
+        TypeError: `model` is no Model.
     """
 
     model: Model
@@ -92,6 +94,7 @@ class Problem:
     part of what the state does; None leaves them apart"""
 
     def __post_init__(self) -> None:
+        check_model(self.model)
         object.__setattr__(self, "flights", tuple(self.flights))
         object.__setattr__(self, "free", dict(self.free))
         _check_method(self)

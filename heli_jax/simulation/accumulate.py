@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import without_next
@@ -30,6 +31,7 @@ class Accumulated(NamedTuple):
     result: dfx.RESULTS
 
 
+@explained
 def accumulate(
     model: Model,
     params: Any,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.blocks import blockwise, columns
 from heli_jax.simulation.discretize import discretize, moved, process_noise, square_root
@@ -65,6 +66,7 @@ def substeps_for(dt: float) -> int:
     return max(4, math.ceil(dt / _LONGEST_STEP - 1e-9))
 
 
+@explained
 def simulate(
     model: Model,
     params: Any,

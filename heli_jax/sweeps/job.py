@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_whole
+from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
@@ -148,6 +149,7 @@ def job(
         ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
             lacks something, an unknown solver or precision, float64 while JAX has it switched off.
     """
+    check_model(model)
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
         raise ValueError("flights: none given, wanted is at least one")

@@ -1,0 +1,283 @@
+"""Whether an object is a model that JAX can trace, said in a sentence before anything is computed.
+
+A model's functions are called with tracers, which stand for numbers that are not known yet. What
+works on numbers may not work on them: NumPy's functions, `if x > 0`, `float(x)`.
+"""
+
+import functools
+import traceback
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+
+_RECORDS = ("Params", "State", "Inputs", "Outputs")
+
+
+def check_model(model: Any, *, traceable: bool = True) -> None:
+    """Refuse what is no Model, and a Model whose functions cannot be traced or return something
+    else than is expected. A model is looked at once; later calls cost a look-up.
+
+    Args:
+        model: what should be a Model.
+        traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
+            Without it only the return values are judged: parameters that stay plain numbers may
+            be branched on.
+
+    Raises:
+        TypeError: it is no Model.
+        ValueError: naming the function, what was expected, what it did, and the remedy.
+    """
+    if not isinstance(model, Model):
+        kind = f"the class {model.__name__}" if isinstance(model, type) else _kind(model)
+        raise TypeError(
+            f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "
+            f"State, Inputs, Outputs) makes one, got {kind}"
+        )
+    # Ours are tested, and what they wrap was looked at when it was wrapped.
+    if str(getattr(model.vector_field, "__module__", "")).startswith("heli_jax."):
+        return
+    parts = _Parts(*(getattr(model, name) for name in _Parts._fields))
+    try:
+        hash(parts)
+    except TypeError:  # such as a function with arrays in it
+        _check(parts, traceable)
+    else:
+        _check_once(parts, traceable)
+
+
+class _Parts(NamedTuple):
+    """What of a Model is looked at: equal where the same functions and classes are."""
+
+    name: str
+    vector_field: Any
+    output: Any
+    Params: Any
+    State: Any
+    Inputs: Any
+    Outputs: Any
+    start: Any
+    noise: Any
+    spread: Any
+    limits: Any
+
+
+@functools.lru_cache(maxsize=256)
+def _check_once(parts: _Parts, traceable: bool) -> None:
+    _check(parts, traceable)
+
+
+def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """A function of a model whose errors, where the model is their cause, are those of
+    `check_model`."""
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        model = args[0] if args else kwargs.get("model")
+        check_model(model, traceable=False)
+        try:
+            return function(*args, **kwargs)
+        except Exception:
+            check_model(model)
+            raise
+
+    return wrapper
+
+
+def _check(model: _Parts, traceable: bool) -> None:
+    for role in _RECORDS:
+        _check_record(model, role)
+
+    def of(role: str, *arguments: str) -> _Function:
+        return _Function(model, role, arguments, traceable)
+
+    of("vector_field", "params", "state", "inputs").returns("State")
+    of("output", "params", "state", "inputs").returns("Outputs")
+    if model.start is not None:
+        of("start", "params").returns("State")
+    if model.noise is not None:
+        of("noise", "params").returns("State")
+    if model.spread is not None:
+        of("spread", "params").returns_by_name(naming.names(model.State))
+    if model.limits is not None:
+        of("limits", "params", "state", "inputs").returns_by_name(None)
+
+
+def _check_record(model: _Parts, role: str) -> None:
+    """Refuse a class of parameters, states, ... that cannot be built by keyword."""
+    record = getattr(model, role)
+    expected = "expected a class with one number a field, such as a NamedTuple"
+    if not isinstance(record, type):
+        raise ValueError(f"model {model.name!r}: {role}: {expected}, got {_kind(record)}")
+    try:
+        names = naming.names(record)
+    except Exception as e:
+        said = " ".join(str(e).split())[:200]
+        raise ValueError(
+            f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields "
+            f"cannot be told ({type(e).__name__}: {said})"
+        ) from e
+    if not names and role != "Inputs":
+        raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
+
+
+class _Function:
+    """One function of a model, as it is traced and spoken of."""
+
+    def __init__(
+        self, model: _Parts, role: str, arguments: tuple[str, ...], traceable: bool
+    ) -> None:
+        self.model, self.role, self.arguments = model, role, arguments
+        self.traceable, self.function = traceable, getattr(model, role)
+        if not callable(self.function):
+            self.refuse(
+                f"expected a function of ({', '.join(arguments)}), got {_kind(self.function)}"
+            )
+
+    def refuse(self, problem: str, cause: BaseException | None = None) -> None:
+        where = f"model {self.model.name!r}: {self.role} {_name(self.function)}"
+        raise ValueError(f"{where}{_line(self.function, cause)}: {problem}") from cause
+
+    def returns(self, role: str) -> None:
+        """Refuse a return value that is no record of that role, with one number a field."""
+        record = getattr(self.model, role)
+        self.traced(lambda found: self.check_fields(found, record, role))
+
+    def returns_by_name(self, known: tuple[str, ...] | None) -> None:
+        """Refuse a return value that is no dictionary of numbers, by some of the known names."""
+
+        def check(found: Any) -> None:
+            if not isinstance(found, dict):
+                self.refuse(f"expected a dictionary by name, got {_kind(found)}")
+            for name, value in found.items():
+                if known is not None and name not in known:
+                    self.refuse(f"expected names of states ({', '.join(known)}), got {name!r}")
+                self.check_number(name, value)
+
+        self.traced(check)
+
+    def check_fields(self, found: Any, record: type, role: str) -> None:
+        expected = (
+            f"expected a {role}, as `return {record.__name__}({naming.names(record)[0]}=...)`"
+        )
+        # Another class with the same fields serves for outputs; states are added to one another.
+        alike = role == "Outputs" and all(hasattr(found, n) for n in naming.names(record))
+        if not (isinstance(found, record) or alike):
+            self.refuse(f"{expected}, got {_kind(found)}")
+        for name in naming.names(record):
+            self.check_number(name, getattr(found, name))
+
+    def check_number(self, name: str, value: Any) -> None:
+        try:
+            array = jnp.asarray(value)
+        except (TypeError, ValueError):
+            self.refuse(f"expected a number for {name!r}, got {_kind(value)}")
+            raise
+        if array.shape != ():
+            self.refuse(
+                f"expected one number for {name!r}, got an array of shape {array.shape}; a model "
+                "is written for one machine, jax.vmap makes many"
+            )
+        if not (
+            jnp.issubdtype(array.dtype, jnp.floating)
+            or jnp.issubdtype(array.dtype, jnp.integer)
+            or self.role == "limits"
+        ):
+            self.refuse(f"expected a real number for {name!r}, got one of type {array.dtype}")
+
+    def traced(self, check: Callable[[Any], None]) -> None:
+        """Call the function with tracers, and look at what it returns while they last."""
+        classes = [getattr(self.model, a.capitalize()) for a in self.arguments]
+        one = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+        def call(numbers: list[list[Any]]) -> None:
+            try:
+                records = [
+                    record(**dict(zip(naming.names(record), values, strict=True)))
+                    for record, values in zip(classes, numbers, strict=True)
+                ]
+            except Exception:  # a class that looks at its values has to do without this check
+                return
+            try:
+                found = self.function(*records)
+            except Exception as e:
+                if self.traceable:
+                    self.refuse(_words(e), e)
+                return
+            check(found)
+
+        jax.eval_shape(call, [[one] * len(naming.names(record)) for record in classes])
+
+
+def _words(e: Exception) -> str:
+    """What went wrong in a function, with the remedy where it is known."""
+    if isinstance(e, jax.errors.TracerBoolConversionError):
+        return (
+            "branches on a value that is traced (if, while, and, or, min, max); expected "
+            "jnp.where(condition, a, b) or jax.lax.cond in its place"
+        )
+    if isinstance(e, jax.errors.TracerArrayConversionError):
+        return (
+            "uses NumPy on a value that is traced; expected jax.numpy, as jnp.sin in place of "
+            "np.sin"
+        )
+    if isinstance(e, jax.errors.ConcretizationTypeError | jax.errors.TracerIntegerConversionError):
+        return (
+            "makes a Python number of a value that is traced (float, int, the functions of math, "
+            "an index); expected jax.numpy, as jnp.sin in place of math.sin"
+        )
+    said = " ".join(str(e).split())[:200]
+    return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}"
+
+
+def _is_named_tuple(value: Any) -> bool:
+    return isinstance(value, tuple) and hasattr(value, "_fields")
+
+
+def _kind(value: Any) -> str:
+    """`a tuple of 2`, `None`, `a dict`."""
+    if value is None:
+        return "None"
+    if isinstance(value, jax.core.Tracer | jax.Array):
+        return f"an array of shape {jnp.shape(value)}"
+    if isinstance(value, tuple | list) and not _is_named_tuple(value):
+        return f"a {type(value).__name__} of {len(value)}"
+    name = type(value).__name__
+    return f"an object of class {name}" if name[:1].isupper() else f"a {name}"
+
+
+def _bare(function: Any) -> Any:
+    """The function within partial applications and other wrappers."""
+    while True:
+        inner = getattr(function, "func", None) or getattr(function, "__wrapped__", None)
+        if inner is None or not callable(inner):
+            return function
+        function = inner
+
+
+def _name(function: Any) -> str:
+    """`module.function`"""
+    function = _bare(function)
+    name = getattr(function, "__qualname__", type(function).__name__)
+    module = getattr(function, "__module__", "")
+    return f"{module}.{name}" if module else name
+
+
+def _line(function: Any, cause: BaseException | None) -> str:
+    """` (line 12)`: where in the function's file something went wrong; else where it begins."""
+    code = getattr(_bare(function), "__code__", None)
+    if code is None:
+        return ""
+    line = code.co_firstlineno
+    if cause is not None:
+        inside = [
+            frame.lineno
+            for frame in traceback.extract_tb(cause.__traceback__)
+            if frame.filename == code.co_filename
+        ]
+        line = inside[-1] if inside else line
+    return f" (line {line})"
