@@ -8,10 +8,12 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.identifiability import Unknown, Verdict
 from heli_jax.identification.judgement import references_of, unknowns_of
-from heli_jax.identification.layout import Data, Layout
+from heli_jax.identification.layout import Data, Layout, noise_limits, unpack
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
 
+_TAKES_PART = 1e-3
+"""part of a unit direction without effect from which on a coordinate is lost with it"""
 _SAYS_NOTHING = 1e3
 """A disturbance's standard deviation or memory whose interval reaches by this factor to either side
 is not determined."""
@@ -29,7 +31,10 @@ def estimates_of(
     unknowns = unknowns_of(problem, layout, e)
     references = references_of(problem, layout, unknowns)
     norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
-    alone = np.divide(1.0, norms * deviations(e.J), where=norms > 0, out=np.ones_like(norms))
+    sds = deviations(e.J)
+    known = (norms > 0) & np.isfinite(sds)
+    product = norms * np.where(known, sds, 1.0)
+    alone = np.divide(1.0, product, where=known, out=np.ones_like(norms))
     out = {}
     for i, u in enumerate(unknowns):
         free = problem.free.get(u.name)
@@ -93,6 +98,25 @@ def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     ]
 
 
+def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
+    """Where a parameter of the disturbance ran to the end of what a record can show."""
+    notes = []
+    limits = noise_limits(data)
+    for i, name in enumerate(layout.noise):
+        at = float(z[len(layout.named) + i])
+        low, high = (float(v) for v in limits[name])
+        if low < at < high:
+            continue
+        value = np.exp(min(max(at, low), high))
+        meaning = {
+            ("tau_w", True): "to this record the disturbance is white noise",
+            ("tau_w", False): "to this record the disturbance is a random walk",
+        }.get((name, at <= low), "the record bounds it to one side at most")
+        unit = naming.unit(layout.model.Params, name) or ""
+        notes.append(f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}.")
+    return notes
+
+
 def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
     """Where the noise found, by 'flight/output', is not the stated one."""
     notes = []
@@ -108,12 +132,22 @@ def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
 
 
 def deviations(J: np.ndarray) -> np.ndarray:
-    """Standard deviations (q,) of all coordinates from whitened rows (n, q); 0 without effect."""
+    """Standard deviations (q,) of all coordinates from whitened rows (n, q).
+
+    Infinite for a coordinate without effect, and for those that take part in a direction without:
+    what leaves no trace in the rows is not known, rather than known exactly.
+    """
     J = np.asarray(J, dtype=np.float64)
+    q = J.shape[1]
+    if not np.isfinite(J).all():
+        return np.full(q, np.inf)
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
-    inverse = np.linalg.pinv(np.linalg.qr(J / norms, mode="r"), rcond=1e-10)
-    return np.sqrt(np.sum(inverse**2, axis=1)) / norms
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    sizes = np.concatenate([sizes, np.zeros(q - sizes.size)])
+    kept = sizes > 1e-10 * sizes[0]
+    sds = np.sqrt(np.sum((right[kept] / sizes[kept, None]) ** 2, axis=0)) / norms
+    return np.where(np.any(np.abs(right[~kept]) > _TAKES_PART, axis=0), np.inf, sds)
 
 
 def flight_nuisances(
@@ -129,10 +163,12 @@ def flight_nuisances(
     q = len(layout.named)
     if layout.size == q:
         return {}
-    sds = deviations(e.J) * wider
+    sds = deviations(e.J)
+    sds = np.multiply(sds, wider, where=np.isfinite(sds), out=sds)
     out, starts = {}, problem.noise
+    disturbance = unpack(layout, data, z).noise
     for i, name in enumerate(layout.noise):
-        value, relative = float(np.exp(z[q + i])), float(sds[q + i])
+        value, relative = float(disturbance[name]), float(sds[q + i])
         reach = float(np.exp(min(quantile * relative, 700.0)))
         unit = naming.unit(layout.model.Params, name) or ""
         limits = (value / reach, value * reach)

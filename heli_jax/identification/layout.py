@@ -4,6 +4,7 @@ z holds coordinates of the free parameters, then input gains, the time shift, th
 for each flight the initial state, the biases and the offsets of the inputs.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,11 @@ from heli_jax.identification.offsets import offset_inputs
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 
 _BLOCK = 32
+_SCALES = 40.0
+"""logarithm by which the noise of one output may differ from its guess"""
+_FAINTEST, _STRONGEST = 60.0, 10.0
+"""logarithms: how far sigma_w may fall below the measured motion, and rise above what would move
+the model as far as it was measured within one sample"""
 
 
 class FlightData(NamedTuple):
@@ -221,6 +227,30 @@ def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
     return coordinates.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 
+def noise_limits(data: Data) -> dict[str, tuple[Any, Any]]:
+    """Lowest and highest logarithm of each parameter of the disturbance.
+
+    A correlation time below a hundredth of a sample is white noise to any record, one above a
+    thousand records is a random walk; beyond these a likelihood without a maximum would take the
+    numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
+    with room for a disturbance that is none.
+    """
+    dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
+    longest = functools.reduce(
+        jnp.maximum,
+        [f.dt * next(iter(f.outputs.values())).shape[0] for f in data.flights],
+    )
+    # A bias's scale is ten times what the output does.
+    motion = functools.reduce(
+        jnp.maximum, [0.1 * s for f in data.flights for s in f.bias_scale.values()]
+    )
+    size = jnp.log(motion)
+    return {
+        "sigma_w": (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST),
+        "tau_w": (jnp.log(0.01 * dt), jnp.log(1e3 * longest)),
+    }
+
+
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     """Names for the entries of z."""
     q = len(layout.free)
@@ -231,9 +261,15 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     if layout.shift:
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
-    noise = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.noise)}
+    limits = noise_limits(data)
+    noise = {
+        name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noise)
+    }
     at += len(layout.noise)
-    scales = {name: jnp.exp(z[at + i]) for i, name in enumerate(layout.scaled)}
+    scales = {
+        name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
+        for i, name in enumerate(layout.scaled)
+    }
     at = layout.weak
     states, biases, offsets = [], [], []
     for flight, outputs, (count, _) in zip(

@@ -14,7 +14,7 @@ from heli_jax.identification.layout import Data, Layout, Noise
 from heli_jax.identification.metrics import noise_guess
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.search import Search
+from heli_jax.identification.search import Search, noise_guess_at
 
 NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
@@ -34,6 +34,8 @@ class Settled(NamedTuple):
     """(steps, cost) of every round of the optimiser"""
     ratio: float | None = None
     """twice the log-likelihood that a disturbance gained, where that was asked"""
+    notes: tuple[str, ...] = ()
+    """what a reader should know of how the optimum was reached"""
 
 
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
@@ -103,35 +105,94 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
     """The optimum with the disturbance where it is significant, else without one.
 
     Where sigma_w goes to zero, tau_w means nothing and the optimiser has no end to come to; the
-    same residuals with sigma_w all but zero are those of output error.
+    same residuals with sigma_w all but zero are those of output error. That model is nested in the
+    one with a disturbance: a search that ends below its likelihood is begun anew from its optimum.
     """
-    layout, data, best, noise = search.layout, search.data, found.best, found.noise
-    e = evaluate(layout, data, noise, best.z)
-    at = layout.noise_at("sigma_w")
-    if bool(best.converged) and np.all(np.isfinite(e.J)) and deviations(e.J)[at] < _SURE:
+    layout, data = search.layout, search.data
+    e = evaluate(layout, data, found.noise, found.best.z)
+    if _sure(layout, found, e) and _far_better(search, found, e):
         return found
     none = without_disturbance(search, found)
     alone = evaluate(layout, data, none.noise, none.best.z)
-    if bool(none.best.converged) and not _corrects(alone, none.noise):
+    if bool(np.isfinite(alone.r).all()) and not _corrects(alone, none.noise):
         without = log_likelihood(layout, data, none.noise, alone)
-        ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
-        if np.isfinite(ratio) and ratio < -NO_DISTURBANCE:
-            # What has one unknown less cannot be better: the search with it went astray.
-            z = none.best.z.at[at].set(best.z[at])
-            [best] = search.run(none.noise, z[None, :])
-            again = settle(search, none.noise, best)
-            found = again._replace(trace=(*found.trace, *again.trace))
-            best, noise = found.best, found.noise
-            e = evaluate(layout, data, noise, best.z)
-            ratio = 2.0 * (log_likelihood(layout, data, noise, e) - without)
-        if not np.isfinite(ratio) or ratio < NO_DISTURBANCE:
+        ratio = 2.0 * (log_likelihood(layout, data, found.noise, e) - without)
+        if not ratio > NO_DISTURBANCE:
+            found, ratio = _from_nested(search, found, ratio, none, without)
+        if bool(none.best.converged) and not ratio > NO_DISTURBANCE:
             return none._replace(trace=found.trace, ratio=ratio)
         found = found._replace(ratio=ratio)
-    if not bool(best.converged):
-        [best] = search.run(noise, best.z[None, :])
-        again = settle(search, noise, best)
-        found = again._replace(trace=(*found.trace, *again.trace), ratio=found.ratio)
+    if not bool(found.best.converged):
+        [best] = search.run(found.noise, found.best.z[None, :])
+        again = settle(search, found.noise, best)
+        found = again._replace(
+            trace=(*found.trace, *again.trace), ratio=found.ratio, notes=found.notes
+        )
     return found
+
+
+def _sure(layout: Layout, found: Settled, e: Evaluation) -> bool:
+    """Whether a disturbance was found and all of it is determined."""
+    if not (bool(found.best.converged) and np.all(np.isfinite(e.J))):
+        return False
+    at = len(layout.named)
+    sds = deviations(e.J)
+    known = np.isfinite(sds[at : at + len(layout.noise)]).all()
+    return bool(known and sds[layout.noise_at("sigma_w")] < _SURE)
+
+
+def _far_better(search: Search, found: Settled, e: Evaluation) -> bool:
+    """Whether nobody need optimise without a disturbance to see that it would fit worse.
+
+    One evaluation at the same parameters, and the gain of the Gauss-Newton step from there.
+    """
+    layout, data, noise = search.layout, search.data, found.noise
+    alone = evaluate(layout, data, noise, _silenced(search, found))
+    if not (np.isfinite(alone.r).all() and np.isfinite(alone.J).all()):
+        return False
+    r, J = np.asarray(alone.r, np.float64), np.asarray(alone.J, np.float64)
+    norms = np.linalg.norm(J, axis=0)
+    Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
+    before = float(r @ r)
+    after = max(before - float(np.sum((Q.T @ r) ** 2)), 1e-300)
+    n = residuals_count(data)
+    gain = 0.5 * (n * np.log(before / after) if layout.concentrated else before - after)
+    without = log_likelihood(layout, data, noise, alone) + gain
+    return bool(log_likelihood(layout, data, noise, e) - without > n)
+
+
+def _from_nested(
+    search: Search, found: Settled, ratio: float, none: Settled, without: float
+) -> tuple[Settled, float]:
+    """The better of `found` and a search from the optimum without disturbance, and its ratio."""
+    layout, data = search.layout, search.data
+    z = with_noise_guess(search, none)
+    guess = evaluate(layout, data, none.noise, z)
+    noise = levelled(data, guess, none.noise)
+    promising = log_likelihood(layout, data, noise, guess) > without + NO_DISTURBANCE
+    if not (promising or ratio < -NO_DISTURBANCE or not np.isfinite(ratio)):
+        return found, ratio
+    [best] = search.run(noise, z[None, :])
+    again = settle(search, noise, best)
+    e = evaluate(layout, data, again.noise, again.best.z)
+    other = 2.0 * (log_likelihood(layout, data, again.noise, e) - without)
+    if not np.isfinite(other) or other <= ratio:
+        return found, ratio
+    said = ()
+    if other > NO_DISTURBANCE:
+        said = (
+            "The first search ended in a worse optimum, below what the model without a disturbance "
+            "reaches: this fit was begun anew from that model's parameters.",
+        )
+    return again._replace(trace=(*found.trace, *again.trace), notes=said), other
+
+
+def with_noise_guess(search: Search, none: Settled) -> Array:
+    """z at the parameters of an optimum, the disturbance from a coarse search."""
+    layout, at = search.layout, len(search.layout.named)
+    starts = [np.log(search.problem.noise[n].start) for n in layout.noise]
+    z = none.best.z.at[at : at + len(starts)].set(jnp.asarray(starts, none.best.z.dtype))
+    return noise_guess_at(layout, search.data, none.noise, z)
 
 
 def _corrects(e: Evaluation, noise: Noise) -> bool:
@@ -148,11 +209,14 @@ def _corrects(e: Evaluation, noise: Noise) -> bool:
 
 def without_disturbance(search: Search, found: Settled) -> Settled:
     """The optimum with a sigma_w that is all but zero."""
+    [none] = search.run(found.noise, _silenced(search, found)[None, :])
+    return settle(search, found.noise, none)
+
+
+def _silenced(search: Search, found: Settled) -> Array:
     at = search.layout.noise_at("sigma_w")
     smallest = min(float(s) for one in found.noise.sd for s in one.values())
-    z = found.best.z.at[at].set(np.log(smallest) - _NONE)
-    [none] = search.run(found.noise, z[None, :])
-    return settle(search, found.noise, none)
+    return found.best.z.at[at].set(np.log(smallest) - _NONE)
 
 
 def _updated(

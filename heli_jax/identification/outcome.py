@@ -17,6 +17,7 @@ from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import (
     bound_notes,
     estimates_of,
+    extreme_noise_notes,
     flight_nuisances,
     labels,
     stated_noise_notes,
@@ -96,6 +97,8 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
         *_disturbance_notes(settled.ratio if none else None),
+        *([] if none else extreme_noise_notes(layout, data, best.z)),
+        *settled.notes,
         *_filter_notes(layout, noise, e, n, ill),
         *stated_noise_notes(problem, sds),
         *bound_notes(estimates),

@@ -26,7 +26,7 @@ def first_guess(
 ) -> Float[Array, " q"]:
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
     linear least squares; what is not among the unknowns stays."""
-    z0 = _noise_guess(layout, data, noise, z0) if layout.noise else z0
+    z0 = noise_guess_at(layout, data, noise, z0) if layout.noise else z0
     if not (layout.shift or len(layout.gains) == 1):
         return z0
     grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
@@ -44,7 +44,7 @@ def first_guess(
     return z0
 
 
-def _noise_guess(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
+def noise_guess_at(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
     """sigma_w and tau_w of the greatest likelihood on a coarse grid about the start."""
     at = len(layout.named)
     steps = {

@@ -1,0 +1,63 @@
+"""Filter error on the bench where there is white noise and no disturbance.
+
+Whatever it says of a disturbance that is not there must be a number that can be believed, or none.
+The records come from scipy and the closed form of eq. 23, not from our own simulation.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+
+from coverage_cases import Case, Run, intervals
+from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.roll import roll_transfer_function
+from heli_jax.identification.result import Fit
+from heli_jax.naming import asdict
+from heli_jax.simulation.inputs import random_steps
+
+N, DT, NOISE = 1000, 0.02, 2e-3
+MODELS = {poles: with_disturbance(models.roll_on_stand, "roll", poles) for poles in (1, 2)}
+
+
+def one_run(seed: int, poles: int = 1) -> Run:
+    vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
+    num, den = roll_transfer_function(vehicle, stand=True)
+    discrete: Any = scipy.signal.cont2discrete((np.array(num), np.array(den)), DT)
+    b, a = discrete[:2]
+    rng = np.random.default_rng(seed)
+    u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
+    y = scipy.signal.lfilter(np.ravel(b), a, u) + NOISE * rng.standard_normal(N)
+    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
+    free = {"Ixx": Free(0.05), "If": Free(5e-4)}
+    start = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
+    params = MODELS[poles].Params(**{**asdict(vehicle), **start})
+    found = fit(Problem(MODELS[poles], params, [flight], free, method="filter-error"))
+    run = intervals(found, {n: float(getattr(vehicle, n)) for n in free})
+    run.flags.update(flags(found))
+    return run
+
+
+def flags(found: Fit) -> dict[str, bool]:
+    """What must not be said of a disturbance that is not there."""
+    sigma, tau = found.nuisance["sigma_w"], found.nuisance["tau_w"]
+    absent = sigma.value == 0.0 and sigma.sd is None and tau.sd is None
+    noted = any("No disturbance shows" in note for note in found.notes)
+    relative = [e.sd / e.value for e in (sigma, tau) if e.sd is not None and e.value > 0]
+    return {
+        "absurd sigma_w": not absent and not 1e-6 < sigma.value < 1e6,
+        "absurd tau_w": not absent and not 0.99 * DT / 100 < tau.value < 1010 * N * DT,
+        "absurdly sure": any(r < 1e-4 for r in relative),
+        "absent but not said": absent != noted,
+        "a disturbance is seen (5 % by the test's own level)": not absent,
+        "not converged": found.status != "converged",
+    }
+
+
+def cases() -> list[Case]:
+    return [
+        Case("filter error, no disturbance, one pole", one_run, 500),
+        Case("filter error, no disturbance, two poles", lambda seed: one_run(seed, 2), 200),
+    ]

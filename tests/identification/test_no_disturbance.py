@@ -1,0 +1,72 @@
+"""What filter error says where no disturbance is, and where its optimiser would go too far."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Free, Problem, fit, models
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.identification.data import data_of
+from heli_jax.identification.estimates import deviations, extreme_noise_notes
+from heli_jax.identification.evaluation import evaluate
+from heli_jax.identification.layout import layout_of, unpack
+from heli_jax.identification.noise import first_noise
+from heli_jax.identification.start import start_vector
+from heli_jax.naming import asdict
+from tests.identification.bench import BENCH, record, vehicle
+
+MODEL = with_disturbance(models.roll_on_stand, "roll")
+FREE = {"Ixx": Free(0.048), "If": Free(6.8e-5)}
+
+
+def problem(seed, n=1000):
+    values = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
+    params = MODEL.Params(**{**asdict(vehicle(BENCH)), **values})
+    return Problem(MODEL, params, [record(BENCH, seed=seed, n=n)], FREE, method="filter-error")
+
+
+# Of seeds 0 to 59 number 23 ended with sigma_w = 9e-105 +- 4e-119, tau_w = 3e197 s.
+@pytest.mark.parametrize("seed", [22, 23])
+def test_white_noise_has_no_disturbance(seed):
+    found = fit(problem(seed))
+    assert found.status == "converged"
+    sigma_w, tau_w = found.nuisance["sigma_w"], found.nuisance["tau_w"]
+    assert sigma_w.value == 0.0
+    assert sigma_w.sd is None
+    assert tau_w.sd is None
+    assert 0.99 * 0.02 / 100 < tau_w.value < 1.01 * 1000 * 20.0
+    assert any("No disturbance shows" in note for note in found.notes)
+    for name, true in (("Ixx", 0.024), ("If", 0.00017)):
+        one = found.estimates[name]
+        assert abs(one.value - true) < 4 * one.sd
+
+
+def test_what_has_no_effect_is_not_known():
+    rng = np.random.default_rng(0)
+    J = rng.standard_normal((50, 4))
+    # The oracle: the inverse of the normal equations.
+    np.testing.assert_allclose(deviations(J), np.sqrt(np.diag(np.linalg.inv(J.T @ J))), rtol=1e-12)
+    # The third is a copy of the second, the last does nothing: only the first is known.
+    J[:, 2] = -3.0 * J[:, 1]
+    J[:, 3] = 0.0
+    sds = deviations(J)
+    both = J[:, :2]
+    assert sds[0] == pytest.approx(np.sqrt(np.linalg.inv(both.T @ both)[0, 0]), rel=1e-9)
+    assert np.isinf(sds[1:]).all()
+    assert np.isinf(deviations(np.full((5, 2), np.nan))).all()
+
+
+def test_a_disturbance_has_ends():
+    one = problem(1, 200)
+    layout, data = layout_of(one, one.training), data_of(one, one.training)
+    z = start_vector(layout, data, one)
+    at = layout.noise_at("tau_w")
+    for far, tau_w, words in ((-900.0, 0.02 / 100, "white"), (900.0, 1e3 * 4.0, "random walk")):
+        out = z.at[at].set(far).at[layout.noise_at("sigma_w")].set(0.0)
+        assert float(unpack(layout, data, out).noise["tau_w"]) == pytest.approx(tau_w, rel=1e-9)
+        J = evaluate(layout, data, first_noise(one, one.training), out).J
+        assert np.isinf(deviations(J)[at])
+        [note] = extreme_noise_notes(layout, data, out)
+        assert "tau_w is not determined" in note
+        assert words in note
+    assert extreme_noise_notes(layout, data, z.at[at - 1].set(0.0)) == []
