@@ -38,7 +38,13 @@ def problem(experiment: Experiment) -> Problem:
     nuisance = Nuisance(**asked)
     flights = read_flights(experiment, gain=nuisance.input_gain)
     free = {
-        name: Free(f.start, f.lower, f.upper, Prior(f.prior.mean, f.prior.sd) if f.prior else None)
+        name: Free(
+            f.start,
+            f.lower,
+            f.upper,
+            Prior(f.prior.mean, f.prior.sd) if f.prior else None,
+            f.sign,
+        )
         for name, f in config.fit.free.items()
     }
     model, params, fixed = experiment.model, experiment.vehicle.params, ()

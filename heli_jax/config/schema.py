@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
-from heli_jax.identification.problem import Method
+from heli_jax.identification.problem import Method, Sign
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -58,6 +58,9 @@ class FreeConfig(_Strict):
     lower: Finite | None = None
     upper: Finite | None = None
     prior: PriorConfig | None = None
+    sign: Sign | None = None
+    """whether the estimate may have another sign than the start: keep, or any; unless given, a
+    helicopter's parameters keep theirs and those of a model of one's own may have any"""
 
 
 class NuisanceConfig(_Strict):

@@ -32,7 +32,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
 
     numbers = Data(
         base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
-        sign=column([float(np.sign(f.start)) or 1.0 for f in frees]),
+        sign=column([coordinates.sign_or_scale(f) for f in frees]),
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),

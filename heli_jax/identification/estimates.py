@@ -62,7 +62,7 @@ def _interval95(
     u: Unknown, relative: float, reference: float, quantile: float
 ) -> tuple[float, float, float]:
     sd = float(relative * reference)
-    if not u.logarithmic:
+    if u.symmetric or not u.logarithmic:
         return sd, u.value - quantile * sd, u.value + quantile * sd
     reach = float(np.exp(min(quantile * relative, 700.0)))
     low, high = sorted((u.value / reach, u.value * reach))

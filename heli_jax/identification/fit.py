@@ -8,6 +8,7 @@ from jaxtyping import Array
 from heli_jax.identification import excitation
 from heli_jax.identification import search as starting
 from heli_jax.identification.data import data_of
+from heli_jax.identification.divergent import SAID, by_windows
 from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import (
@@ -101,7 +102,12 @@ def fit(
     short = min(max_steps, _FIRST_STEPS) if asked else max_steps
     search = starting.Search(problem, begin.layout, begin.data, short)
     runs = search.run(begin.noise, points, tell)
-    settled = settle(search, begin.noise, min(runs, key=starting.rank))
+    best, said = min(runs, key=starting.rank), ()
+    other = by_windows(problem, search, begin.noise, begin.e, begin.z, best)
+    if other is not None:
+        best, said = other, (SAID,)
+    settled = settle(search, begin.noise, best)
+    settled = settled._replace(notes=(*said, *settled.notes))
     search.max_steps = max_steps
     if asked:
         settled = disturbance_or_none(search, settled)

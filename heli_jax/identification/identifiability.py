@@ -33,6 +33,11 @@ class Unknown(NamedTuple):
     """1 / sd of its prior in that coordinate; 0 without one"""
     is_parameter: bool = True
     """False for gains and time shifts"""
+    per_log: float = 1.0
+    """what turns its relative coordinate into log |value|"""
+    symmetric: bool = False
+    """whether it may have either sign: its interval is then symmetric about the value, and
+    determines nothing where it reaches further than log 10 times its size to either side"""
 
 
 class Combination(NamedTuple):
@@ -184,7 +189,8 @@ def _too_wide(
 ) -> list[np.ndarray]:
     """Directions of full rank along which a 95 % interval still spans more than the factor."""
     limit = math.log(FACTOR) / Z95
-    wide = [u.logarithmic and covariance[i, i] > limit**2 for i, u in enumerate(unknowns)]
+    sized = [u.logarithmic or u.symmetric for u in unknowns]
+    wide = [s and covariance[i, i] > limit**2 for i, s in enumerate(sized)]
     if not any(wide):
         return []
     plain = _directions(total, np.ones(len(unknowns)))
@@ -219,6 +225,9 @@ def _combinations(
     """Products of powers that do not change along the null directions."""
     if not null:
         return ()
+    per_log = np.array([u.per_log for u in unknowns])
+    null = [_unit(v * per_log) for v in null]
+    covariance = covariance * np.outer(per_log, per_log)
     W, pivots = _reduced(np.array(null), unknowns)
     found = []
     for i in range(len(unknowns)):

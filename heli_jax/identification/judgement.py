@@ -3,10 +3,15 @@
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.identification import coordinates
 from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.identifiability import NULL, Unknown, Verdict, judge, projected
 from heli_jax.identification.layout import Layout
 from heli_jax.identification.problem import Problem
+
+
+_NEAR_ZERO = 1e-2
+"""part of a parameter's size below which it takes no part in products of powers"""
 
 
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
@@ -23,7 +28,11 @@ def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknow
             reference, log = _reference(problem, name, value)
             prior = reference / free.prior.sd if free.prior else 0.0
             scale = 1.0 / prior if prior else _interval(free.lower, free.upper, log)
-            found.append(Unknown(name, value, log, scale, prior))
+            symmetric = coordinates.changes_sign(free)
+            per_log = reference / abs(value) if symmetric and log else 1.0
+            found.append(
+                Unknown(name, value, log, scale, prior, per_log=per_log, symmetric=symmetric)
+            )
     return tuple(found)
 
 
@@ -39,6 +48,10 @@ def _reference(problem: Problem, name: str, value: float) -> tuple[float, bool]:
     low, high = free.lower, free.upper
     if low is not None and high is not None and low < 0 < high:
         return 0.5 * (high - low), False
+    if coordinates.changes_sign(free):
+        # A value near zero is known as soon as it is known to be small beside the start.
+        size = max(abs(value), coordinates.scale(free))
+        return size, abs(value) > _NEAR_ZERO * size
     return abs(value), True
 
 

@@ -49,6 +49,7 @@ class Data(NamedTuple):
     base: Any
     """the vehicle's parameters by name"""
     sign: Any
+    """of the start; of a linear coordinate its scale"""
     low: Any
     high: Any
     prior_mean: Any

@@ -85,6 +85,11 @@ _ANCHOR = 100.0
 a factor of e^100 is no prior, but it tells one end of a valley from the other"""
 
 
+_LINEAR_ANCHOR = 1e6
+"""the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
+that the data would give it at the start if all else were known"""
+
+
 class _Scaling(NamedTuple):
     """Units in which the optimiser sees a start: z = z0 + unit * xi, residuals / level."""
 
@@ -358,7 +363,14 @@ def _terms(layout: Layout, z0: Array, units: _Scaling) -> _Terms:
     anchor = np.where(at < len(layout.free), 1.0 / _ANCHOR, 0.0)
     # The unknowns whose steps say whether the optimiser has arrived.
     watched = (at < len(layout.named)) | (at >= layout.weak)
-    return _Terms(z0, units, jnp.asarray(anchor, z0.dtype), jnp.asarray(watched))
+    ties = jnp.asarray(anchor, z0.dtype)
+    linear = np.array([how == "linear" for how in layout.kinds])
+    if linear.any():
+        linear = np.concatenate([linear, np.zeros(layout.size - linear.size, bool)])
+        usable = units.unit > 0
+        norms = _COLUMN * units.level / jnp.where(usable, units.unit, 1.0)
+        ties = jnp.where(linear, jnp.where(usable, norms / _LINEAR_ANCHOR, 0.0), ties)
+    return _Terms(z0, units, ties, jnp.asarray(watched))
 
 
 def residuals_count(data: Data) -> int:

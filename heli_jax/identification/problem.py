@@ -23,13 +23,23 @@ class Prior(NamedTuple):
     sd: float
 
 
+Sign = Literal["keep", "any"]
+
+
 class Free(NamedTuple):
-    """A parameter to be estimated: where to start, between what bounds, with what prior."""
+    """A parameter to be estimated: where to start, between what bounds, with what prior.
+
+    `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
+    logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
+    Helicopter's parameters keep theirs and those of a model of one's own may have any. Bounds that
+    lie on one side of zero keep it in either case.
+    """
 
     start: float
     lower: float | None = None
     upper: float | None = None
     prior: Prior | None = None
+    sign: Sign | None = None
 
 
 class Nuisance(NamedTuple):
@@ -96,7 +106,12 @@ class Problem:
     def __post_init__(self) -> None:
         check_model(self.model)
         object.__setattr__(self, "flights", tuple(self.flights))
-        object.__setattr__(self, "free", dict(self.free))
+        ours = of_helicopter(self.model.Params)
+        free = {
+            n: f if f.sign is not None else f._replace(sign="keep" if ours else "any")
+            for n, f in self.free.items()
+        }
+        object.__setattr__(self, "free", free)
         _check_method(self)
         if not self.free:
             raise ValueError("nothing is free: name at least one parameter to estimate")
@@ -221,10 +236,12 @@ def _check_free(name: str, one: Free, model: Model) -> None:
             f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
         )
         raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
-    if one.start == 0 and (low is None or high is None):
+    if one.sign not in ("keep", "any"):
+        raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {one.sign!r}")
+    if one.start == 0 and one.sign == "keep" and (low is None or high is None):
         raise ValueError(
             f"free.{name}.start: found 0 without two bounds, wanted is a start of the right sign "
-            "and size, or lower and upper"
+            "and size, or lower and upper, or sign: any"
         )
 
 

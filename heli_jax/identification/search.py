@@ -104,14 +104,15 @@ def draw(
     """Starts (s, q): the first is z0, the others differ in the free parameters.
 
     Between two bounds of one sign the draw is uniform in log, between two of different sign
-    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior.
+    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
+    and of either sign where that may be any.
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
     dtype = z0.dtype
     for i, (free, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
         values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
-        sign = jnp.asarray(np.sign(free.start) or 1.0, dtype)
+        sign = jnp.asarray(coordinates.sign_or_scale(free), dtype)
         low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
         rows[1:, i] = np.asarray(coordinates.to_coordinate(how, values, sign, low, high))
     return jnp.asarray(rows, dtype)
@@ -128,7 +129,16 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     if free.prior is not None and free.prior.mean:
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
     values = free.start * np.exp(width * rng.standard_normal(size))
+    if coordinates.changes_sign(free):
+        values = _either_sign(free, width, rng.standard_normal((2, size)))
     return np.where([coordinates.inside(free, float(v)) for v in values], values, free.start)
+
+
+def _either_sign(free: Free, width: float, drawn: np.ndarray) -> np.ndarray:
+    """Values of the start's size; about the prior's mean where there is one, which knows more."""
+    if free.prior is not None:
+        return free.prior.mean + 2.0 * free.prior.sd * drawn[0]
+    return coordinates.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
 
 
 class Search:
@@ -172,13 +182,17 @@ class Search:
 
     def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        nothing = self.misfit_of_nothing(noise) / residuals_count(self.data)
+        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+
+    def misfit_of_nothing(self, noise: Noise) -> float:
+        """Sum of squares that a model without any response leaves."""
         power = [
             float(np.nansum(np.square(np.asarray(y) / np.asarray(s[n]))))
             for flight, s in zip(self.data.flights, noise.sd, strict=True)
             for n, y in flight.outputs.items()
         ]
-        nothing = sum(power) / residuals_count(self.data)
-        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+        return sum(power)
 
     def _inside(self, z: Array) -> bool:
         values = named_values(self.layout, self.data, z)

@@ -33,6 +33,8 @@ def cases(draw):
     size, width, share = draw(sizes), draw(widths), draw(shares)
     if how == "log":
         return how, sign, -math.inf, math.inf, sign * size
+    if how == "linear":
+        return how, size, -math.inf, math.inf, sign * width * size
     if how == "above":
         low = sign * size
         return how, sign, low, math.inf, low + width * size
@@ -75,7 +77,14 @@ def test_monotone(case, z, step):
     how, sign, low, high, _ = case
     one, two = (float(to_value(how, jnp.asarray(v), sign, low, high)) for v in (z, z + step))
     assume(math.isfinite(one) and math.isfinite(two))
-    rising = {"log": sign > 0, "above": True, "below": False, "logit": True, "logit-log": sign > 0}
+    rising = {
+        "log": sign > 0,
+        "linear": True,
+        "above": True,
+        "below": False,
+        "logit": True,
+        "logit-log": sign > 0,
+    }
     if how == "logit-log" or rising[how]:  # from log|low| to log|high|: always from low to high
         assert two >= one
     else:
@@ -109,6 +118,13 @@ def test_derivative_is_finite_and_that_of_differences(how, sign):
         (Free(-2.0, -3.0, -1.0), "logit-log", (-3.0, -1.0), "log"),
         (Free(0.5, -1.0, 1.0), "logit", (-1.0, 1.0), "logit"),
         (Free(0.5, 0.0, 1.0), "logit", (0.0, 1.0), "log"),
+        (Free(2.0, sign="any"), "linear", (-math.inf, math.inf), "linear"),
+        (Free(0.0, sign="any"), "linear", (-math.inf, math.inf), "linear"),
+        (Free(2.0, upper=3.0, sign="any"), "below", (-math.inf, 3.0), "linear"),
+        (Free(-2.0, lower=-3.0, sign="any"), "above", (-3.0, math.inf), "linear"),
+        (Free(2.0, lower=1.0, sign="any"), "above", (1.0, math.inf), "log"),
+        (Free(2.0, 1.0, 3.0, sign="any"), "logit-log", (1.0, 3.0), "log"),
+        (Free(0.5, -1.0, 1.0, sign="any"), "logit", (-1.0, 1.0), "logit"),
     ],
 )
 def test_kind_and_limits(free, wanted, bounds, plain):

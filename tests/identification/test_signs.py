@@ -1,0 +1,174 @@
+"""A parameter whose sign physics does not give ends at the truth, whatever sign it began with.
+
+The records come from SciPy's exact discretisation, not from our own simulation.
+"""
+
+from typing import Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit
+from heli_jax.identification.coordinates import changes_sign
+from heli_jax.identification.search import _draw_values
+from tests.identification.bench import steps
+
+
+class Derivatives(NamedTuple):
+    Lp: Annotated[Any, "1/s"]
+    Lr: Annotated[Any, "1/s"]
+    Np: Annotated[Any, "1/s"]
+    Nr: Annotated[Any, "1/s"]
+    Ld: Annotated[Any, "1/s^2"]
+    Nd: Annotated[Any, "1/s^2"]
+
+
+class Rates(NamedTuple):
+    p: Annotated[Any, "rad/s"]
+    r: Annotated[Any, "rad/s"]
+
+
+class Stick(NamedTuple):
+    d: Annotated[Any, "1"]
+
+
+def field(q: Any, s: Rates, u: Stick) -> Rates:
+    return Rates(
+        p=q.Lp * s.p + q.Lr * s.r + q.Ld * u.d,
+        r=q.Np * s.p + q.Nr * s.r + q.Nd * u.d,
+    )
+
+
+def at_rest(q: Any) -> Rates:
+    return Rates(0.0 * q.Lp, 0.0 * q.Lp)
+
+
+MODEL = Model(
+    "lateral", field, lambda q, s, u: s, Derivatives, Rates, Stick, Rates, linear=True,
+    start=at_rest,
+)  # fmt: skip
+TRUTH = {"Lp": -4.0, "Lr": 0.8, "Np": -0.6, "Nr": -1.5, "Ld": 12.0, "Nd": -3.0}
+N, DT, NOISE = 1000, 0.02, 0.02
+
+
+def flight(truth=TRUTH, seed=0):
+    t = truth
+    system = (
+        np.array([[t["Lp"], t["Lr"]], [t["Np"], t["Nr"]]]),
+        np.array([[t["Ld"]], [t["Nd"]]]),
+        np.eye(2),
+        np.zeros((2, 1)),
+    )
+    A, B, *_ = scipy.signal.cont2discrete(system, DT)
+    rng = np.random.default_rng(seed)
+    u = steps(rng, N, DT, 0.3)
+    x, y = np.zeros(2), np.empty((N, 2))
+    for k in range(N):
+        y[k] = x
+        x = A @ x + B[:, 0] * u[k]
+    y += NOISE * rng.standard_normal(y.shape)
+    return Flight(dt=DT, inputs={"d": u}, outputs={"p": y[:, 0], "r": y[:, 1]})
+
+
+FLIGHT = flight()
+
+
+def problem(free, base=TRUTH, record=FLIGHT, **how):
+    params = Derivatives(**{n: jnp.asarray(v) for n, v in base.items()})
+    return Problem(MODEL, params, [record], free, Nuisance(), **how)
+
+
+@pytest.mark.parametrize(
+    "starts",
+    [
+        {"Lp": -2.0, "Lr": -1.0, "Np": 1.0, "Nr": -1.0, "Ld": -5.0, "Nd": 5.0},
+        {"Lp": 1.0, "Lr": -1.0, "Np": 1.0, "Nr": 1.0, "Ld": -5.0, "Nd": 1.0},
+        {"Lp": -1.0, "Lr": 0.0, "Np": 0.0, "Nr": -1.0, "Ld": 1.0, "Nd": 0.0},
+    ],
+    ids=["wrong", "unstable", "zero"],
+)
+def test_a_start_of_the_wrong_sign_ends_at_the_truth(starts):
+    found = fit(problem({n: Free(v) for n, v in starts.items()}))
+    assert found.status == "converged", found.verdict.text
+    for name, true in TRUTH.items():
+        one = found.estimates[name]
+        assert abs(one.value - true) < 4 * one.sd
+        assert one.sd < 0.1 * abs(true)
+        # Not a logarithm's interval: as far to one side as to the other.
+        assert one.upper95 - one.value == pytest.approx(one.value - one.lower95, rel=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [0.5, 3.0])
+def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
+    # Over 20 s the simulation grows by e^10 and e^60.
+    found = fit(problem({"Lp": Free(wrong), "Ld": Free(-1.0)}))
+    assert found.status == "converged"
+    for name in ("Lp", "Ld"):
+        one = found.estimates[name]
+        assert abs(one.value - TRUTH[name]) < 4 * one.sd
+    assert any("diverges at the start values" in note for note in found.notes)
+
+
+def test_the_sign_may_be_kept():
+    free = {"Ld": Free(10.0), "Nd": Free(1.0, sign="keep"), "Lr": Free(1.0, lower=0.0)}
+    one = problem(free)
+    assert [changes_sign(f) for f in one.free.values()] == [True, False, False]
+    found = fit(one)
+    assert found.status == "not-identifiable"
+    assert found.estimates["Nd"].value > 0
+    kept = fit(problem(free | {"Nd": Free(-1.0, sign="keep")}))
+    assert kept.status == "converged"
+    open_ = fit(problem(free | {"Nd": Free(1.0)}))
+    assert open_.estimates["Nd"].value == pytest.approx(kept.estimates["Nd"].value, rel=1e-4)
+    assert open_.log_likelihood == pytest.approx(kept.log_likelihood, abs=1e-3)
+
+
+def test_one_bound_beyond_zero_is_kept():
+    found = fit(problem({"Ld": Free(1.0, upper=10.0), "Nd": Free(1.0, lower=-20.0)}))
+    assert found.estimates["Ld"].at_bound
+    assert found.estimates["Ld"].value == pytest.approx(10.0, rel=1e-3)
+    assert found.estimates["Nd"].value == pytest.approx(-3.0, abs=0.2)
+
+
+def test_a_parameter_that_is_zero_is_determined():
+    truth = TRUTH | {"Lr": 0.0}
+    found = fit(
+        problem({"Lp": Free(-2.0), "Lr": Free(-1.0), "Ld": Free(5.0)}, truth, flight(truth))
+    )
+    one = found.estimates["Lr"]
+    assert found.status == "converged"
+    assert abs(one.value) < 4 * one.sd
+    assert one.sd < 0.2
+
+
+def test_what_says_nothing_is_not_determined():
+    # A record without motion but noise: every derivative is anybody's guess.
+    rng = np.random.default_rng(1)
+    still = Flight(
+        dt=DT,
+        inputs={"d": 1e-4 * FLIGHT.inputs["d"]},
+        outputs={n: NOISE * rng.standard_normal(N) for n in ("p", "r")},
+    )
+    verdict = check(problem({"Ld": Free(1.0), "Nd": Free(1.0)}, record=still)).verdict
+    assert not verdict.identifiable
+    assert set(verdict.undetermined) == {"Ld", "Nd"}
+    # The same with a start that asks for less: three times its size is told.
+    assert check(problem({"Ld": Free(1e3), "Nd": Free(1e3)}, record=still)).verdict.identifiable
+
+
+def test_many_starts_are_of_both_signs():
+    rng = np.random.default_rng(0)
+    values = _draw_values(Free(2.0, sign="any"), 200, rng)
+    assert 60 < np.sum(values > 0) < 140
+    assert np.all(_draw_values(Free(2.0, sign="keep"), 50, rng) > 0)
+    near = _draw_values(Free(2.0, prior=Prior(2.0, 0.1), sign="any"), 50, rng)
+    assert np.all(np.abs(near - 2.0) < 1.0)
+
+
+def test_a_sign_is_one_of_two():
+    with pytest.raises(ValueError, match=r"free.Ld.sign: expected 'keep' or 'any', got 'plus'"):
+        problem({"Ld": Free(1.0, sign="plus")})  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="sign: any"):
+        problem({"Ld": Free(0.0, sign="keep")})
