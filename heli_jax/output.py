@@ -17,7 +17,7 @@ from heli_jax.errors import InputError
 from heli_jax.flights import write as tables
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate, Fit
-from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.identifiability import Combination, Verdict
 from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
 from heli_jax.report import files
@@ -76,7 +76,7 @@ def print_fit(
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     _table((*head[:3], fit.interval, *head[4:]), rows)
     for c in fit.verdict.combinations:
-        print(f"determined: {c.name} = {c.value:.6g}, 95 % {c.lower95:.6g} to {c.upper95:.6g}")
+        print(_determined(c))
     if further.intervals is not None:
         found = report_tables.intervals(further.intervals, fit)
         _table(found.head, found.rows)
@@ -101,6 +101,28 @@ def print_fit(
     print(f"report: {out / 'report.html'}")
 
 
+def _determined(c: Combination) -> str:
+    """`determined: a/Ixx = 212.61, sd 0.36, 95 % interval 211.90 to 213.32`"""
+    value, sd = rounded(c.value, c.sd)
+    return f"determined: {c.name} = {value}, sd {sd}, 95 % interval {_range(c)}"
+
+
+def _range(one: Estimate | Combination) -> str:
+    """An interval to the digits that its sd leaves; ends far from the value to three."""
+    assert one.sd is not None
+    ends = (one.lower95, one.upper95)
+    shown = []
+    for end in ends:
+        assert end is not None
+        # Where an interval spans powers of ten its ends have digits of their own.
+        near = abs(end - one.value) < _NEAR * one.sd and abs(end) > abs(one.value) / _NEAR
+        shown.append(rounded(end, one.sd)[0] if near or end == 0 else f"{end:.3g}")
+    return f"{shown[0]} to {shown[1]}"
+
+
+_NEAR = 10.0
+
+
 def _print_agreement(what: str, m: Metrics) -> None:
     print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
 
@@ -118,9 +140,7 @@ def _row(name: str, e: Estimate) -> tuple[str, ...]:
         return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)
-    low, _ = rounded(e.lower95, e.sd)
-    high, _ = rounded(e.upper95, e.sd)
-    return (name, value + at_bound, sd, f"{low} to {high}", e.unit, f"{e.prior_share:.2f}")
+    return (name, value + at_bound, sd, _range(e), e.unit, f"{e.prior_share:.2f}")
 
 
 def rounded(value: float, sd: float) -> tuple[str, str]:

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.flights.flight import Flight
 from heli_jax.identification.evaluation import Evaluation
 from heli_jax.identification.identifiability import Unknown, Verdict
 from heli_jax.identification.judgement import references_of, unknowns_of
 from heli_jax.identification.layout import Data, Layout, noise_limits, unpack
+from heli_jax.identification.nuisances import labels
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
 
@@ -163,8 +163,8 @@ def flight_nuisances(
     q = len(layout.named)
     if layout.size == q:
         return {}
-    sds = deviations(e.J)
-    sds = np.multiply(sds, wider, where=np.isfinite(sds), out=sds)
+    whites = deviations(e.J)
+    sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
     out, starts = {}, problem.noise
     disturbance = unpack(layout, data, z).noise
     for i, name in enumerate(layout.noise):
@@ -198,7 +198,7 @@ def flight_nuisances(
         ]
         for name, scale, unit in parts:
             value, sd = float(z[at] * scale), float(sds[at] * scale)
-            share = min(1.0, float(sds[at] / wider[at]) ** 2)
+            share = min(1.0, float(whites[at]) ** 2)
             limits = (value - quantile * sd, value + quantile * sd)
             out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
             at += 1
@@ -210,10 +210,3 @@ def _offset_unit(problem: Problem, name: str) -> str | None:
     if problem.gain_units.get(name, "1") != "1":
         return "1"
     return naming.unit(problem.model.Inputs, name)
-
-
-def labels(flights: tuple[Flight, ...]) -> list[str]:
-    """What to call each flight; of several with one name the second and further have a number."""
-    names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
-    before = [names[:i].count(name) for i, name in enumerate(names)]
-    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]

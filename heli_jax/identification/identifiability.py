@@ -5,10 +5,13 @@ scale for those that may be zero. Initial states and biases are projected out fi
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
+from heli_jax.identification import words
 
 NULL = 1e-8
 """A singular value below this part of the largest counts as zero."""
@@ -17,6 +20,8 @@ FACTOR = 10.0
 ILL_CONDITIONED = 1e4
 STRONG = 0.99
 _TAKES_PART = 0.1  # of a unit direction: less is not worth naming
+_HELD = 3.0
+"""weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
 Z95 = 1.959963984540054
 
 
@@ -73,6 +78,7 @@ class Verdict:
     null_directions: tuple[dict[str, float], ...]
     """unit vectors in relative coordinates along which nothing changes"""
     combinations: tuple[Combination, ...]
+    """what the data alone determine of parameters that they do not determine one by one"""
     pairs: tuple[Pair, ...]
     without_effect: tuple[str, ...]
     undetermined: tuple[str, ...]
@@ -80,7 +86,13 @@ class Verdict:
     """(q, q) in relative coordinates; the undetermined directions are left out of it"""
     correlation: np.ndarray
     prior_share: dict[str, float]
+    """share of what is known of a parameter that came from priors: its own, and the weak ones of
+    the nuisances; 1 where the data said nothing"""
     sentences: tuple[str, ...]
+    resting: tuple[str, ...] = ()
+    """parameters that are determined by priors, and not by the data alone"""
+    exchangeable: tuple[str, ...] = ()
+    """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
 
     @property
     def text(self) -> str:
@@ -88,77 +100,243 @@ class Verdict:
         return " ".join(self.sentences)
 
 
-def projected(J: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
-    """The (q, q) triangle that holds what J (n, q) says once the nuisance columns are free.
+class Held(NamedTuple):
+    """What is left of the data where the nuisances' weak priors are taken away.
+
+    Initial states, biases and input offsets carry priors of ten times the signal, so that one that
+    no output shows does no harm. What only these hold up of a parameter the data do not determine.
+    """
+
+    sensitivity: np.ndarray
+    """(any, q) with the nuisances free: no prior of any kind"""
+    compensation: np.ndarray
+    """(k, q) by how much the nuisances move, in sds of their weak priors, to make up for a unit of
+    each unknown"""
+    nuisances: tuple[str, ...]
+    """(k,) in words, as 'the bias of p'"""
+    labels: tuple[str, ...]
+    """(k,) as the fit names them, as 'flight 1/bias p'"""
+    switched_off: dict[str, np.ndarray]
+    """by the nuisance's switch, as 'nuisance.bias', the sensitivity (any, q) without it"""
+
+
+def projected(J: np.ndarray, nuisances: np.ndarray, smallest: float | None = None) -> np.ndarray:
+    """What J (n, q) says once the nuisance columns (n, k) are free, as few rows (any, q).
 
     By orthogonal factors, never by normal equations: singular values keep their full precision.
+
+    Args:
+        smallest: the nuisances may be dependent: of their directions, with columns of equal size,
+            those below this part of the largest have no effect of their own and are left out.
+            Without it they have to be independent.
     """
     q, k = J.shape[1], nuisances.shape[1]
     both = np.hstack([nuisances, J])
     if both.shape[0] < q + k:
         both = np.vstack([both, np.zeros((q + k - both.shape[0], q + k))])
     R = np.linalg.qr(both, mode="r")
-    return R[k : k + q, k:]
+    if smallest is None or k == 0:
+        return R[k : k + q, k:]
+    N, S = R[:, :k], R[:, k:]
+    norms = np.linalg.norm(N, axis=0)
+    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
+    shown = left[:, singular > smallest * max(singular[0], 1e-300)]
+    for _ in range(2):  # the second time takes off what rounding left the first time
+        S = S - shown @ (shown.T @ S)
+    return S
 
 
 def judge(
     sensitivity: np.ndarray,
     unknowns: tuple[Unknown, ...],
-    remedy: str = "",
+    remedies: Mapping[str, str] | None = None,
     null_below: float = NULL,
+    held: Held | None = None,
 ) -> Verdict:
     """The verdict from a whitened sensitivity (any rows, q) in relative coordinates.
 
-    Priors are no rows of it; they come with the unknowns.
-
-    `null_below` is the part of the largest singular value that counts as zero. `remedy` is a
-    further way out that the model offers, such as a run with a known inertia.
+    Args:
+        sensitivity: with the nuisances free but for their weak priors. Priors of the unknowns are
+            no rows of it; they come with the unknowns.
+        remedies: by name of an unknown, a further way out that the model offers, such as a run
+            with a known inertia.
+        null_below: the part of the largest singular value that counts as zero.
+        held: the same without the weak priors, which count as data where it is not given.
     """
     names = tuple(u.name for u in unknowns)
     scale = np.array([u.scale for u in unknowns])
     prior = np.diag([u.prior for u in unknowns])
-    data = _directions(sensitivity, scale)
-    total = _directions(np.vstack([sensitivity, prior]), scale)
-    kept = total.singular > null_below * max(total.singular[0], 1e-300)
-    covariance = _covariance(total, kept, scale)
+    bare = sensitivity if held is None else held.sensitivity
+    data, total = _directions(bare, scale), _directions(np.vstack([bare, prior]), scale)
+    with_weak = _directions(np.vstack([sensitivity, prior]), scale)
+    least = null_below * max(total.singular[0], 1e-300)
+    kept = total.singular > least
+    without_weak = _covariance(total, kept, scale)
+    covariance = without_weak
     null = [_unit(scale * v) for v in total.right[~kept]]
     if not null:
-        null = _too_wide(np.vstack([sensitivity, prior]), covariance, unknowns)
-    combinations = _combinations(null, covariance, unknowns)
+        covariance = _covariance(with_weak, with_weak.singular > 0, scale)
+        null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
+        null = null or _weakly_held(without_weak, covariance, unknowns)
+    data_kept = data.singular > null_below * max(data.singular[0], 1e-300)
+    of_data = _covariance(data, data_kept, scale)
+    data_null = []
+    if not null and prior.any():
+        data_null = [_unit(scale * v) for v in data.right[~data_kept]]
+        data_null = data_null or _too_wide(bare, of_data, unknowns)
     sizes = np.linalg.norm(sensitivity, axis=0) * scale
     dead = tuple(
         n for n, s in zip(names, sizes, strict=True) if not s > 1e-12 * max(sizes.max(), 1e-300)
     )
+    exchanged = _Exchange(sensitivity, held, least)
+    groups = _groups(null, covariance, unknowns, dead, exchanged)
+    # What the data alone say, so that no prior is in it.
+    resting = _groups(data_null, of_data, unknowns, (), exchanged)
     undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > 1e-3 for v in null))
     correlation = _correlation(covariance)
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
     condition = float(total.singular[0] / smallest) if smallest > 0 else math.inf
-    data_rank = int(np.sum(data.singular > null_below * max(data.singular[0], 1e-300)))
-    share = {
-        u.name: float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
-        for i, u in enumerate(unknowns)
-    }
-    data_null = [_unit(scale * v) for v in data.right[data_rank:]]
-    sentences = _sentences(
-        names, null, combinations, dead, pairs, condition, data_null, unknowns, remedy, covariance
-    )
+    share, weak = _shares(covariance, without_weak, unknowns)
+    for group in groups:
+        if group.nuisances:
+            share |= dict.fromkeys(group.names, 1.0)
+    weakest = None
+    if not null and condition > ILL_CONDITIONED and not data_null:
+        weakest = _weakest(covariance, condition, unknowns)
+    facts = words.Facts(unknowns, dead, groups, resting, pairs, weakest, weak, dict(remedies or {}))
     return Verdict(
         names=names,
         identifiable=not null,
         rank=int(kept.sum()),
-        rank_without_priors=data_rank,
+        rank_without_priors=int(data_kept.sum()),
         condition=condition,
         singular_values=total.singular,
         null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in null),
-        combinations=combinations,
+        combinations=tuple(c for group in (*groups, *resting) for c in group.combinations),
         pairs=pairs,
         without_effect=dead,
         undetermined=undetermined,
         covariance=covariance,
         correlation=correlation,
         prior_share=share,
-        sentences=sentences,
+        sentences=words.sentences(facts),
+        resting=tuple(n for group in resting for n in group.names),
+        exchangeable=tuple(
+            dict.fromkeys(label for v in (*null, *data_null) for label in exchanged.labels(v))
+        ),
+    )
+
+
+class _Exchange(NamedTuple):
+    """Which nuisances a direction of the unknowns is exchanged with."""
+
+    sensitivity: np.ndarray
+    held: Held | None
+    least: float
+    """singular value that counts as zero"""
+
+    def moves(self, v: np.ndarray) -> np.ndarray:
+        """(k,) whether each nuisance takes part; none where weak priors do not hold v."""
+        if self.held is None or not self.held.nuisances:
+            return np.zeros(0, bool)
+        with_weak = np.linalg.norm(self.sensitivity @ v)
+        without = np.linalg.norm(self.held.sensitivity @ v)
+        size = np.abs(self.held.compensation @ v)
+        if with_weak < max(self.least, _HELD * without):
+            return np.zeros(size.size, bool)
+        return size > _TAKES_PART * max(size.max(), 1e-300)
+
+    def labels(self, v: np.ndarray) -> tuple[str, ...]:
+        """As the fit names the nuisances."""
+        moves = self.moves(v)
+        return tuple(self.held.labels[i] for i in np.flatnonzero(moves)) if self.held else ()
+
+    def words(self, rows: list[np.ndarray]) -> tuple[str, ...]:
+        """The nuisances that the directions are exchanged with, each once."""
+        if self.held is None:
+            return ()
+        found = [self.held.nuisances[i] for v in rows for i in np.flatnonzero(self.moves(v))]
+        return tuple(dict.fromkeys(found))
+
+    def switches(self, rows: list[np.ndarray]) -> tuple[str, ...]:
+        """The nuisances without which every direction would be determined."""
+        if self.held is None or not self.words(rows):
+            return ()
+        return tuple(
+            name
+            for name, other in self.held.switched_off.items()
+            if all(
+                np.linalg.norm(other @ v)
+                > max(self.least, _HELD * np.linalg.norm(self.held.sensitivity @ v))
+                for v in rows
+            )
+        )
+
+
+def _weakly_held(
+    without_weak: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> list[np.ndarray]:
+    """Directions of unknowns that may be zero and that weak priors alone hold.
+
+    For those of one sign the factor of ten tells it; here it is an sd, without the weak priors,
+    beyond the unknown's scale and ten times the one with them.
+    """
+    return [
+        _unit(without_weak[:, i] / math.sqrt(without_weak[i, i]))
+        for i, u in enumerate(unknowns)
+        if not u.logarithmic and without_weak[i, i] > max(1.0, FACTOR**2 * covariance[i, i])
+    ]
+
+
+def _shares(
+    covariance: np.ndarray, without_weak: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """By name, the share of what is known that comes from priors, and from weak priors alone."""
+    share, weak = {}, {}
+    for i, u in enumerate(unknowns):
+        own = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
+        ratio = covariance[i, i] / without_weak[i, i] if without_weak[i, i] > 0 else 1.0
+        weak[u.name] = float(np.clip(1.0 - ratio, 0.0, 1.0))
+        share[u.name] = 1.0 - (1.0 - own) * (1.0 - weak[u.name])
+    return share, weak
+
+
+def _groups(
+    null: list[np.ndarray],
+    covariance: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    dead: tuple[str, ...],
+    exchanged: _Exchange,
+) -> tuple[words.Open, ...]:
+    """The parameters in null directions, those apart that no direction ties together."""
+    names = [u.name for u in unknowns]
+    gone = [names.index(n) for n in dead]
+    alive = [v for v in null if np.delete(np.abs(v), gone).max(initial=0.0) > _TAKES_PART]
+    if not alive:
+        return ()
+    W, _ = _reduced(np.array(alive), unknowns)
+    groups: list[tuple[set[int], list[np.ndarray]]] = []
+    for v in map(_unit, W):
+        part = {int(i) for i in np.flatnonzero(np.abs(v) > _TAKES_PART)} - set(gone)
+        if not part:
+            continue
+        joined, apart = (part, [v]), []
+        for group in groups:
+            if group[0] & part:
+                joined = (joined[0] | group[0], [*group[1], *joined[1]])
+            else:
+                apart.append(group)
+        groups = [*apart, joined]
+    return tuple(
+        words.Open(
+            tuple(names[i] for i in sorted(members)),
+            len(directions),
+            _combinations(directions, covariance, unknowns),
+            exchanged.words(directions),
+            exchanged.switches(directions),
+        )
+        for members, directions in groups
     )
 
 
@@ -209,12 +387,12 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 def _pairs(
     correlation: np.ndarray, names: tuple[str, ...], undetermined: tuple[str, ...]
 ) -> tuple[Pair, ...]:
-    """Pairs beyond the limit; those within an undetermined direction are told by that."""
+    """Pairs beyond the limit; what is not determined has no correlation."""
     found = []
     for i in range(len(names)):
         for j in range(i):
-            both_lost = names[i] in undetermined and names[j] in undetermined
-            if abs(correlation[i, j]) > STRONG and not both_lost:
+            lost = names[i] in undetermined or names[j] in undetermined
+            if abs(correlation[i, j]) > STRONG and not lost:
                 found.append(Pair(names[j], names[i], float(correlation[i, j])))
     return tuple(sorted(found, key=lambda p: -abs(p.correlation)))
 
@@ -296,81 +474,13 @@ def combination_name(exponents: dict[str, float]) -> str:
     return f"{' * '.join(over) or '1'}/{below}"
 
 
-def _listed(words: list[str], last: str = "and") -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
-
-
-def _sentences(
-    names: tuple[str, ...],
-    null: list[np.ndarray],
-    combinations: tuple[Combination, ...],
-    dead: tuple[str, ...],
-    pairs: tuple[Pair, ...],
-    condition: float,
-    data_null: list[np.ndarray],
-    unknowns: tuple[Unknown, ...],
-    remedy: str,
-    covariance: np.ndarray,
-) -> tuple[str, ...]:
-    said = [f"{name} has no effect on the measured outputs: fix it." for name in dead]
-    lost = _mixed(null, names, dead)
-    if lost:
-        what = _listed([c.name for c in combinations]) if combinations else "no part"
-        said.append(
-            f"The data determine only {what} of {_listed(list(lost))}: "
-            f"fix one of {', '.join(lost)}, give it a prior{remedy}."
-        )
-    elif null and not dead:
-        said.append("The data do not determine what was asked.")
-    if not null:
-        resting = _mixed(data_null, names, ())
-        if resting:
-            combos = _combinations(data_null, covariance, unknowns)
-            with_prior = [u.name for u in unknowns if u.prior > 0 and u.name in resting]
-            what = _listed([c.name for c in combos]) if combos else "less than was asked"
-            owners = f"the prior of {_listed(with_prior)}" if with_prior else "the priors"
-            said.append(
-                f"The data alone determine only {what}; {_listed(list(resting))} rest on {owners}."
-            )
-        else:
-            said.append(f"The data determine {_listed(list(names))}.")
-    told = set(lost) | (set(_mixed(data_null, names, ())) if not null else set())
-    if not null and condition > ILL_CONDITIONED and not data_null:
-        words, weak = _weakest(covariance, unknowns)
-        told |= weak
-        said.append(f"They are hardly separated (condition number {condition:.1e}): {words}")
-    for pair in pairs:
-        if {pair.first, pair.second} <= told:
-            continue
-        said.append(
-            f"{pair.first} and {pair.second} can hardly be told apart (correlation "
-            f"{pair.correlation:+.5f}): fix one of them or give it a prior."
-        )
-    return tuple(said)
-
-
-def _mixed(
-    null: list[np.ndarray], names: tuple[str, ...], dead: tuple[str, ...]
-) -> tuple[str, ...]:
-    """The parameters that take part in a direction with others."""
-    return tuple(
-        n
-        for i, n in enumerate(names)
-        if n not in dead and any(abs(v[i]) > _TAKES_PART for v in null)
-    )
-
-
-def _weakest(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, set[str]]:
-    """The least determined direction in words, and who takes part in it."""
+def _weakest(
+    covariance: np.ndarray, condition: float, unknowns: tuple[Unknown, ...]
+) -> words.Weakest:
+    """The least determined direction, and what is determined far better."""
     _, vectors = np.linalg.eigh(covariance)
     direction = _unit(vectors[:, -1])
-    parts = {u.name: v for u, v in zip(unknowns, direction, strict=True) if abs(v) > _TAKES_PART}
-    words = ", ".join(f"{n} {v:+.2f}" for n, v in parts.items())
-    combos = _combinations([direction], covariance, unknowns)
-    better = _listed([c.name for c in combos]) if combos else "their combinations"
-    return (
-        f"the weakest direction is ({words}) in log coordinates, and {better} "
-        f"{'is' if len(combos) == 1 else 'are'} determined far better than "
-        f"{_listed(list(parts))}; fix one of them or give it a prior.",
-        set(parts),
-    )
+    parts = {
+        u.name: float(v) for u, v in zip(unknowns, direction, strict=True) if abs(v) > _TAKES_PART
+    }
+    return words.Weakest(parts, _combinations([direction], covariance, unknowns), condition)

@@ -1,12 +1,15 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.identification import coordinates
 from heli_jax.identification.evaluation import Evaluation
-from heli_jax.identification.identifiability import NULL, Unknown, Verdict, judge, projected
+from heli_jax.identification.identifiability import NULL, Held, Unknown, Verdict, judge, projected
 from heli_jax.identification.layout import Layout
+from heli_jax.identification.nuisances import can_be_off, weak_unknowns
 from heli_jax.identification.problem import Problem
 
 
@@ -68,44 +71,94 @@ def references_of(problem: Problem, layout: Layout, unknowns: tuple[Unknown, ...
     return np.array(out)
 
 
-def _split(
-    problem: Problem, layout: Layout, e: Evaluation, unknowns: tuple[Unknown, ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Data rows of the Jacobian: named unknowns in relative coordinates, and the nuisances."""
+class _Rows(NamedTuple):
+    """The Jacobian without the priors of the parameters, taken apart."""
+
+    sensitivity: np.ndarray
+    """(n, q) of the rows of data, named unknowns in relative coordinates"""
+    nuisances: np.ndarray
+    """(n, k) of the same rows, all other unknowns"""
+    weak: np.ndarray
+    """(w, k) the weak priors' rows, which only nuisances have"""
+
+
+def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> _Rows:
     J = np.asarray(e.J, dtype=np.float64)
     q, p = len(layout.named), len(layout.free)
-    weak = layout.size - layout.weak
-    data_rows = np.r_[0 : J.shape[0] - p - weak, J.shape[0] - weak : J.shape[0]]
-    references = references_of(problem, layout, unknowns)
+    count = layout.size - layout.weak
+    # Last come the weak priors (all that stands in z from `layout.weak` on), before them the
+    # parameters' own; the jumps between windows count as data.
+    data = J[: J.shape[0] - count - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)
     # A parameter of negative sign falls as its logarithm rises; the size is what counts.
-    sensitivity = J[data_rows][:, :q] * np.abs(factor) * np.sign(slopes) * _signs(unknowns)
-    nuisances = J[data_rows][:, q:]
-    # A nuisance without effect, such as the memory of a disturbance that is not there, has no
-    # direction to be projected out.
-    return sensitivity, nuisances[:, np.linalg.norm(nuisances, axis=0) > 1e-6]
+    sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * signs
+    return _Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
+
+
+_NO_EFFECT = 1e-6
+"""A nuisance whose whole effect is below this part of the noise, such as the memory of a
+disturbance that is not there, has no direction to be projected out."""
+
+
+def _held(problem: Problem, layout: Layout, rows: _Rows, smallest: float) -> tuple[Any, Held]:
+    """The sensitivity with the weak priors, and what is left of it without them.
+
+    Args:
+        smallest: part of the largest singular value below which a direction of the nuisances has
+            no effect.
+    """
+    q = rows.sensitivity.shape[1]
+    # All further work is on the triangle, which holds what the data say.
+    R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
+    S, N = R[:, :q], R[:, q:]
+    seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
+    with_weak = np.vstack([S, np.zeros((rows.weak.shape[0], q))])
+    all_nuisances = np.vstack([N, rows.weak])
+    # What neither the data nor a prior of its own sees is no unknown.
+    shown = np.linalg.norm(all_nuisances, axis=0) > _NO_EFFECT
+    sensitivity = projected(with_weak, all_nuisances[:, shown])
+    named = weak_unknowns(problem, layout)
+    kinds = np.array([""] * (N.shape[1] - len(named)) + [one.kind for one in named])
+    off = {
+        f"nuisance.{kind}": projected(S, N[:, seen & (kinds != kind)], smallest)
+        for kind in dict.fromkeys(one.kind for one in named)
+        if can_be_off(problem, kind)
+    }
+    weak = kinds != ""
+    moves = -np.linalg.lstsq(N[:, seen], S, rcond=smallest)[0]
+    compensation = np.zeros((N.shape[1], q))
+    compensation[seen] = moves
+    held = Held(
+        projected(S, N[:, seen], smallest),
+        compensation[weak],
+        tuple(one.words for one in named),
+        tuple(one.label for one in named),
+        off,
+    )
+    return sensitivity, held
 
 
 def _signs(unknowns: tuple[Unknown, ...]) -> np.ndarray:
     return np.array([np.sign(u.value) or 1.0 if u.logarithmic else 1.0 for u in unknowns])
 
 
-def _remedy(problem: Problem) -> str:
-    added = [
-        f"{n}_added" for n in problem.free if f"{n}_added" in naming.names(problem.model.Params)
-    ]
-    return ", or add a run with a known inertia" if added else ""
+def _remedies(problem: Problem) -> dict[str, str]:
+    """By parameter, what determines it beside a known value or a prior."""
+    known = naming.names(problem.model.Params)
+    return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
 
 
 def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
+    """What the data determine at one point."""
     if not bool(np.all(np.isfinite(e.J))):
         raise ValueError(
             "the simulation is not finite at the given values: the model is unstable there over "
             "the length of this record; start elsewhere or use a shorter window"
         )
     unknowns = unknowns_of(problem, layout, e)
-    sensitivity, nuisances = _split(problem, layout, e, unknowns)
+    rows = _split(layout, e, references_of(problem, layout, unknowns), _signs(unknowns))
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
-    return judge(projected(sensitivity, nuisances), unknowns, _remedy(problem), null_below)
+    sensitivity, held = _held(problem, layout, rows, null_below)
+    return judge(sensitivity, unknowns, _remedies(problem), null_below, held)

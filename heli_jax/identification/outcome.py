@@ -19,7 +19,6 @@ from heli_jax.identification.estimates import (
     estimates_of,
     extreme_noise_notes,
     flight_nuisances,
-    labels,
     stated_noise_notes,
 )
 from heli_jax.identification.evaluation import Evaluation, evaluate
@@ -35,6 +34,7 @@ from heli_jax.identification.noise import (
     log_likelihood,
     noise_unknowns,
 )
+from heli_jax.identification.nuisances import labels
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status

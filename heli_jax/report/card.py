@@ -111,7 +111,7 @@ def _of_parameter(name: str, one: Estimate) -> list[Gate]:
         ),
         _most("insensitivity", name, share(one.sd_alone), "%", INSENSITIVITY, remark),
     ]
-    if one.prior_share > 0.005:
+    if one.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
         said = "how much of what is known came from the prior"
         lines.append(Gate("prior share", name, 100 * one.prior_share, "%", "", None, said))
     return lines

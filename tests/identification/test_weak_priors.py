@@ -1,0 +1,177 @@
+"""What only the weak priors of initial states and biases hold up, the data do not determine.
+
+The oracle is a recurrence in NumPy, differentiated by finite differences.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, models
+from heli_jax.identification.identifiability import Held, Unknown, judge, projected
+from tests.identification.bench import BENCH, record, vehicle
+
+DT, N, SD = 0.05, 200, 0.02
+TRUTH = {"Lp": -2.0, "Ld": 5.0, "L0": 0.0}
+
+
+class Params(NamedTuple):
+    Lp: float
+    Ld: float
+    L0: float = 0.0
+
+
+class State(NamedTuple):
+    p: float
+    unseen: float
+
+
+class Inputs(NamedTuple):
+    d: float
+
+
+class Outputs(NamedTuple):
+    p: float
+
+
+def field(params, s, u):
+    return State(p=params.Lp * s.p + params.Ld * u.d + params.L0, unseen=s.p - s.unseen)
+
+
+roll_rate = Model("own", field, lambda p, s, u: Outputs(p=s.p), Params, State, Inputs, Outputs)
+
+
+def by_recurrence(values, d):
+    """p (N,) from rest in steps of DT, exact for a held input; then a bias."""
+    Lp, Ld, L0, begin, bias = values
+    decay, p = np.exp(Lp * DT), [begin]
+    for one in d[:-1]:
+        p.append(decay * p[-1] + (Ld * one + L0) * (decay - 1.0) / Lp)
+    return np.array(p) + bias
+
+
+def made(seed):
+    rng = np.random.default_rng(seed)
+    d = np.repeat(rng.uniform(-1.0, 1.0, N // 8), 8)
+    p = by_recurrence([*TRUTH.values(), 0.0, 0.0], d) + SD * rng.standard_normal(N)
+    return Flight(dt=DT, inputs={"d": d}, outputs={"p": p}, sd={"p": SD})
+
+
+def problem(L0, nuisance=Nuisance(), flights=1, **how):
+    free = {"Lp": Free(-1.5, -10.0, -0.1), "Ld": Free(3.0, 0.1, 50.0), "L0": L0}
+    many = [made(seed) for seed in range(flights)]
+    return Problem(roll_rate, Params(-1.5, 3.0), many, free, nuisance, **how)
+
+
+BOUNDED = Free(0.1, -5.0, 5.0)
+
+
+def oracle(estimates, columns):
+    """Standard deviations of Lp, Ld, L0 with the unknowns at `columns` of the recurrence."""
+    d = made(0).inputs["d"]
+    at = np.array([*(estimates[n].value for n in TRUTH), 0.0, 0.0])
+    J = np.stack(
+        [
+            (by_recurrence(at + h, d) - by_recurrence(at - h, d)) / 2e-5
+            for h in 1e-5 * np.eye(5)[columns]
+        ],
+        axis=1,
+    )
+    return J, np.sqrt(np.diag(np.linalg.pinv(J.T @ J, rcond=1e-12))) * SD
+
+
+def test_a_constant_term_is_exchangeable_with_bias_and_initial_state():
+    found = fit(problem(BOUNDED))
+    J, sd = oracle(found.estimates, [0, 1, 2, 3, 4])
+    assert np.linalg.matrix_rank(J, tol=1e-6 * np.linalg.norm(J)) == 4
+    assert found.status == "not-identifiable"
+    v = found.verdict
+    assert (v.rank, v.rank_without_priors) == (2, 2)
+    assert v.undetermined == ("L0",)
+    assert v.prior_share["L0"] == 1.0
+    assert found.estimates["L0"].sd is None
+    assert v.exchangeable == ("flight 1/initial p", "flight 1/bias p")
+    assert "L0, the initial p and the bias of p are exchangeable" in v.text
+    assert "switch off nuisance.initial_state or nuisance.bias, fix L0, or give it a prior" in (
+        v.text
+    )
+    assert "The data determine Lp and Ld." in v.text
+    for name, wanted in zip(("Lp", "Ld"), sd, strict=False):
+        assert found.estimates[name].sd == pytest.approx(wanted, rel=0.15)  # of the residual's sd
+        assert found.estimates[name].prior_share < 1e-6
+
+
+@pytest.mark.parametrize("off", ["bias", "initial_state"])
+def test_without_one_of_the_two_it_is_determined(off):
+    found = fit(problem(BOUNDED, Nuisance(**{off: False})))
+    assert found.status == "converged"
+    assert found.verdict.rank_without_priors == 3
+    _, sd = oracle(found.estimates, [0, 1, 2, 3 if off == "bias" else 4])
+    assert found.estimates["L0"].sd == pytest.approx(sd[2], rel=0.15)
+    assert found.estimates["L0"].prior_share < 1e-4
+
+
+def test_a_prior_determines_it_and_is_said_to():
+    verdict = check(problem(BOUNDED._replace(prior=Prior(0.0, 0.1)))).verdict
+    assert verdict.identifiable
+    assert verdict.rank_without_priors == 2
+    assert verdict.resting == ("L0",)
+    assert verdict.prior_share["L0"] > 0.99
+    assert "rests on the prior of L0" in verdict.text
+
+
+def test_two_flights_have_a_bias_and_a_start_each():
+    verdict = check(problem(BOUNDED, flights=2)).verdict
+    assert not verdict.identifiable
+    assert len(verdict.exchangeable) == 4
+    assert verdict.text.count("the bias of p") == 1
+
+
+def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
+    how = {"window": 2.0, "flights": 1}
+    verdict = check(problem(BOUNDED, Nuisance(bias=False), continuity=0.01, **how)).verdict
+    assert verdict.identifiable
+    verdict = check(problem(BOUNDED, **how)).verdict
+    assert verdict.undetermined == ("L0",)
+    assert "switch off nuisance.bias, fix L0" in verdict.text
+
+
+def test_what_no_output_shows_does_no_harm():
+    """The free roll of the paper: bias and initial angle are one; on the stand they are two."""
+    for model, stand in ((models.roll, False), (models.roll_on_stand, True)):
+        flight = record(BENCH, seed=3, n=300, stand=stand)
+        free = {"Ixx": Free(0.03), "If": Free(2e-4)}
+        verdict = check(Problem(model, vehicle(BENCH), [flight], free)).verdict
+        assert verdict.identifiable
+        assert verdict.rank_without_priors == 2
+        assert max(verdict.prior_share.values()) < 0.05
+
+
+def test_dependent_nuisances_are_projected_out_in_either_precision():
+    rng = np.random.default_rng(0)
+    N, S = rng.standard_normal((60, 3)), rng.standard_normal((60, 2))
+    # Of very different sizes, one twice, one combination of others, and one without effect.
+    sizes = np.diag([1e6, 1.0, 1e-3])
+    nuisances = np.hstack([N @ sizes, N[:, :1], N[:, 1:2] - N[:, 2:], np.zeros((60, 1))])
+    Q, _ = np.linalg.qr(N)
+    wanted = np.linalg.svd(S - Q @ (Q.T @ S), compute_uv=False)
+    for dtype, smallest in ((np.float64, 1e-8), (np.float32, 1.2e-5)):
+        rounded = nuisances.astype(dtype).astype(np.float64)
+        found = np.linalg.svd(projected(S, rounded, smallest), compute_uv=False)[:2]
+        np.testing.assert_allclose(found, wanted, rtol=1e-4)
+        # What the nuisances can do is gone altogether.
+        within = (N @ rng.standard_normal((3, 2))).astype(dtype).astype(np.float64)
+        assert np.linalg.norm(projected(within, rounded, smallest)) < smallest * np.linalg.norm(
+            within
+        )
+
+
+def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
+    offset = Unknown("L0", 0.1, False, 1.0, 0.0)
+    for hold, identifiable in ((20.0, False), (2.0, True)):
+        bare = np.array([[0.5]])
+        held = Held(bare, np.array([[1.0]]), ("the bias of p",), ("flight 1/bias p",), {})
+        verdict = judge(hold * bare, (offset,), held=held)
+        assert verdict.identifiable is identifiable
+        assert verdict.prior_share["L0"] == pytest.approx(1.0 if hold > 10 else 0.75)
