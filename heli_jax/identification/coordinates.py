@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from heli_jax.identification.problem import Free
 
 KINDS = ("log", "linear", "above", "below", "logit-log", "logit")
-"""log: x = sign e^z. linear: x = scale z. above, below: a bound on one side. logit-log: between two bounds of one
-sign, uniform in log x. logit: between any two bounds."""
+"""log: x = sign e^z. linear: x = scale z. above, below: a bound on one side. logit-log: between two
+bounds of one sign, uniform in log x. logit: between any two bounds."""
 
 
 def kind(free: Free) -> str:

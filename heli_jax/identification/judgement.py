@@ -12,7 +12,6 @@ from heli_jax.identification.layout import Layout
 from heli_jax.identification.nuisances import can_be_off, weak_unknowns
 from heli_jax.identification.problem import Problem
 
-
 _NEAR_ZERO = 1e-2
 """part of a parameter's size below which it takes no part in products of powers"""
 
