@@ -364,7 +364,8 @@ def _terms(layout: Layout, z0: Array, units: _Scaling) -> _Terms:
     # The unknowns whose steps say whether the optimiser has arrived.
     watched = (at < len(layout.named)) | (at >= layout.weak)
     ties = jnp.asarray(anchor, z0.dtype)
-    linear = np.array([how == "linear" for how in layout.kinds])
+    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
+    linear = np.array([how == "linear" for how in layout.kinds] + [True] * len(layout.gains))
     if linear.any():
         linear = np.concatenate([linear, np.zeros(layout.size - linear.size, bool)])
         usable = units.unit > 0
