@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.model import correlation_of, spread_of
+from heli_jax.identification.coloured import drawn
 from heli_jax.identification.layout import Data, Reached, unpack, value_of
 from heli_jax.identification.optimise import optimise_many
 from heli_jax.identification.residual import driven, predict
@@ -35,7 +36,8 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     """Refit `runs` records made with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are coloured, noise with their spectrum (random phases). Means of priors are drawn anew too.
+    are autocorrelated, noise with their covariance over time and between outputs. Means of priors
+    are drawn anew too.
 
     Raises:
         ValueError: the time shift is free, or the data do not determine every parameter.
@@ -82,12 +84,15 @@ def _records(
             moved = _disturbed(at, u, i, keys)
         else:
             moved = dict(zip(at.layout.outputs[i], clean[i].outputs, strict=True))
+        if fit.coloured:
+            residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
+            coloured = drawn(np.stack(residuals), runs, rng)
         one = {}
         for n, y in flight.outputs.items():
             sd = float(sds[n]) * float(u.scales.get(n, 1.0))
             noise = sd * rng.standard_normal((runs, y.shape[0]))
             if fit.coloured:
-                noise = _like(fit.signals[i].residual(n), runs, rng)
+                noise = coloured[:, at.layout.outputs[i].index(n)]
             made = np.asarray(moved[n]) + float(u.biases[i][n]) + noise
             one[n] = jnp.asarray(np.where(np.isnan(np.asarray(y)), np.nan, made), at.z.dtype)
         records.append(one)
@@ -124,11 +129,3 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
         ).outputs
 
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
-
-
-def _like(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarray:
-    """Noise (runs, N) with the spectrum of the residual (N,): random phases (Theiler, 1992)."""
-    r = np.where(np.isnan(residual), 0.0, residual - np.nanmean(residual))
-    spectrum = np.abs(np.fft.rfft(r))
-    phases = np.exp(2j * np.pi * rng.uniform(size=(runs, spectrum.size)))
-    return np.fft.irfft(spectrum * phases, r.size, axis=1)

@@ -24,10 +24,11 @@ def estimates_of(
     layout: Layout,
     e: Evaluation,
     verdict: Verdict,
-    quantile: float,
+    quantiles: np.ndarray,
     wider: np.ndarray,
 ) -> dict[str, Estimate]:
-    """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns."""
+    """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns, and
+    their intervals reach `quantiles` (q,) deviations to either side."""
     unknowns = unknowns_of(problem, layout, e)
     references = references_of(problem, layout, unknowns)
     norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
@@ -40,7 +41,7 @@ def estimates_of(
         free = problem.free.get(u.name)
         white = float(np.sqrt(verdict.covariance[i, i]))
         relative = white * float(wider[i])
-        sd, low, high = _interval95(u, relative, references[i], quantile)
+        sd, low, high = _interval95(u, relative, references[i], float(quantiles[i]))
         lost = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
         out[u.name] = Estimate(
@@ -156,7 +157,7 @@ def flight_nuisances(
     data: Data,
     z: Array,
     e: Evaluation,
-    quantile: float,
+    quantiles: np.ndarray,
     wider: np.ndarray,
 ) -> dict[str, Estimate]:
     """The disturbance, then initial states, biases and input offsets with their weak priors."""
@@ -169,7 +170,7 @@ def flight_nuisances(
     disturbance = unpack(layout, data, z).noise
     for i, name in enumerate(layout.noise):
         value, relative = float(disturbance[name]), float(sds[q + i])
-        reach = float(np.exp(min(quantile * relative, 700.0)))
+        reach = float(np.exp(min(float(quantiles[q + i]) * relative, 700.0)))
         unit = naming.unit(layout.model.Params, name) or ""
         limits = (value / reach, value * reach)
         said = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
@@ -199,7 +200,8 @@ def flight_nuisances(
         for name, scale, unit in parts:
             value, sd = float(z[at] * scale), float(sds[at] * scale)
             share = min(1.0, float(whites[at]) ** 2)
-            limits = (value - quantile * sd, value + quantile * sd)
+            reach = float(quantiles[at]) * sd
+            limits = (value - reach, value + reach)
             out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
             at += 1
     return out

@@ -152,6 +152,7 @@ def judge(
     remedies: Mapping[str, str] | None = None,
     null_below: float = NULL,
     held: Held | None = None,
+    reported: np.ndarray | None = None,
 ) -> Verdict:
     """The verdict from a whitened sensitivity (any rows, q) in relative coordinates.
 
@@ -162,6 +163,9 @@ def judge(
             with a known inertia.
         null_below: the part of the largest singular value that counts as zero.
         held: the same without the weak priors, which count as data where it is not given.
+        reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
+            where it is not that of white residuals: these must not reach further than the factor
+            either.
     """
     names = tuple(u.name for u in unknowns)
     scale = np.array([u.scale for u in unknowns])
@@ -178,6 +182,8 @@ def judge(
         covariance = _covariance(with_weak, with_weak.singular > 0, scale)
         null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
         null = null or _weakly_held(without_weak, covariance, unknowns)
+    if not null and reported is not None:
+        null = _reported_too_wide(reported, unknowns)
     data_kept = data.singular > null_below * max(data.singular[0], 1e-300)
     of_data = _covariance(data, data_kept, scale)
     data_null = []
@@ -374,6 +380,16 @@ def _too_wide(
     plain = _directions(total, np.ones(len(unknowns)))
     weak = [_unit(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * limit < 1]
     return weak or [_unit(plain.right[-1])]
+
+
+def _reported_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
+    """As `_too_wide` has them, by the covariance of the intervals that are reported."""
+    limit = math.log(FACTOR) / Z95
+    sized = [u.logarithmic or u.symmetric for u in unknowns]
+    if not any(s and covariance[i, i] > limit**2 for i, s in enumerate(sized)):
+        return []
+    values, vectors = np.linalg.eigh(covariance)
+    return [_unit(v) for v in vectors[:, values > limit**2].T] or [_unit(vectors[:, -1])]
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:

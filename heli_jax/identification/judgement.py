@@ -148,8 +148,18 @@ def _remedies(problem: Problem) -> dict[str, str]:
     return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
 
 
-def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
-    """What the data determine at one point."""
+def verdict_of(
+    problem: Problem, layout: Layout, e: Evaluation, reported: np.ndarray | None = None
+) -> Verdict:
+    """What the data determine at one point.
+
+    Args:
+        reported: covariance (k, k) of the named unknowns, in the optimiser's coordinates, that the
+            reported intervals have where it is not that of white residuals.
+
+    Raises:
+        ValueError: the simulation is not finite there.
+    """
     if not bool(np.all(np.isfinite(e.J))):
         raise ValueError(
             "the simulation is not finite at the given values: the model is unstable there over "
@@ -160,4 +170,9 @@ def verdict_of(problem: Problem, layout: Layout, e: Evaluation) -> Verdict:
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     sensitivity, held = _held(problem, layout, rows, null_below)
-    return judge(sensitivity, unknowns, _remedies(problem), null_below, held)
+    relative = None
+    if reported is not None:
+        slopes = np.asarray(e.slopes, np.float64)
+        to_relative = slopes / references_of(problem, layout, unknowns) * _signs(unknowns)
+        relative = reported * np.outer(to_relative, to_relative)
+    return judge(sensitivity, unknowns, _remedies(problem), null_below, held, relative)

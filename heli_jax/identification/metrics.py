@@ -62,7 +62,7 @@ class Whiteness(NamedTuple):
     outside: float
     """share of the lags outside the 99 % band"""
     lag1: float
-    """autocorrelation at one sample"""
+    """autocorrelation at one sample, or at the shortest lag of which enough pairs are seen"""
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
@@ -102,20 +102,40 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
     (Bonferroni), so that one in a hundred white records fails, not one in a hundred signals.
     """
     n = int(np.count_nonzero(~np.isnan(residual)))
-    lags = lags_for(n)
-    r = autocorrelation(residual, lags)[1:]
-    statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, lags + 1)))
+    r, pairs, whole = _seen_autocorrelation(residual)
+    lags = r.size
+    # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
+    q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
     # Few lags see a short memory that many lags would drown; both must agree with white noise.
     short = min(lags, 20)
-    q_short = n * (n + 2) * np.sum(r[:short] ** 2 / (n - np.arange(1, short + 1)))
     p = min(
         1.0,
         2.0
         * together
-        * min(scipy.special.chdtrc(lags, statistic), scipy.special.chdtrc(short, q_short)),
+        * min(scipy.special.chdtrc(lags, q[-1]), scipy.special.chdtrc(short, q[short - 1])),
     )
-    outside = float(np.mean(np.abs(r) > 2.5758 / np.sqrt(n)))
-    return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0]))
+    outside = float(np.mean(np.abs(r) * whole > 2.5758 * np.sqrt(whole / pairs)))
+    return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
+
+
+def _seen_autocorrelation(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Autocorrelation over the pairs of samples that are seen, the number of these, and the part of
+    the record that a lag leaves, each (lags,), at the shortest lags at which enough are seen; at
+    all of them where nothing is missing."""
+    seen = ~np.isnan(residual)
+    r = _centred(residual)
+    n, count = r.size, int(seen.sum())
+    size = 1 << (2 * n - 1).bit_length()
+
+    def products(x: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)
+
+    pairs, c = np.round(products(seen.astype(float))), products(r)
+    at = np.arange(1, max(n // 4, 1) + 1)
+    at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
+    if at.size == 0 or not c[0] > 0:
+        return np.zeros(1), np.ones(1), np.ones(1)
+    return c[at] / c[0] * count / pairs[at], pairs[at], 1.0 - at / n
 
 
 def noise_guess(signal: np.ndarray) -> float:

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import excitation
-from heli_jax.identification.coloured import inflation
+from heli_jax.identification.coloured import Sandwich, residual_curvature, sandwich
 from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import (
     bound_notes,
@@ -22,7 +22,7 @@ from heli_jax.identification.estimates import (
     stated_noise_notes,
 )
 from heli_jax.identification.evaluation import Evaluation, evaluate
-from heli_jax.identification.identifiability import Verdict
+from heli_jax.identification.identifiability import Z95, Verdict
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
 from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
@@ -74,15 +74,17 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
     coloured = usable and not layout.filtered and not all(w.white for w in white.values())
-    wider = np.ones(layout.size)
+    wider, quantiles = np.ones(layout.size), np.full(layout.size, quantile)
     if coloured:
-        both = np.vstack([np.eye(layout.size), _along(verdict, layout, e)])
-        wider, of_combinations = np.split(inflation(layout, data, e, both), [layout.size])
-        verdict = _widened(verdict, of_combinations)
-    named = estimates_of(problem, layout, e, verdict, quantile, wider)
+        curvature = residual_curvature(layout, data, noise, best.z)
+        errors = sandwich(layout, data, e, curvature)
+        wider, quantiles = errors.inflation(), np.maximum(errors.quantile(), quantile)
+        verdict = verdict_of(problem, layout, e, _reported(errors, layout, e, quantiles))
+        verdict = _widened(verdict, errors, _along(verdict, layout, e))
+    named = estimates_of(problem, layout, e, verdict, quantiles, wider)
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
-    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantile, wider)
+    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantiles, wider)
     none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
     if none:
         nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
@@ -146,15 +148,28 @@ def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
     return along
 
 
-def _widened(verdict: Verdict, wider: np.ndarray) -> Verdict:
-    """The verdict with intervals of its combinations (k,) that many times as wide."""
+def _reported(errors: Sandwich, layout: Layout, e: Evaluation, quantiles: np.ndarray) -> np.ndarray:
+    """Covariance (k, k) of the named unknowns with autocorrelated residuals, as wide as the
+    intervals that are reported."""
+    named = np.eye(layout.size)[: len(layout.named)]
+    factor = quantiles[: len(layout.named)] / Z95
+    return errors.covariance(named) * np.outer(factor, factor)
+
+
+def _widened(verdict: Verdict, errors: Sandwich, along: np.ndarray) -> Verdict:
+    """The verdict with intervals of its combinations, directions (k, q), that allow for
+    autocorrelated residuals."""
+    if not verdict.combinations:
+        return verdict
+    wider = errors.inflation(along)
+    reach = wider * errors.quantile(along) / Z95
     combinations = tuple(
         c._replace(
             sd=float(c.sd * w),
-            lower95=float(c.value * (c.lower95 / c.value) ** w),
-            upper95=float(c.value * (c.upper95 / c.value) ** w),
+            lower95=float(c.value * (c.lower95 / c.value) ** r),
+            upper95=float(c.value * (c.upper95 / c.value) ** r),
         )
-        for c, w in zip(verdict.combinations, wider, strict=True)
+        for c, w, r in zip(verdict.combinations, wider, reach, strict=True)
     )
     return replace(verdict, combinations=combinations)
 

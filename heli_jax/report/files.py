@@ -114,7 +114,7 @@ def whiteness_note(fit: Fit) -> str:
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
-            "residuals' memory (Bartlett window). They are honest about a poor estimate: "
+            "residuals' autocorrelation. They are honest about a poor estimate: "
             "filter-error makes a better one."
         )
     else:

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import scipy.signal
+import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,3 +43,35 @@ def test_missing_samples_are_left_out():
     smooth = np.sin(0.01 * np.arange(5000)) + 0.01 * np.nan_to_num(noise)
     smooth[::7] = np.nan
     assert noise_guess(smooth) == pytest.approx(0.01, rel=0.2)
+
+
+@pytest.mark.parametrize("missing", ["every second", "a random half", "a gap"])
+def test_whiteness_is_judged_on_the_pairs_that_are_seen(missing):
+    """White noise fails about one time in a hundred, a memory is seen; neither half as often."""
+    n, alarms, found = 2000, 0, 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        gone = {
+            "every second": np.arange(n) % 2 == 1,
+            "a random half": rng.uniform(size=n) < 0.5,
+            "a gap": np.abs(np.arange(n) - n / 2) < n / 4,
+        }[missing]
+        noise = rng.standard_normal(n)
+        alarms += not whiteness(np.where(gone, np.nan, noise)).white
+        # AR(0.6): 0.36 at two samples, which every second still shows.
+        slow = scipy.signal.lfilter([1.0], [1.0, -0.6], noise)
+        found += not whiteness(np.where(gone, np.nan, slow)).white
+    assert alarms <= 9
+    assert found >= 190
+
+
+def test_a_whole_record_is_judged_as_by_ljung_and_box():
+    noise = np.random.default_rng(3).standard_normal(400)
+    centred = noise - noise.mean()
+    r = np.array([centred[k:] @ centred[:-k] for k in range(1, 101)]) / (centred @ centred)
+    q = 400 * 402 * np.cumsum(r**2 / (400 - np.arange(1, 101)))
+    wanted = 2 * min(scipy.stats.chi2.sf(q[99], 100), scipy.stats.chi2.sf(q[19], 20))
+    found = whiteness(noise)
+    assert found.p_value == pytest.approx(min(1.0, wanted), rel=1e-9)
+    assert found.lag1 == pytest.approx(r[0], rel=1e-9)
+    assert found.outside == np.mean(np.abs(r) > 2.5758 / np.sqrt(400))
