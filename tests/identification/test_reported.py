@@ -1,0 +1,80 @@
+"""What is said of autocorrelated residuals goes by the intervals that are reported."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Problem, fit, models
+from heli_jax.identification.coloured import residual_curvature
+from heli_jax.identification.identifiability import FACTOR, Z95, Unknown, judge
+from heli_jax.identification.optimise import slopes
+from tests.identification.bench import BENCH, response, steps, vehicle
+
+N, DT = 600, 0.02
+
+
+@pytest.fixture(scope="module")
+def found():
+    """12 s of the bench with a slow oscillation that is larger than its response."""
+    rng = np.random.default_rng(0)
+    u = steps(rng, N, DT, 3e-6)
+    root = 0.995 * np.exp(0.04j)
+    slow = np.poly([root, root.conj()]).real
+    noise = scipy.signal.lfilter([1.0], slow, rng.standard_normal(N + 2000))[2000:]
+    y = response(BENCH, u, DT, True) + 0.3 * noise / noise.std()
+    y += 2e-3 * rng.standard_normal(N)
+    free = {"Ixx": Free(0.03), "If": Free(2e-4), "kappa": Free(3.0)}
+    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
+    return fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free))
+
+
+def test_the_factor_of_ten_rule_sees_the_interval_that_is_reported(found):
+    assert found.coloured
+    by_white = np.sqrt(found.verdict.covariance[0, 0])
+    assert np.exp(Z95 * by_white) < FACTOR
+    assert found.status == "not-identifiable"
+    assert "Ixx" in found.verdict.undetermined
+    assert found.estimates["Ixx"].sd is None
+    assert found.estimates["Ixx"].lower95 is None
+    # No determined parameter has an interval that breaks the rule.
+    for e in found.estimates.values():
+        if e.lower95 is not None:
+            assert e.upper95 / e.value < FACTOR
+            assert e.value / e.lower95 < FACTOR
+    # Their product is known, and its interval allows for the residuals too.
+    assert found.verdict.combinations
+
+
+def test_reported_intervals_enter_the_verdict():
+    unknowns = tuple(Unknown(n, 1.0, True, 1.0, 0.0) for n in ("p", "q"))
+    limit = np.log(FACTOR) / Z95
+    sensitivity = np.diag([10.0, 10.0])
+    assert judge(sensitivity, unknowns).identifiable
+    inside, outside = np.diag([0.01, 0.9 * limit**2]), np.diag([0.01, 1.1 * limit**2])
+    assert judge(sensitivity, unknowns, reported=inside).identifiable
+    wide = judge(sensitivity, unknowns, reported=outside)
+    assert not wide.identifiable
+    assert wide.undetermined == ("q",)
+    # A parameter that may be zero has no factor.
+    scaled = (unknowns[0], unknowns[1]._replace(logarithmic=False))
+    assert judge(sensitivity, scaled, reported=outside).identifiable
+
+
+def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
+    """Second differences of r'r/2, which never see J."""
+    at = found.reached
+
+    def cost(i, j, a, b):
+        z = at.z.at[i].add(a).at[j].add(b)
+        return 0.5 * float(np.sum(np.square(slopes(at.layout, at.data, at.noise, z).r)))
+
+    h = 2e-3
+    J = np.asarray(slopes(at.layout, at.data, at.noise, at.z).J)
+    hessian = J.T @ J + residual_curvature(at.layout, at.data, at.noise, at.z)
+    scale = np.linalg.norm(J, axis=0)
+    for i, j in ((0, 0), (0, 2), (1, 2), (2, 4)):
+        corners = [a * b * cost(i, j, a * h, b * h) for a in (1, -1) for b in (1, -1)]
+        wanted = sum(corners) / (4.0 * h**2)
+        error = (hessian[i, j] - wanted) / (scale[i] * scale[j])
+        assert abs(error) < 1e-3
+    assert np.max(np.abs(hessian - J.T @ J) / np.outer(scale, scale)) > 0.05
