@@ -11,8 +11,8 @@ from heli_jax import naming
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import fit
-from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Status
+from heli_jax.identification.problem import Free, Problem
+from heli_jax.identification.result import Fit, Status
 
 
 class Candidate(NamedTuple):
@@ -100,9 +100,23 @@ def alternatives(
             )
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
-            if ending:
+            if ending and _stand_may_vanish(problem):
                 nested.append((words + ending, words))
     return Alternatives(problems, tuple(nested))
+
+
+def _stand_may_vanish(problem: Problem) -> bool:
+    """Whether a stand without stiffness and damping is among those that are fitted: each of the two
+    is free to go to zero, or zero already."""
+    values = naming.asdict(problem.vehicle)
+    for name in ("kappa", "zeta"):
+        if name in problem.free:
+            lower = problem.free[name].lower
+            if lower is not None and lower > 0:
+                return False
+        elif any(float(f.known.get(name, values[name])) != 0.0 for f in problem.training):
+            return False
+    return True
 
 
 def choose(
@@ -114,26 +128,135 @@ def choose(
 ) -> Choice:
     """Fit every problem and compare; `nested` names pairs (small, large) for a likelihood ratio.
 
-    All must have the same flights. `how` goes to `fit`.
+    All must have the same flights. `how` goes to `fit`. A model that ends below one nested in it is
+    fitted again from there, and a sentence says so.
     """
     tell = progress or (lambda _: None)
-    found: dict[str, Candidate] = {}
+    fits: dict[str, Fit] = {}
     for name, problem in problems.items():
         tell(f"comparing models: {name}")
-        one = fit(problem, **how)
-        values = {n: e.value for n, e in one.estimates.items()}
-        found[name] = Candidate(
-            name, one.status, one.log_likelihood, one.unknowns, one.aic, one.bic, one.white, values
-        )
-    tests = [_test(found[a], found[b]) for a, b in nested if a in found and b in found]
+        fits[name] = fit(problem, **how)
+    pairs = [(a, b) for a, b in nested if a in fits and b in fits]
+    said = _none_below_its_part(problems, pairs, fits, tell, how)
+    found = {name: _candidate(name, one) for name, one in fits.items()}
+    asked = [_test(found[a], found[b]) for a, b in pairs]
+    tests = [t for t in asked if t.degrees > 0]
     ranked = tuple(sorted(found.values(), key=lambda c: (c.status == "not-converged", c.aic)))
-    return Choice(ranked, tuple(tests), tuple(_sentences(ranked, tests)))
+    said += _sentences(ranked, tests)
+    said += [
+        f"{t.small} within {t.large}: the larger one has no unknown more, so there is no test."
+        for t in asked
+        if t.degrees <= 0
+    ]
+    return Choice(ranked, tuple(tests), tuple(said))
+
+
+def _candidate(name: str, one: Fit) -> Candidate:
+    values = {n: e.value for n, e in one.estimates.items()}
+    return Candidate(
+        name, one.status, one.log_likelihood, one.unknowns, one.aic, one.bic, one.white, values
+    )
+
+
+_BELOW = 0.05
+"""log-likelihood by which a model may end below one that is nested in it: the optimiser's rest"""
+_FAR = 10.0
+"""the same for one with the same parameters and another disturbance, which is not nested"""
+
+
+def _none_below_its_part(
+    problems: Mapping[str, Problem],
+    nested: Sequence[tuple[str, str]],
+    fits: dict[str, Fit],
+    tell: Callable[[str], None],
+    how: dict[str, Any],
+) -> list[str]:
+    """Fit again, from the better optimum, what ended below a model that is nested in it, or far
+    below one that has the same parameters; `fits` is changed, and the words are returned."""
+    said = []
+    for (a, b), least in [*((p, _BELOW) for p in nested), *((p, _FAR) for p in _alike(problems))]:
+        before, other = fits[b].log_likelihood, fits[a].log_likelihood
+        if not before < other - least:
+            continue
+        tell(f"comparing models: {b} again, from {a}")
+        try:
+            again = fit(begun_from(problems[b], problems[a], fits[a]), **how)
+        except ValueError:  # the model is unstable there
+            again = fits[b]
+        if again.log_likelihood > before + least:
+            fits[b] = again
+        reached, part = fits[b].log_likelihood, (a, b) in nested
+        where = (
+            f"below {a}, which is nested in it"
+            if part
+            else f"far below {a}, which has the same parameters"
+        )
+        if reached > before:
+            said.append(
+                f"{b} first ended {where} (log-likelihood {before:.1f} for {other:.1f}): begun "
+                f"anew from that optimum it reaches {reached:.1f}."
+            )
+        if part and reached < other - least:
+            said.append(
+                f"{b} ends {where} (log-likelihood {reached:.1f} for {other:.1f}), also when it "
+                "begins there: its own optimum was not found, and its test means nothing."
+            )
+    return said
+
+
+def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
+    """Pairs of models with the same parameters, each with a disturbance of its own."""
+    with_noise = [name for name, problem in problems.items() if problem.noise]
+    return [
+        (a, b)
+        for a in with_noise
+        for b in with_noise
+        if a != b and problems[a].free == problems[b].free
+    ]
+
+
+_ALL_BUT_NOTHING = 1e-3
+"""part of its start at which a parameter begins that the nested model does not have"""
+
+
+def begun_from(problem: Problem, nested: Problem, found: Fit) -> Problem:
+    """The problem with its starts where the fit of another one ended, the disturbance's too.
+
+    A parameter that is fixed there begins at its value there; one that the other model does not
+    have begins all but at zero.
+    """
+    free = {}
+    for name, one in problem.free.items():
+        value = _ALL_BUT_NOTHING * one.start
+        if name in found.estimates:
+            value = found.estimates[name].value
+        elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
+            value = float(getattr(nested.vehicle, name))
+        free[name] = one._replace(start=_inside(one, value))
+    noise = {
+        n: jnp.asarray(found.nuisance[n].value)
+        for n in problem.noise
+        if n in found.nuisance and found.nuisance[n].value > 0
+    }
+    return replace(problem, free=free, vehicle=naming.replace(problem.vehicle, **noise))
+
+
+def _inside(free: Free, value: float) -> float:
+    """The value, or the nearest that is well inside the bounds."""
+    low, high = free.lower, free.upper
+    size = high - low if low is not None and high is not None else abs(value) or abs(free.start)
+    if low is not None:
+        value = max(value, low + 1e-3 * size)
+    if high is not None:
+        value = min(value, high - 1e-3 * size)
+    return value
 
 
 def _test(small: Candidate, large: Candidate) -> Nested:
+    """Without a further unknown there is nothing to test: degrees of 0, and no p-value."""
     ratio = 2.0 * (large.log_likelihood - small.log_likelihood)
-    degrees = max(large.unknowns - small.unknowns, 1)
-    p = float(scipy.special.chdtrc(degrees, max(ratio, 0.0)))
+    degrees = large.unknowns - small.unknowns
+    p = float(scipy.special.chdtrc(degrees, max(ratio, 0.0))) if degrees > 0 else float("nan")
     return Nested(small.name, large.name, ratio, degrees, p)
 
 
