@@ -240,6 +240,10 @@ def _warn_reading(problem: Any) -> None:
     for flight in problem.flights:
         for note in flight.source.notes if flight.source else ():
             _say(f"{flight.source.path}: {note}")
+        for name, why in flight.hold_reason.items():
+            if flight.hold[name] == "linear":
+                where = flight.source.path if flight.source else flight.name
+                _say(f"{where}: {name} is taken as linear between samples, since it {why}")
 
 
 def _check(options: argparse.Namespace) -> int:

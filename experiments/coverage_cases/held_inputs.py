@@ -93,13 +93,17 @@ def aircraft_record(seed: int, hold: str = "linear", noise: float = 1.0) -> Flig
     return Flight(dt=DT, inputs={"de": de}, outputs=measured, hold={"de": hold})
 
 
-def aircraft_fit(seed: int, hold: str = "linear", noise: float = 1.0) -> Fit:
+def aircraft_problem(seed: int, hold: str = "linear", noise: float = 1.0) -> Problem:
     """All derivatives but Zq, which w and q do not tell from the speed, in windows of 2 s: over a
     whole record an unstable aircraft diverges from any error of its initial state."""
     starts = {"Zw": -1.2, "Zde": -5.0, "Mw": 0.2, "Mq": -3.0, "Mde": -11.0}
     free = {n: Free(v) for n, v in starts.items()}
     record = aircraft_record(seed, hold, noise)
-    return fit(Problem(AIRCRAFT, Params(**TRUTH), [record], free, window=2.0))
+    return Problem(AIRCRAFT, Params(**TRUTH), [record], free, window=2.0)
+
+
+def aircraft_fit(seed: int, hold: str = "linear", noise: float = 1.0) -> Fit:
+    return fit(aircraft_problem(seed, hold, noise))
 
 
 def aircraft(seed: int) -> Run:
@@ -144,10 +148,13 @@ def late_record(seed: int, hold: str = "linear") -> Flight:
     return Flight(dt=0.04, inputs={"da": da}, outputs={"p": p}, hold={"da": hold})
 
 
-def late_fit(seed: int, hold: str = "linear") -> Fit:
+def late_problem(record: Flight) -> Problem:
     free = {"Lp": Free(-3.0), "Lda": Free(15.0)}
-    shift = Nuisance(time_shift=True)
-    return fit(Problem(ROLL, RollParams(-4.0, 20.0), [late_record(seed, hold)], free, shift))
+    return Problem(ROLL, RollParams(-4.0, 20.0), [record], free, Nuisance(time_shift=True))
+
+
+def late_fit(seed: int, hold: str = "linear") -> Fit:
+    return fit(late_problem(late_record(seed, hold)))
 
 
 def late(seed: int) -> Run:

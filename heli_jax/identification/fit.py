@@ -10,6 +10,7 @@ from heli_jax.identification import search as starting
 from heli_jax.identification.data import data_of
 from heli_jax.identification.divergent import SAID, by_windows
 from heli_jax.identification.evaluation import Evaluation, evaluate
+from heli_jax.identification.holds import other_hold
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import (
     Data,
@@ -65,6 +66,8 @@ def check(problem: Problem) -> Check:
     verdict = verdict_of(problem, begin.layout, e)
     runs = tuple(s.simulated for s in signals_of(e, problem.training))
     notes = excitation.notes(problem, runs, begin.noise.sd)
+    lost = (*verdict.undetermined, *verdict.without_effect)
+    notes += other_hold(problem, *begin[:4], e, skip=lost)
     scales = unpack(begin.layout, begin.data, begin.z).scales
     return Check(verdict, noise_by_name(problem, begin.layout, begin.noise, scales), tuple(notes))
 

@@ -22,6 +22,7 @@ from heli_jax.identification.estimates import (
     stated_noise_notes,
 )
 from heli_jax.identification.evaluation import Evaluation, evaluate
+from heli_jax.identification.holds import other_hold
 from heli_jax.identification.identifiability import Z95, Verdict
 from heli_jax.identification.judgement import verdict_of
 from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
@@ -104,6 +105,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *_filter_notes(layout, noise, e, n, ill),
         *stated_noise_notes(problem, sds),
         *bound_notes(estimates),
+        *_hold_notes(problem, search, settled, e, named),
         *_useless_notes(_pooled(signals)),
     ]
     return Fit(
@@ -185,6 +187,17 @@ def _absent(name: str, one: Estimate) -> Estimate:
     gone = name == "sigma_w"
     value = 0.0 if gone else one.value
     return one._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
+
+
+def _hold_notes(
+    problem: Problem, search: Search, settled: Settled, e: Evaluation, named: dict[str, Estimate]
+) -> list[str]:
+    """Where the log let inputs be taken as linear between samples, and it matters."""
+    if not bool(settled.best.converged):
+        return []
+    sd = {n: one.sd for n, one in named.items() if one.sd is not None}
+    at = (search.layout, search.data, settled.noise, settled.best.z)
+    return other_hold(problem, *at, e, sd, in_doubt=True)
 
 
 def _useless_notes(pooled: dict[str, Metrics]) -> list[str]:

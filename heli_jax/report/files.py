@@ -68,6 +68,7 @@ def fit_json(
             "timing_s": fit.timing,
             "versions": versions(),
             "data": [_source(f) for f in problem.flights],
+            "inputs": [_holds(f) for f in problem.flights],
             "seed": fit.seed,
         }
     )
@@ -183,6 +184,12 @@ def _baseline(b: Baseline | None) -> dict[str, Any] | None:
         "trusted": b.trusted,
         "sentences": list(b.sentences),
     }
+
+
+def _holds(flight: Flight) -> dict[str, dict[str, str]]:
+    """By input what it is taken to do between samples, and what of the log spoke for it."""
+    reason = flight.hold_reason
+    return {n: {"hold": h, "reason": reason.get(n, "as stated")} for n, h in flight.hold.items()}
 
 
 def _source(flight: Flight) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.choice import Choice
 from heli_jax.identification.fit import Estimate, Fit
@@ -384,12 +385,20 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
         if flight.known:
             known = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
             rows.append(("differs in", known))
+        rows += [(f"{n} between samples", words) for n, words in _holds(flight).items()]
         source = flight.source
         rows.append(("file", source.path if source else "given in memory, no file"))
         if source:
             rows.append(("sha256", source.sha256))
         found.append(Origin(signals.flight, Table(("", ""), rows), source.notes if source else ()))
     return found
+
+
+def _holds(flight: Flight) -> dict[str, str]:
+    """By input what it is taken to do between samples, and why."""
+    return {
+        n: f"{hold} ({flight.hold_reason.get(n, 'as stated')})" for n, hold in flight.hold.items()
+    }
 
 
 def constants(problem: Problem, given: Mapping[str, Constant]) -> Table:

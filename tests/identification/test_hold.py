@@ -1,9 +1,15 @@
 """Fits of records whose input moved between the samples; made by scipy, integrated continuously."""
 
 import importlib
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
+
+from heli_jax import Nuisance, check, fit
 
 
 @pytest.fixture(scope="module")
@@ -29,3 +35,65 @@ def test_a_delay_of_a_part_of_a_sample(held_inputs):
     assert shift.lower95 < 0.017 < shift.upper95
     held = held_inputs.late_fit(0, "zero-order").nuisance["time_shift"]
     assert held.value == pytest.approx(-3e-3, abs=2e-3)
+
+
+def words(notes):
+    return [n for n in notes if n.startswith("Between samples")]
+
+
+def told(note, name):
+    """What a note says of one name, as a number of its unit."""
+    return float(re.search(rf"{name} would be about ([-+.\de]+) ", note).group(1))
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero-order"])
+def test_check_tells_what_the_other_hold_would_change(held_inputs, hold):
+    """As much as the fits of both holds differ by."""
+    record = held_inputs.late_record(0, hold)
+    (note,) = words(check(held_inputs.late_problem(record)).notes)
+    assert f"da is taken as {hold} (as stated)" in note
+    sign = -1 if hold == "linear" else 1
+    assert told(note, "time_shift") == pytest.approx(20.0 * sign, abs=4.0)
+
+
+def test_the_change_told_is_that_between_two_fits(held_inputs):
+    found = held_inputs.aircraft_fit(0, "zero-order", noise=0.3)
+    assert not words(found.notes)  # as stated: nothing is in doubt
+    (note,) = words(check(held_inputs.aircraft_problem(0, "zero-order", 0.3)).notes)
+    other = held_inputs.aircraft_fit(0, "linear", noise=0.3)
+    off = 100 * (other.estimates["Mq"].value / found.estimates["Mq"].value - 1)
+    assert off < -15
+    assert told(note, "Mq") == pytest.approx(off, rel=0.5)
+
+
+def test_a_fit_doubts_only_what_the_log_let_be_linear(held_inputs):
+    record = held_inputs.late_record(0, "linear")
+    decided = replace(record, hold_reason={"da": "moves at 100 % of the samples"})
+    (note,) = words(fit(held_inputs.late_problem(decided)).notes)
+    assert "da is taken as linear (it moves at 100 % of the samples)" in note
+    assert told(note, "time_shift") == pytest.approx(-20.0, abs=4.0)
+
+
+def test_nothing_is_said_where_it_does_not_matter(held_inputs):
+    """A slow stick in much noise: half a sample is nothing."""
+    record = held_inputs.late_record(0, "linear")
+    noise = np.random.default_rng(1).standard_normal(record.n_samples)
+    rough = replace(record, outputs={"p": record.outputs["p"] + 20.0 * noise})
+    problem = replace(held_inputs.late_problem(rough), nuisance=Nuisance())
+    assert not words(check(problem).notes)
+
+
+def test_an_input_that_is_seen_directly(held_inputs):
+    """With feed-through the other hold is a program of its own, and check makes it."""
+    roll = held_inputs.ROLL
+
+    class Seen(NamedTuple):
+        p: float
+        dp: float
+
+    def output(v, s, u):
+        return Seen(p=s.p, dp=v.Lp * s.p + v.Lda * u.da)
+
+    model = replace(roll, output=output, Outputs=Seen)
+    problem = held_inputs.late_problem(held_inputs.late_record(0, "linear"))
+    assert told(words(check(replace(problem, model=model)).notes)[0], "time_shift") < -10
