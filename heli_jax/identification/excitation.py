@@ -7,6 +7,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.linear import modes
+from heli_jax.identification.operating_point import operating_point
 from heli_jax.identification.problem import Problem
 
 _AT_NYQUIST = 0.9
@@ -44,12 +45,20 @@ def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
     found = []
     for flight in problem.training:
         known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-        eigenvalues = modes(problem.model, naming.replace(params, **known))
+        here = naming.replace(params, **known)
+        at = operating_point(
+            problem.model, here, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
+        )
+        try:
+            eigenvalues = modes(problem.model, here, at.state, at.inputs)
+        except np.linalg.LinAlgError:  # no finite matrices there: nothing is known of the modes
+            continue
         fastest = float(np.max(np.abs(np.imag(eigenvalues))))
         nyquist = np.pi / flight.dt
         if fastest >= _AT_NYQUIST * nyquist:
             found.append(
-                f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s lies at or past the "
+                f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s"
+                f"{f' (linearised about {at.words})' if at.words else ''} lies at or past the "
                 f"Nyquist frequency of the sampling ({nyquist:.4g} rad/s): the samples cannot show "
                 "it, and its aliases may be taken for slower dynamics."
             )

@@ -3,13 +3,16 @@
 import math
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
+from heli_jax import naming
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability import ILL_CONDITIONED
 from heli_jax.identification.metrics import Metrics
 from heli_jax.identification.problem import Problem
 from heli_jax.report import frequency
+from heli_jax.report.coherence import Coherence, coherences
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, 0.6
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -145,18 +148,29 @@ def _of_agreement(name: str, m: Metrics, how: str, *, judged: bool) -> list[Gate
 
 
 def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
+    """Coherence, asked for where the model says that the output follows the input, and told
+    elsewhere."""
     lines = []
-    memory = frequency.memory(problem.model, fit.params)
-    for s in fit.signals:
-        for u in s.inputs:
-            for y in s.measured:
-                of = f"{u} to {y}, {s.flight}"
-                dt = float(s.times[1] - s.times[0])
-                found = frequency.empirical(s.inputs[u], s.measured[y], dt, memory)
-                if isinstance(found, str):
-                    lines.append(Gate("coherence", of, math.nan, "", "", None, found))
-                    continue
-                mean = float(np.average(found.coherence, weights=found.power))
-                said = f"weighted by the input's power, {found.segments} segments"
-                lines.append(_least("coherence", of, mean, "", COHERENCE, said))
+    # In the order of the signals.
+    flights = (*problem.training, *(f for f in problem.flights if f.hold_out))
+    for s, flight in zip(fit.signals, flights, strict=False):
+        here = {n: jnp.asarray(v) for n, v in flight.known.items()}
+        params = naming.replace(fit.params, **here)
+        at = frequency.at_record(problem.model, params, s, fit)
+        for (u, y), found in coherences(problem.model, params, at, s, fit).items():
+            lines.append(_of_coherence(f"{u} to {y}, {s.flight}", found))
     return lines
+
+
+def _of_coherence(of: str, found: Coherence | str) -> Gate:
+    if isinstance(found, str):
+        return Gate("coherence", of, math.nan, "", "", None, found)
+    said = f"weighted by the expected response, {found.segments} segments"
+    what = "partial coherence" if found.others else "coherence"
+    if not found.asked:
+        said = f"not asked: the model puts {found.share:.0%} of this output down to this input"
+    elif found.expected < COHERENCE:
+        said = f"not asked: in the simulation it is {found.expected:.2g} too"
+    else:
+        return _least(what, of, found.value, "", COHERENCE, said)
+    return Gate(what, of, found.value, "", "", None, said)

@@ -161,12 +161,13 @@ def bode(
     dt = _dt(signals)
     nyquist, top = np.pi / dt, 1.6 * np.pi / dt
     low = 2 * np.pi / (dt * max(signals.times.size, 8)) * 2
-    memory = frequency.memory(model, params)
+    at = frequency.at_record(model, params, signals, fit)
+    memory = frequency.memory(model, params, at, dt * signals.times.size)
     record = frequency.empirical(signals.inputs[input], signals.measured[output], dt, memory)
     found = isinstance(record, frequency.Empirical)
     axes = _panels(figure, 6.0 if found else 4.6, [1.4, 1.2, 0.6] if found else [1.2, 1.0])
     axes[0].set_title(f"{input} to {output}: frequency response", loc="left")
-    continuous, sampled = frequency.responses(model, params, output, input, dt)
+    continuous, sampled = frequency.responses(model, params, output, input, dt, at)
     omega, below = frequency.log_grid(low, top), frequency.log_grid(low, 0.999 * nyquist)
     H = continuous(omega) * frequency.nuisance_factor(fit, input, omega)
     held = sampled(below) * frequency.nuisance_factor(fit, input, below)
@@ -178,9 +179,9 @@ def bode(
                color=style.ORANGE, lw=1.5, ls=(0, (4, 2)), label="RLS")  # fmt: skip
     note = _draw_record(axes, reference, record, _others(signals, input))
     if not np.isfinite(H).any():
-        note = f"the model cannot be linearised about zero; {note}"
-    elif not model.linear:
-        note = f"linearised about zero; {note}"
+        note = f"the model cannot be linearised about {at.words or 'zero'}; {note}"
+    elif at.words:
+        note = f"linearised about {at.words}; {note}"
     _finish_bode(axes, nyquist, (low, top), _bode_unit(model, output, input), note)
     return axes
 

@@ -1,5 +1,6 @@
 """Frequency responses of a fit, of its baseline and of the record itself, on one phase branch."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,9 @@ from heli_jax.analysis.linear import linearize
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Fit
+from heli_jax.identification.operating_point import EVERYWHERE, OperatingPoint, operating_point
+from heli_jax.identification.result import Signals
+from heli_jax.simulation.simulate import substeps_for
 
 type Response = Callable[[np.ndarray], np.ndarray]
 
@@ -19,6 +23,8 @@ SEGMENTS = 8
 SHORTEST = 64
 """samples of a segment at least: fewer resolve nothing"""
 _LONGEST = 4096
+_MEMORIES = 16
+"""in a record at least, so that segments of one are enough for an average"""
 
 
 class Empirical(NamedTuple):
@@ -45,16 +51,31 @@ def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
     return factor if shift is None else factor * np.exp(-1j * omega * shift.value)
 
 
+def at_record(model: Model, params: Any, signals: Signals, fit: Fit) -> OperatingPoint:
+    """Where the model is linearised for a record, with the gains that were estimated."""
+    named = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
+    gains = {n: one.value for n, one in named.items() if one is not None}
+    dt = float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
+    return operating_point(
+        model, params, signals.inputs, signals.measured, dt, substeps=substeps_for(dt), gains=gains
+    )
+
+
 def responses(
-    model: Model, params: Any, output: str, input: str, dt: float
+    model: Model,
+    params: Any,
+    output: str,
+    input: str,
+    dt: float,
+    at: OperatingPoint = EVERYWHERE,
 ) -> tuple[Response, Response]:
-    """H(i omega) and Hd(e^{i omega dt}) of the model linearised about zero, as functions.
+    """H(i omega) and Hd(e^{i omega dt}) of the model linearised about a point, as functions.
 
     The second holds the input over each sample: this, and not the first, is what a sampled record
     can show. One linearisation serves both, and NumPy evaluates them: a figure is no reason to
     compile.
     """
-    A, B, C, D = (np.asarray(M) for M in linearize(model, params).matrices)
+    A, B, C, D = (np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices)
     i = naming.names(model.Outputs).index(output)
     j = naming.names(model.Inputs).index(input)
     n = A.shape[0]
@@ -62,25 +83,33 @@ def responses(
     both[:n, :n], both[:n, n] = A, B[:, j]
     held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
 
-    def at(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def along(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
         if not np.isfinite(A).all():
             return np.full(points.shape, np.nan, complex)
         x = np.linalg.solve(points[:, None, None] * np.eye(n) - A, b[None, :, None])
         return (C[i] @ x)[:, 0] + D[i, j]
 
     return (
-        lambda omega: at(1j * omega, A, B[:, j]),
-        lambda omega: at(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
+        lambda omega: along(1j * omega, A, B[:, j]),
+        lambda omega: along(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
     )
 
 
-def memory(model: Model, params: Any) -> float:
-    """Four times the slowest time constant of the linearised model [s], integrators left out."""
-    A = np.asarray(linearize(model, params).matrices.A)
+def memory(
+    model: Model, params: Any, at: OperatingPoint = EVERYWHERE, duration: float = math.inf
+) -> float:
+    """Four times the slowest time constant of the linearised model [s], integrators left out.
+
+    About an operating point a mode that is remembered for more than a sixteenth of the record's
+    `duration` [s] counts as an integrator as well: the drift of a hovering helicopter has time
+    constants of minutes, and within a segment it is a trend, which is taken out.
+    """
+    A = np.asarray(linearize(model, params, at.state, at.inputs).matrices.A)
     if not np.isfinite(A).all():
         return 0.0
     size = np.abs(np.linalg.eigvals(A))
-    size = size[size > 1e-6 * np.max(size, initial=0.0)]
+    least = 0.0 if at.state is None else _MEMORIES * 4.0 / duration
+    size = size[(size > 1e-6 * np.max(size, initial=0.0)) & (size >= least)]
     return 4.0 / float(size.min()) if size.size else 0.0
 
 
@@ -89,6 +118,16 @@ def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
     z = np.exp(1j * omega * baseline.dt)
     with np.errstate(all="ignore"):
         return np.polyval(baseline.num, z) / np.polyval(baseline.den, z)
+
+
+def _needed(dt: float, memory: float) -> int:
+    return max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
+
+
+def segment_length(samples: int, dt: float, memory: float) -> int:
+    """Samples of a segment: eight fit in the record, unless the memory [s] asks for longer ones."""
+    most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
+    return max(_needed(dt, memory), most)
 
 
 def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
@@ -102,8 +141,8 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         return "samples are missing"
     from matplotlib import mlab  # not at the start: commands without a report need none of it
 
-    needed = max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
-    length = max(needed, min(2 ** int(np.log2(max(u.size / SEGMENTS, 1.0))), _LONGEST))
+    needed = _needed(dt, memory)
+    length = segment_length(u.size, dt, memory)
     segments = 1 + (u.size - length) // (length // 2)
     if segments < SEGMENTS:
         wanted = needed * dt * (SEGMENTS + 1) / 2

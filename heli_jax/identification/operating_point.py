@@ -1,0 +1,169 @@
+"""Where a model that is not linear is linearised for a record: a trim, or the record's mean.
+
+The matrices of a helicopter at zero throttle say nothing of one that flies: its rotor stands still.
+"""
+
+import functools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.analysis.trim import HOVER, Condition, is_whole, trim
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.simulate import simulate
+from heli_jax.vehicle import of_helicopter
+
+_SLOW = 0.5
+"""m/s: a record of less mean speed is of hover"""
+
+
+class OperatingPoint(NamedTuple):
+    """State and inputs about which a model is linearised; None for those of a linear model, whose
+    matrices are the same everywhere."""
+
+    state: Any
+    inputs: Any
+    words: str
+    """`the trim in hover`; empty for a linear model"""
+
+
+EVERYWHERE = OperatingPoint(None, None, "")
+
+
+def operating_point(
+    model: Model,
+    params: Any,
+    inputs: Mapping[str, np.ndarray],
+    outputs: Mapping[str, np.ndarray],
+    dt: float,
+    *,
+    substeps: int = 4,
+    gains: Mapping[str, float] | None = None,
+) -> OperatingPoint:
+    """The point that stands for a record.
+
+    For a whole helicopter it is the trim at the mean speed of the record, as far as positions or
+    velocities were measured, else hover. For others it is the mean of the inputs and of the states
+    that they give in a simulation, or the initial state where that diverges.
+
+    Args:
+        model: any model, also one with a disturbance, which is zero at the point.
+        params: its parameters, of this flight.
+        inputs: as logged (N,), by name, SI.
+        outputs: as measured (N,), by name, SI; NaN where missing.
+        dt: sample time [s].
+        substeps: of the simulation.
+        gains: by name, what an input is multiplied by before it acts.
+    """
+    if model.linear:
+        return EVERYWHERE
+    quiet = _undisturbed(model)
+    if is_whole(quiet):
+        found = _trimmed(quiet, params, _condition(outputs, dt))
+        if found is not None:
+            return found._replace(state=_extended(model, found.state))
+    return _mean(model, params, inputs, dt, substeps, gains or {})
+
+
+def _trimmed(model: Model, params: Any, condition: Condition) -> OperatingPoint | None:
+    """The trim at a condition, else in hover; None where there is neither."""
+    for one in dict.fromkeys((condition, HOVER)):
+        try:
+            found = trim(model, params, one)
+        except ValueError:  # the vehicle cannot fly so
+            continue
+        return OperatingPoint(found.state, found.inputs, f"the trim {_words(one)}")
+    return None
+
+
+def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
+    """The mean motion of a record; hover where it is slow or nothing tells."""
+    dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
+    heading = outputs.get("yaw")
+    psi = float(np.nanmean(heading)) if heading is not None else 0.0
+    ahead, aside = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
+    speeds = [float(v) if abs(v) >= _SLOW else 0.0 for v in (ahead, aside, dz)]
+    return Condition(*speeds, psi) if any(speeds) else HOVER
+
+
+def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
+    """Mean velocity along an axis [m/s], from what was measured of it."""
+    if f"d{axis}" in outputs:
+        return float(np.nanmean(outputs[f"d{axis}"]))
+    if axis in outputs:
+        seen = np.flatnonzero(np.isfinite(outputs[axis]))
+        if seen.size > 1:
+            first, last = seen[0], seen[-1]
+            return float((outputs[axis][last] - outputs[axis][first]) / ((last - first) * dt))
+    return 0.0
+
+
+def _words(condition: Condition) -> str:
+    named = ("ahead", condition.ahead), ("to the right", condition.aside), ("up", condition.climb)
+    parts = [f"{v:.2g} m/s {n}" for n, v in named if v]
+    return f"at {', '.join(parts)}" if parts else "in hover"
+
+
+def _mean(
+    model: Model,
+    params: Any,
+    inputs: Mapping[str, np.ndarray],
+    dt: float,
+    substeps: int,
+    gains: Mapping[str, float],
+) -> OperatingPoint:
+    acting = {n: gains.get(n, 1.0) * np.asarray(inputs[n]) for n in naming.names(model.Inputs)}
+    dtype = jnp.result_type(float)
+    mean = model.Inputs(**{n: jnp.asarray(u.mean(), dtype) for n, u in acting.items()})
+    driven = model.Inputs(**{n: jnp.asarray(u, dtype) for n, u in acting.items()})
+    state = _mean_state(model, params, driven, jnp.asarray(dt, dtype), substeps)
+    if all(bool(np.isfinite(v)) for v in jax.tree.leaves(state)):
+        return OperatingPoint(state, mean, "the record's mean")
+    start = jax.tree.map(lambda v: jnp.asarray(v, dtype), model.initial_state(params))
+    return OperatingPoint(start, mean, "the initial state and the record's mean inputs")
+
+
+@eqx.filter_jit
+def _mean_state(model: Model, params: Any, inputs: Any, dt: Any, substeps: int) -> Any:
+    found = simulate(model, params, inputs, dt=dt, substeps=substeps)
+    return jax.tree.map(lambda x: jnp.mean(x), found.states)
+
+
+@functools.cache
+def _undisturbed(model: Model) -> Model:
+    """A helicopter's model without the states of a disturbance; any other model as it is."""
+    names = naming.names(model.State)
+    kept = [n for n in names if not (n[:1] == "w" and n[1:2].isdigit())]
+    if len(kept) == len(names) or not of_helicopter(model.Params):
+        return model
+    fields = naming.fields(model.State)
+    State: Any = NamedTuple("State", [(n, fields[n]) for n in kept])  # type: ignore[misc]
+
+    def vector_field(p: Any, s: Any, u: Any) -> Any:
+        rates = model.vector_field(p, _extended(model, s), u)
+        return State(**{n: getattr(rates, n) for n in kept})
+
+    limits = model.limits
+    return Model(
+        model.name,
+        vector_field,
+        lambda p, s, u: model.output(p, _extended(model, s), u),
+        model.Params,
+        State,
+        model.Inputs,
+        model.Outputs,
+        limits=None if limits is None else lambda p, s, u: limits(p, _extended(model, s), u),
+    )
+
+
+def _extended(model: Model, state: Any) -> Any:
+    """The model's State with zero where the given one has nothing."""
+    given = naming.asdict(state)
+    zero: Array = jnp.zeros((), jnp.result_type(*(jnp.asarray(v) for v in given.values())))
+    return model.State(**{n: given.get(n, zero) for n in naming.names(model.State)})

@@ -1,0 +1,183 @@
+"""Coherence of a record, of each input with the others taken out, and where to expect it.
+
+A record shows coherence between an input and an output only where the one moves the other. Which
+do, and in which band, the model says: of an output that an input hardly moves nothing is asked.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+from heli_jax import naming
+from heli_jax.analysis.linear import linearize
+from heli_jax.dynamics.model import Model
+from heli_jax.identification.fit import Fit
+from heli_jax.identification.operating_point import OperatingPoint
+from heli_jax.identification.result import Signals
+from heli_jax.report import frequency
+
+SIZEABLE = 0.1
+"""part of an output's power that the model puts down to an input, from which on it is asked for"""
+_MORE = 2
+"""half-overlapping segments more for every further input: each takes a degree of freedom"""
+_ROUNDING = 1e-20
+"""of a signal's power: less is what rounding leaves where others explain all of it"""
+
+
+class Coherence(NamedTuple):
+    """One input and one output of a record."""
+
+    value: float
+    """mean of the partial coherence, weighted by the response that the model expects"""
+    expected: float
+    """the same of the simulated output"""
+    share: float
+    """of the simulated output's power, what the linearised model puts down to this input alone"""
+    segments: int
+    others: int
+    """further inputs that move, whose part was taken out"""
+
+    @property
+    def asked(self) -> bool:
+        """Whether the model lets expect that the output follows this input coherently."""
+        return self.share >= SIZEABLE
+
+
+def coherences(
+    model: Model, params: Any, at: OperatingPoint, signals: Signals, fit: Fit
+) -> dict[tuple[str, str], Coherence | str]:
+    """By input and output of a flight: the partial coherence, or why there is none.
+
+    Args:
+        model: what was fitted.
+        params: its parameters, of this flight.
+        at: where it is linearised.
+        signals: the flight, measured and simulated.
+        fit: what knows the gains of the inputs.
+    """
+    dt = float(signals.times[1] - signals.times[0])
+    memory = frequency.memory(model, params, at, dt * signals.times.size)
+    moving = [n for n, u in signals.inputs.items() if np.std(u) > 0]
+    found: dict[tuple[str, str], Coherence | str] = {
+        (u, y): "the input does not move"
+        for u in signals.inputs
+        for y in signals.measured
+        if u not in moving
+    }
+    matrices = [np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices]
+    for y in signals.measured:
+        record = _spectra(signals, moving, y, dt, memory)
+        if isinstance(record, str):
+            found |= {(u, y): record for u in moving}
+            continue
+        i = naming.names(model.Outputs).index(y)
+        for u in moving:
+            j = naming.names(model.Inputs).index(u)
+            H = _sampled(matrices, i, j, dt, record.omega)
+            H = H * frequency.nuisance_factor(fit, u, record.omega)
+            found[u, y] = _coherence(record, moving.index(u), H)
+    return found
+
+
+class _Spectra(NamedTuple):
+    """Fourier transforms of the half-overlapping segments of a record."""
+
+    omega: np.ndarray
+    """(k,) [rad/s], above zero and below the Nyquist frequency"""
+    inputs: np.ndarray
+    """(k, segments, inputs)"""
+    measured: np.ndarray
+    """(k, segments)"""
+    simulated: np.ndarray
+    """(k, segments)"""
+
+
+def _spectra(
+    signals: Signals, moving: list[str], output: str, dt: float, memory: float
+) -> _Spectra | str:
+    y, model = signals.measured[output], signals.simulated[output]
+    if np.isnan(y).any():
+        return "samples are missing"
+    if not np.isfinite(model).all():
+        return "the simulation diverges"
+    least = frequency.SEGMENTS + _MORE * (len(moving) - 1)
+    length = frequency.segment_length(y.size, dt, memory)
+    segments = 1 + (y.size - length) // (length // 2)
+    if segments < least:
+        wanted = length * dt * (least + 1) / 2
+        return f"wanted are {least} segments of {length * dt:.3g} s, a record of {wanted:.3g} s"
+    channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
+    at = np.arange(segments)[:, None] * (length // 2) + np.arange(length)[None, :]
+    pieces = scipy.signal.detrend(channels[:, at], axis=-1, type="linear")
+    transforms = np.fft.rfft(pieces * np.hanning(length), axis=-1)[..., 1:-1]
+    transforms = np.moveaxis(transforms, -1, 0)  # (k, channels, segments)
+    omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)[1:-1]
+    inputs = np.moveaxis(transforms[:, :-2], 1, 2)
+    return _Spectra(omega, inputs, transforms[:, -2], transforms[:, -1])
+
+
+def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
+    """Of input j, whose expected response is H (k,)."""
+    others = np.delete(record.inputs, j, axis=2)
+    alone = _without(others, record.inputs[:, :, j])
+    power = np.sum(np.abs(alone) ** 2, axis=1)
+    weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
+    total = float(np.sum(np.abs(record.simulated) ** 2))
+    share = float(np.sum(weights)) / total if total > 0 else 0.0
+    value, expected = (
+        _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)
+        for y in (record.measured, record.simulated)
+    )
+    return Coherence(value, expected, share, record.inputs.shape[1], others.shape[2])
+
+
+def _mean(coherence: np.ndarray, weights: np.ndarray) -> float:
+    seen = np.isfinite(coherence) & (weights > 0)
+    return float(np.average(coherence[seen], weights=weights[seen])) if seen.any() else 0.0
+
+
+def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
+
+    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
+
+    Args:
+        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
+        u: (k, segments)
+        y: (k, segments)
+
+    Source: Bendat and Piersol, Random Data (2010), chapter 7.
+    """
+    left_u, left_y = _without(others, u), _without(others, y)
+    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
+    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
+    enough = uu > _ROUNDING * np.sum(np.abs(u) ** 2, axis=1)
+    enough &= yy > _ROUNDING * np.sum(np.abs(y) ** 2, axis=1)
+    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
+
+
+def _without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """x (k, segments) less its projection on the others (k, segments, inputs)."""
+    if not others.shape[2]:
+        return x
+    gains = np.linalg.pinv(others) @ x[:, :, None]
+    return x - (others @ gains)[:, :, 0]
+
+
+def _sampled(
+    matrices: list[np.ndarray], i: int, j: int, dt: float, omega: np.ndarray
+) -> np.ndarray:
+    """Hd(e^{i omega dt}) (k,) from input j, held over each sample, to output i; zero where the
+    linearised model is not finite."""
+    A, B, C, D = matrices
+    n = A.shape[0]
+    both = np.zeros((n + 1, n + 1))
+    both[:n, :n], both[:n, n] = A, B[:, j]
+    if not (np.isfinite(both).all() and np.isfinite(C[i]).all()):
+        return np.zeros(omega.shape, complex)
+    held = scipy.linalg.expm(both * dt)
+    z = np.exp(1j * omega * dt)[:, None, None]
+    x = np.linalg.solve(z * np.eye(n) - held[:n, :n], held[None, :n, n:])
+    return (C[i] @ x)[:, 0] + D[i, j]

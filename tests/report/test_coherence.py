@@ -1,0 +1,134 @@
+"""Coherence is asked for where the model expects it, with the other inputs taken out."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, models, naming
+from heli_jax import config as configuration
+from heli_jax.dynamics.roll import roll_transfer_function
+from heli_jax.generate import generate
+from heli_jax.identification.result import Signals
+from heli_jax.report import card
+from heli_jax.report.coherence import _spectra, coherences, partial_coherence
+from tests.identification.bench import BENCH, record, vehicle
+
+
+def by_scipy(inputs, y, j, length, dt):
+    """Partial coherence of input j from the inverse of the matrix of SciPy's cross-spectra."""
+    signals = [*inputs, y]
+    how = {"fs": 1 / dt, "window": np.hanning(length), "noverlap": length // 2}
+    G = np.array([[scipy.signal.csd(a, b, nperseg=length, detrend="linear", **how)[1]
+                   for b in signals] for a in signals])  # fmt: skip
+    P = np.linalg.inv(np.moveaxis(G, -1, 0))
+    return (np.abs(P[:, j, -1]) ** 2 / np.abs(P[:, j, j] * P[:, -1, -1]))[1:-1]
+
+
+def coloured(rng, n):
+    return scipy.signal.lfilter([1.0], [1.0, -0.7], rng.standard_normal(n))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_partial_coherence_is_that_of_scipys_spectra(count):
+    rng, n, dt = np.random.default_rng(5), 6000, 0.02
+    common = coloured(rng, n)  # the inputs move together, as sticks of one pilot
+    inputs = {f"u{k}": coloured(rng, n) + 0.8 * common for k in range(count)}
+    y = sum(scipy.signal.lfilter([0.0, 0.3 + k], [1.0, -0.9], u) for k, u in
+            enumerate(inputs.values())) + 3.0 * rng.standard_normal(n)  # fmt: skip
+    s = Signals("f", False, np.arange(n) * dt, inputs, {"y": y}, {"y": y})
+    found = _spectra(s, list(inputs), "y", dt, 1.0)
+    length = 2 * (found.omega.size + 1)
+    for j in range(count):
+        others = np.delete(found.inputs, j, axis=2)
+        ours = partial_coherence(others, found.inputs[:, :, j], found.measured)
+        np.testing.assert_allclose(ours, by_scipy(inputs.values(), y, j, length, dt), rtol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A noise-free flight of the whole helicopter, all sticks moving: problem, fit and signals."""
+    path = Path(__file__).parents[2] / "configs" / "xcell-combined.yaml"
+    settings = ["simulate.duration=200", "simulate.rate=25", "simulate.noise={}"]
+    experiment = configuration.load(path, settings)
+    [run] = generate(experiment).runs.values()
+    names = ("roll", "z", "roll_rate", "pitch_rate", "yaw_rate")
+    y = {n: np.asarray(getattr(run.outputs, n)) for n in names}
+    u = {n: np.asarray(v) for n, v in naming.asdict(run.inputs).items()}
+    flight = Flight(dt=0.04, inputs=u, outputs=y)
+    problem = SimpleNamespace(model=experiment.model, training=(flight,), flights=(flight,))
+    signals = Signals("flight 1", False, np.asarray(run.times), u, y, y)
+    return problem, experiment.vehicle.params, signals
+
+
+def gates(flown, **changed):
+    problem, params, signals = flown
+    fit = SimpleNamespace(params=params, signals=(signals._replace(**changed),), nuisance={})
+    return {g.of.removesuffix(", flight 1"): g for g in card._of_excitation(problem, fit)}
+
+
+def test_a_noise_free_flight_of_the_exact_model_fails_no_gate(flown):
+    found = gates(flown)
+    assert len(found) == 20
+    assert card.failed(tuple(found.values())) == ()
+    # And it is asked of those that fly the axis.
+    asked = {of for of, gate in found.items() if gate.passed is not None}
+    assert {"x_roll to roll_rate", "x_pitch to pitch_rate"} <= asked
+    assert all(found[of].what == "partial coherence" for of in asked)
+    assert not asked & {"x_roll to pitch_rate", "x_throttle to roll_rate", "x_yaw to pitch_rate"}
+    assert "not asked" in found["x_roll to pitch_rate"].remark
+
+
+def test_what_should_respond_and_does_not_fails(flown):
+    _, _, signals = flown
+    rng = np.random.default_rng(1)
+    dead = {**signals.measured, "roll_rate": 0.1 * rng.standard_normal(signals.times.size)}
+    found = gates(flown, measured=dead)
+    assert {of for of, g in found.items() if g.passed is False} == {"x_roll to roll_rate"}
+    assert found["x_roll to roll_rate"].value < 0.4
+    # The same where the log's sticks are of another flight.
+    other = {n: np.roll(u, u.size // 2) for n, u in signals.inputs.items()}
+    shown = {n: np.roll(y, y.size // 2) for n, y in signals.simulated.items()}
+    found = gates(flown, inputs=other, simulated=shown)
+    assert found["x_pitch to pitch_rate"].passed is False
+
+
+def test_one_input_alone_is_weighted_by_the_expected_response():
+    dt, n = 0.05, 4000
+    flight = record(BENCH, seed=4, n=n, dt=dt, noise=0.05)
+    u, y = flight.inputs["x_roll"], flight.outputs["roll"]
+    s = Signals("f", False, flight.times, {"x_roll": u}, {"roll": y}, {"roll": y})
+    model, params = models.roll_on_stand, vehicle(BENCH)
+    at = SimpleNamespace(state=None, inputs=None)
+    [found] = coherences(model, params, at, s, SimpleNamespace(nuisance={})).values()
+    length = 256  # eight and more in 4000 samples, in powers of two
+    how = {"fs": 1 / dt, "window": np.hanning(length), "noverlap": length // 2}
+    f, g2 = scipy.signal.coherence(u, y, nperseg=length, detrend="linear", **how)
+    _, power = scipy.signal.welch(u, nperseg=length, detrend="linear", **how)
+    tf = roll_transfer_function(params, stand=True)
+    num, den, _ = scipy.signal.cont2discrete(
+        ([float(v) for v in tf.num], [float(v) for v in tf.den]), dt
+    )
+    _, H = scipy.signal.freqz(np.ravel(num), den, 2 * np.pi * f * dt)
+    weights = (np.abs(H) ** 2 * power)[1:-1]
+    assert found.value == pytest.approx(np.average(g2[1:-1], weights=weights), rel=1e-4)
+    assert found.others == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"measured": {"roll": np.r_[np.nan, np.zeros(999)]}}, "samples are missing"),
+        ({"simulated": {"roll": np.full(1000, np.inf)}}, "the simulation diverges"),
+        ({"inputs": {"x_roll": np.ones(1000)}}, "the input does not move"),
+    ],
+)
+def test_why_there_is_none(change, said):
+    t = np.arange(1000) * 0.05
+    s = Signals("f", False, t, {"x_roll": np.sin(t)}, {"roll": np.cos(t)}, {"roll": np.cos(t)})
+    at = SimpleNamespace(state=None, inputs=None)
+    fit = SimpleNamespace(nuisance={})
+    found = coherences(models.roll_on_stand, vehicle(BENCH), at, s._replace(**change), fit)
+    assert list(found.values()) == [said]
