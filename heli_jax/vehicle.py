@@ -34,7 +34,13 @@ def _field(default: float | None = None) -> Any:
 
 
 class Helicopter(eqx.Module):
-    """A single-rotor helicopter with a Bell-Hiller flybar; every field a scalar in SI."""
+    """A single-rotor helicopter with a Bell-Hiller flybar; every field a scalar in SI.
+
+    A field that is NaN is not given: models that read it refuse the vehicle. `c_paddle` and
+    `a_paddle` are the exception: where they are not given the paddle has the blade's chord and
+    lift slope, as in the paper, and an If that is found is larger than one that was swung by
+    a c / (a_paddle c_paddle).
+    """
 
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
     If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field()
@@ -78,6 +84,10 @@ class Helicopter(eqx.Module):
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
     zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
     cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
+    c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _field(math.nan)
+    a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _field(
+        math.nan
+    )
 
 
 # A vehicle may leave out what the model at hand does not read; what it gives must be possible.

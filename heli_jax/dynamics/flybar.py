@@ -5,6 +5,8 @@ are then computed once, outside the loop over time, and no division is left in i
 divided by the rotor's speed, so that a rotor at rest is an ordinary point.
 """
 
+import jax.numpy as jnp
+
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
 
@@ -20,12 +22,30 @@ def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
 
 
 def flapping_rate_gain(p: Helicopter) -> Scalar:
-    r"""$k_1 = \rho \Omega^2 a c (R_2^4 - R_1^4) / (8 I_f)$ [1/s^2]: eq. 12 divided by If."""
+    r"""$k_1 = \rho \Omega^2 a c (R_2^4 - R_1^4) / (8 I_f)$ [1/s^2]: eq. 12 divided by If.
+
+    Here and in what follows a and c are the paddle's where they are given.
+    """
     return _paddle(p) * p.Omega**2
 
 
 def _paddle(p: Helicopter) -> Scalar:
-    return p.rho * p.a * p.c * (p.R2**4 - p.R1**4) / (8.0 * p.If)
+    return p.rho * paddle_lift_slope(p) * paddle_chord(p) * (p.R2**4 - p.R1**4) / (8.0 * p.If)
+
+
+def paddle_lift_slope(p: Helicopter) -> Scalar:
+    """Lift slope of the flybar's paddle [1/rad]: the blade's `a`, as in eq. 12, unless given."""
+    return _given_or(p.a_paddle, p.a)
+
+
+def paddle_chord(p: Helicopter) -> Scalar:
+    """Chord of the flybar's paddle [m]: the blade's `c`, as in eq. 12, unless given."""
+    return _given_or(p.c_paddle, p.c)
+
+
+def _given_or(value: Scalar, default: Scalar) -> Scalar:
+    """A constant that may be left out (NaN), or what stands in its place then."""
+    return jnp.where(jnp.isnan(value), default, value)
 
 
 def flapping_acceleration(

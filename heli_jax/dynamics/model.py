@@ -136,16 +136,26 @@ def needed_but_missing(model: Model, params: Any) -> list[str]:
     """The parameters that are NaN (not given) and that the model reads, in field order."""
     params = plain(params)
     open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
-    return [n for n in open_ if reads(model, params, n)]
+    return [n for n in open_ if np.isnan(_at_one(model, params, n, np.nan)).any()]
 
 
 def reads(model: Model, params: Any, name: str) -> bool:
     """Whether the rates or the outputs depend on a parameter, where states and inputs are one."""
+    if np.isnan(_at_one(model, params, name, np.nan)).any():
+        return True
+    # One that may be left out has another in its place where it is NaN.
+    given, larger = (_at_one(model, params, name, value) for value in (1.0, 2.0))
+    return not np.array_equal(given, larger, equal_nan=True)
+
+
+def _at_one(model: Model, params: Any, name: str, value: float) -> np.ndarray:
+    """Rates and outputs where states, inputs and what is not given are one, and a parameter is
+    `value`."""
     one = np.float64(1.0)
     others = {n: one for n, v in naming.asdict(params).items() if np.isnan(v)}
-    filled = naming.replace(plain(params), **{**others, name: np.float64(np.nan)})
+    filled = naming.replace(plain(params), **{**others, name: np.float64(value)})
     x = model.State(**dict.fromkeys(naming.names(model.State), one))
     u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
     with np.errstate(all="ignore"):
         parts = field_and_output(model, filled, x, u)
-    return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
+    return np.array([float(v) for v in jax.tree.leaves(parts)])

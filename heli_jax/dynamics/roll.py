@@ -9,6 +9,9 @@ import dataclasses
 import functools
 from typing import Annotated, Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+
 from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
 from heli_jax.dynamics.check_model import check_model
@@ -192,7 +195,7 @@ class Ratios(NamedTuple):
     """What a fourth-order denominator says of the physical parameters."""
 
     values: dict[str, Scalar]
-    """a over the inertia of the axis, and a/If"""
+    """a over the inertia of the axis, and a/If (a_paddle/If where a_paddle is given)"""
     p2: Scalar
     p2_expected: Scalar
     """the coefficient of s^2 that the other coefficients and Omega ask for"""
@@ -204,7 +207,8 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
     `den` holds (1, p1, p2, p3, p4), highest power first, of the angle `roll` or `pitch`. The
     stand's damping zeta, the geometry and Omega are taken from `p`; the stand's stiffness is read
     from p4 = kappa c2. With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and
-    k2 follow. What the model says of p2 = c2 + zeta c1 + kappa is left over as a check.
+    k2 follow. Where `a_paddle` is given (concrete), the paddle's lift slope is not `a` and k1 is
+    a_paddle/If. What the model says of p2 = c2 + zeta c1 + kappa is left over as a check.
     """
     axis = {"roll": _AXES[0], "pitch": _AXES[1]}[angle]
     inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
@@ -214,9 +218,16 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
     c3 = p3 - zeta * c2 - kappa * c1
     k1 = c1 * p.Omega
     k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
-    unit_a = naming.replace(p, a=1.0, If=1.0)
+    slope = "a_paddle" if _is_given(p.a_paddle) else "a"
+    unit_a = naming.replace(p, **{"a": 1.0, "If": 1.0, slope: 1.0})
     moment_per_a = cyclic_moment(unit_a, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3)))
     over = f"a/{axis.inertia}"
     total = k2 / moment_per_a  # a over the whole inertia, what is added included
-    ratios = {over: total * (inertia + added) / inertia, "a/If": k1 / flapping_rate_gain(unit_a)}
+    k1_per_ratio = flapping_rate_gain(unit_a)
+    ratios = {over: total * (inertia + added) / inertia, f"{slope}/If": k1 / k1_per_ratio}
     return Ratios(ratios, p2, c2 + zeta * c1 + kappa)
+
+
+def _is_given(value: Scalar) -> bool:
+    """Whether an optional constant is there; not so where it is traced, which nobody can tell."""
+    return not isinstance(value, jax.core.Tracer) and not bool(jnp.isnan(value))
