@@ -18,7 +18,7 @@ from heli_jax.flights import write as tables
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.identifiability import Combination, Verdict
-from heli_jax.identification.metrics import Metrics
+from heli_jax.identification.metrics import Metrics, diverges
 from heli_jax.identification.problem import Problem
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
@@ -88,6 +88,11 @@ def print_fit(
         _print_agreement(f"{name}, one step ahead", m)
     for name, m in fit.validation.items():
         _print_agreement(f"{name}, held out, simulated", m)
+    for name, m in fit.validation_free_run.items():
+        if diverges(m):
+            print(f"{name}, held out, simulated in one piece: diverges")
+        else:
+            _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     print(f"acceptance card: {summary(card(problem, fit))}")

@@ -50,6 +50,18 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     return Evaluation(simulated, raw, rms, *rest)
 
 
+def simulated_outputs(
+    layout: Layout, data: Data, z: Float[Array, " q"]
+) -> tuple[dict[str, np.ndarray], ...]:
+    """By flight and output the simulation (N,) with the bias, SI."""
+    outputs, biases, _ = jax.device_get(_shown(layout, data, z))
+    bias = iter(biases)
+    return tuple(
+        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
+        for run, names in zip(outputs, layout.outputs, strict=True)
+    )
+
+
 @eqx.filter_jit
 def _shown(layout: Layout, data: Data, z: Array) -> Shown:
     u = unpack(layout, data, z)

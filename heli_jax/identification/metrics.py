@@ -28,6 +28,12 @@ class Metrics(NamedTuple):
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
+def diverges(m: Metrics) -> bool:
+    """Whether a simulation left what was measured: it is not finite, or its error has ten times the
+    variance of the signal."""
+    return not np.isfinite(m.rmse) or m.vaf < -9.0
+
+
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     """Agreement of two signals (N,) where something is measured (not NaN)."""
     seen = ~np.isnan(measured)

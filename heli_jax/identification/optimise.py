@@ -295,10 +295,12 @@ def optimise(
     noise: Noise,
     z0: Float[Array, " q"],
     max_steps: int = 200,
+    *,
+    held: np.ndarray | None = None,
 ) -> Optimum:
-    """The least-squares optimum from z0."""
+    """The least-squares optimum from z0; unknowns that are `held` (q,) stay there."""
     count = residuals_count(data)
-    if _whole(layout):
+    if _whole(layout) and held is None:
         end = _at_once(layout, data, noise, z0, np.asarray(max_steps))
         return _optimum(end.level, end.state, end.z, count)
 
@@ -307,7 +309,11 @@ def optimise(
         return e.r, e.J
 
     first = at(z0)
-    terms = _terms(layout, z0, _scaling(*first))
+    r0, J0 = first
+    if held is not None:
+        # A column of zeros has no unit, and what has none stays.
+        J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
+    terms = _terms(layout, z0, _scaling(r0, J0))
     return _descend(at, terms, first, count, max_steps, _one)
 
 

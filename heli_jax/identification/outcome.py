@@ -13,7 +13,6 @@ from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import excitation
 from heli_jax.identification.coloured import Sandwich, residual_curvature, sandwich
-from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import (
     bound_notes,
     estimates_of,
@@ -25,12 +24,11 @@ from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.holds import other_hold
 from heli_jax.identification.identifiability import Z95, Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, Reached, layout_of, unpack
-from heli_jax.identification.metrics import Metrics, Whiteness, metrics, whiteness
+from heli_jax.identification.layout import Layout, Noise, Reached, unpack
+from heli_jax.identification.metrics import NO_METRICS, Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
     Settled,
-    first_noise,
     innovation_sums,
     log_likelihood,
     noise_unknowns,
@@ -40,7 +38,7 @@ from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.search import Search, table
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.validation import validate
 
 
 class Ran(NamedTuple):
@@ -90,7 +88,9 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     if none:
         nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
     held = tuple(f for f in problem.flights if f.hold_out)
-    validation = _validation(problem, layout, best.z, noise, held) if held else ()
+    checked = validate(problem, layout, best.z, noise, held) if held else None
+    validation = signals_of(checked.e, held) if checked else ()
+    free_run = _free_run(held, checked.free_run) if checked else ()
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
     ill = _ill_conditioned(problem, e, sds)
     dtype = jnp.result_type(float)
@@ -107,6 +107,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *bound_notes(estimates),
         *_hold_notes(problem, search, settled, e, named),
         *_useless_notes(_pooled(signals)),
+        *(checked.notes if checked else ()),
     ]
     return Fit(
         model=problem.model.name,
@@ -124,6 +125,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         signals=(*signals, *validation),
         metrics=_pooled(signals),
         validation=_pooled(validation),
+        validation_free_run=_pooled(free_run),
         one_step=_pooled(signals, one_step=True),
         one_step_validation=_pooled(validation, one_step=True),
         whiteness=white,
@@ -319,28 +321,14 @@ def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...
     )
 
 
-def _validation(
-    problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
+def _free_run(
+    flights: tuple[Flight, ...], runs: tuple[dict[str, np.ndarray], ...] | None
 ) -> tuple[Signals, ...]:
-    """Flights held out, predicted with the estimates; only their initial state and bias are
-    adjusted, by least squares (linear in them, or step by step)."""
-    other, data = layout_of(problem, held), data_of(problem, held)
-    begin = jnp.zeros(other.size - layout.weak, z.dtype)
-    if not problem.model.linear:
-        begin = start_vector(other, data, problem)[layout.weak :]
-    full = jnp.concatenate([z[: layout.weak], begin])
-    theirs = first_noise(problem, held)
-    if layout.filtered:
-        known = {n: s for one in noise.sd for n, s in one.items()}
-        sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
-        theirs = theirs._replace(sd=sd)
-    steps = 1 if problem.model.linear else 5
-    for _ in range(steps if other.size > layout.weak else 0):
-        e = evaluate(other, data, theirs, full)
-        columns = np.asarray(e.J)[:, layout.weak :]
-        step, *_ = np.linalg.lstsq(columns, -np.asarray(e.r), rcond=1e-10)
-        full = full.at[layout.weak :].add(jnp.asarray(step, z.dtype))
-    return signals_of(evaluate(other, data, theirs, full), held)
+    """The flights held out as simulated in one piece."""
+    return tuple(
+        Signals(label, f.hold_out, f.times, dict(f.inputs), dict(f.outputs), run)
+        for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
+    )
 
 
 def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
@@ -354,5 +342,6 @@ def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str
         have = [s for s in signals if n in s.measured]
         measured = np.concatenate([s.measured[n] for s in have])
         model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
-        pooled[n] = metrics(measured, model)
+        finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
+        pooled[n] = metrics(measured, model) if finite else NO_METRICS
     return pooled

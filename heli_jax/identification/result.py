@@ -115,6 +115,8 @@ class Fit:
     notes: tuple[str, ...]
     reached: Reached
     """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
+    validation_free_run: dict[str, Metrics] = field(default_factory=dict)
+    """with windows: the same simulated in one piece, from the initial state of the first window"""
     coloured: bool = False
     """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0

@@ -50,6 +50,7 @@ def fit_json(
             "noise_sd": fit.noise,
             "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
             "validation": {n: m._asdict() for n, m in fit.validation.items()},
+            "validation_free_run": {n: m._asdict() for n, m in fit.validation_free_run.items()},
             "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
             "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
             "acceptance": [g._asdict() for g in card(problem, fit)],

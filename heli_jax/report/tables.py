@@ -13,7 +13,7 @@ from heli_jax.identification.choice import Choice
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability import ILL_CONDITIONED, Verdict
 from heli_jax.identification.intervals import Intervals
-from heli_jax.identification.metrics import Metrics
+from heli_jax.identification.metrics import Metrics, diverges
 from heli_jax.identification.problem import Problem
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import whiteness_note
@@ -156,6 +156,10 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
             rows.append(_agreement(output, "fit, one step ahead", fit.one_step[output]))
         if output in fit.validation:
             rows.append(_agreement(output, "held out, simulated", fit.validation[output]))
+        if output in fit.validation_free_run:
+            run = fit.validation_free_run[output]
+            row = _agreement(output, "held out, in one piece", run)
+            rows.append((*row[:2], "diverges", *[NOTHING] * 3) if diverges(run) else row)
         if output in fit.one_step_validation:
             one_step = fit.one_step_validation[output]
             rows.append(_agreement(output, "held out, one step ahead", one_step))
