@@ -23,6 +23,7 @@ from heli_jax.identification.noise import (
     disturbance_or_none,
     first_noise,
     levelled,
+    second_guess,
     settle,
 )
 from heli_jax.identification.outcome import Ran, assemble, noise_by_name, signals_of
@@ -111,6 +112,7 @@ def fit(
         best, said = other, (SAID,)
     settled = settle(search, begin.noise, best)
     settled = settled._replace(notes=(*said, *settled.notes))
+    settled = second_guess(search, points, settled, problem.training)
     search.max_steps = max_steps
     if asked:
         settled = disturbance_or_none(search, settled)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimates import deviations
@@ -99,6 +99,75 @@ def _noise_matters(search: Search, fall: float) -> bool:
     if layout.concentrated:
         return any(f.prior for f in search.problem.free.values())
     return fall > 0.9
+
+
+_EXPLAINED = 2.0
+"""times the noise that a record shows by itself up to which its residual is that noise"""
+
+
+def second_guess(
+    search: Search, points: Float[Array, "s q"], found: Settled, flights: Sequence[Flight]
+) -> Settled:
+    """The better of an optimum and of one whose noise is relaxed from the scale of the signals.
+
+    Relaxation weighs several outputs by the noise, and ends in the optimum that its first guess
+    leads to. That guess, from the third differences, is the end of the story where the model
+    explains a record to its noise. Where it does not, a smooth output of little noise has had all
+    the say, and outputs weighed by their own size may lead elsewhere. One output has no weights.
+
+    Args:
+        points: the starts; the first is begun from again.
+        flights: those fitted.
+    """
+    layout, data = search.layout, search.data
+    guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
+    several = sum(len(o) for o in layout.outputs) > 1
+    if layout.filtered or not several or _explained(found.noise, guesses):
+        return found
+    dtype = found.noise.level.dtype
+    sd = tuple(
+        {n: np.asarray(float(np.nanstd(f.outputs[n])) or guess[n], dtype) for n in sorted(guess)}
+        for f, guess in zip(flights, guesses, strict=True)
+    )
+    noise = Noise(sd, found.noise.level)
+    [best] = search.run(noise, points[:1])
+    other = settle(search, noise, best)
+    trace = (*found.trace, *other.trace)
+    first, second = (_worth(layout, data, s) for s in (found, other))
+    worse = bool(found.best.converged) and not bool(other.best.converged)
+    if worse or not second > first + _WORTH_TELLING:
+        return found._replace(trace=trace)
+    said = (
+        "Weighing the outputs by their size first led to a better optimum than the noise of their "
+        f"differences did (log-likelihood {second:.1f} for {first:.1f}): this fit is the better "
+        "one.",
+    )
+    return other._replace(trace=trace, notes=(*found.notes, *said))
+
+
+_WORTH_TELLING = 0.1
+"""log-likelihood by which two optima differ"""
+
+
+def _explained(noise: Noise, guesses: list[dict[str, float]]) -> bool:
+    """Whether every residual is about as small as the noise that its record shows by itself."""
+    return all(
+        float(sd[n]) <= _EXPLAINED * guess[n]
+        for sd, guess in zip(noise.sd, guesses, strict=True)
+        for n in guess
+    )
+
+
+def _worth(layout: Layout, data: Data, found: Settled) -> float:
+    """The log-likelihood of output error, less what the priors hold against the parameters."""
+    e = evaluate(layout, data, found.noise, found.best.z)
+    measured = sum(
+        float(np.nansum((np.asarray(r) / float(sd[n])) ** 2))
+        for by_name, sd in zip(e.raw, found.noise.sd, strict=True)
+        for n, r in by_name.items()
+    )
+    beside = float(np.sum(np.square(np.asarray(e.r, np.float64)))) - measured
+    return log_likelihood(layout, data, found.noise, e) - 0.5 * beside
 
 
 def disturbance_or_none(search: Search, found: Settled) -> Settled:
