@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
     0 done; 2 wrong input; 3 the data cannot determine what was asked; 4 the optimiser did not
-    converge; 130 interrupted.
+    converge, or the model explains less than the mean of what was measured; 130 interrupted.
     """
     options = _parser().parse_args(arguments)
     with _interrupts() as seen:
@@ -205,7 +205,17 @@ def _fit(options: argparse.Namespace) -> int:
     _say("writing the report")
     output.write_fit(out, experiment, problem, found, rls, further, begin)
     output.print_fit(problem, found, rls, further, out)
-    return {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
+    return _fit_code(found)
+
+
+def _fit_code(found: Any) -> int:
+    """The exit code of a fit; what is wrong with the model itself is said on standard error."""
+    for reason in found.adequacy.reasons:
+        _say(f"the model is not adequate: {reason}")
+    code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
+    if code == DONE and found.adequacy.less_than_mean:
+        return NOT_CONVERGED
+    return code
 
 
 def _further(experiment: Any, problem: Any, found: Any) -> Any:

@@ -67,7 +67,9 @@ def print_fit(
 ) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
-    print(f"{fit.status}: {judged}{fit.verdict.text}")
+    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
+    # Did the optimiser arrive; what do the data determine; is the model adequate.
+    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {fit.adequacy.summary}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")

@@ -62,6 +62,10 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     assert main(["fit", str(bench), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert "rest on the prior of a" in shown.out
+    first = shown.out.splitlines()[0]
+    assert first.startswith("converged: The data alone determine only a/Ixx and a/If")
+    assert first.endswith("adequate: yes")
+    assert "determined: a/Ixx = " in shown.out
     assert "report:" in shown.out
     assert "Ixx" in shown.out
     assert {p.name for p in out.iterdir()} == {
@@ -70,6 +74,9 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     result = json.loads((out / "fit.json").read_text())
     assert result["status"] == "converged"
     assert result["identifiable"] is True
+    assert result["adequate"] is True
+    assert result["adequacy"]["judged"][0]["output"] == "roll"
+    assert {c["name"] for c in result["determined_combinations"]} == {"a/Ixx", "a/If"}
     assert result["parameters"]["a"]["prior_share"] > 0.95
     assert result["n_samples"] == 600
     assert len(result["baseline_rls"]["theta"]) == 9

@@ -99,10 +99,13 @@ def _sentences(
 ) -> list[str]:
     said = []
     if fit.coloured and any({"profile", "nuts"} & set(by) for by in found.values()):
+        # Only what can be had: no bootstrap with a free time shift, no filter without an axis.
+        bootstrap_too = booted is not None or not fit.reached.layout.shift
         said.append(
             "The residuals are coloured: profile and NUTS take them for white and are too narrow. "
-            "Believe the Gaussian interval, which allows for their memory, or the bootstrap, which "
-            "draws noise of their spectrum; or fit by filter error."
+            "Believe the Gaussian interval, which allows for their memory"
+            + (", or the bootstrap, which draws noise of their spectrum" if bootstrap_too else "")
+            + ("; or fit by filter error." if fit.disturbable else ".")
         )
     if booted is not None and booted.failures:
         said.append(

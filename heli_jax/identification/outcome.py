@@ -12,6 +12,7 @@ from jaxtyping import Array
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification import excitation
+from heli_jax.identification.adequacy import Adequacy, Record, assess
 from heli_jax.identification.coloured import Sandwich, residual_curvature, sandwich
 from heli_jax.identification.estimates import (
     bound_notes,
@@ -24,7 +25,7 @@ from heli_jax.identification.evaluation import Evaluation, evaluate
 from heli_jax.identification.holds import other_hold
 from heli_jax.identification.identifiability import Z95, Verdict
 from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import Layout, Noise, Reached, unpack
+from heli_jax.identification.layout import Data, Layout, Noise, Reached, unpack
 from heli_jax.identification.metrics import NO_METRICS, Metrics, Whiteness, metrics, whiteness
 from heli_jax.identification.noise import (
     NO_DISTURBANCE,
@@ -96,6 +97,11 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
     reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    params = naming.replace(problem.vehicle, **values)
+    against = None
+    if layout.filtered and not none:
+        against = _against_disturbance(layout, data, noise, e, best.z)
+    adequacy = _adequacy(problem, params, signals, white, against)
     notes = [
         *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
@@ -106,7 +112,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *stated_noise_notes(problem, sds),
         *bound_notes(estimates),
         *_hold_notes(problem, search, settled, e, named),
-        *_useless_notes(_pooled(signals)),
+        *adequacy.sentences,
         *(checked.notes if checked else ()),
     ]
     return Fit(
@@ -116,7 +122,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         n_samples=n,
         estimates=estimates,
         nuisance=nuisance,
-        params=naming.replace(problem.vehicle, **values),
+        params=params,
         verdict_before=ran.before,
         verdict=verdict,
         noise=sds,
@@ -129,6 +135,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         one_step=_pooled(signals, one_step=True),
         one_step_validation=_pooled(validation, one_step=True),
         whiteness=white,
+        adequacy=adequacy,
         coloured=coloured,
         starts=table(layout, data, ran.points, ran.runs),
         steps=sum(s for s, _ in settled.trace),
@@ -202,15 +209,58 @@ def _hold_notes(
     return other_hold(problem, *at, e, sd, in_doubt=True)
 
 
-def _useless_notes(pooled: dict[str, Metrics]) -> list[str]:
-    """Where the model says less than no model at all."""
-    return [
-        f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
-        f"{m.vaf:.3g}): its parameters mean little. Are the columns, signs and units the right "
-        "ones, and the start values near?"
-        for name, m in pooled.items()
-        if m.vaf < 0
-    ]
+def _adequacy(
+    problem: Problem,
+    params: Any,
+    signals: tuple[Signals, ...],
+    white: dict[str, Whiteness],
+    against: dict[str, float] | None,
+) -> Adequacy:
+    records = tuple(
+        Record(s.flight, flight.dt, s.measured, s.simulated)
+        for s, flight in zip(signals, problem.training, strict=True)
+    )
+    return assess(problem, params, records, _pooled(signals), white, against)
+
+
+_BLIND = 1e4
+"""so many times the signal is a noise from which a filter learns nothing"""
+
+
+def _against_disturbance(
+    layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
+) -> dict[str, float]:
+    """By output, the power of the simulation's error over that which disturbance and noise make.
+
+    A filter whose measurements are all but noise never corrects its state: the variance of its
+    innovations is then that of a simulation's error. The program is the one that is compiled.
+    """
+    sizes = tuple(
+        {n: np.asarray(_BLIND * _moved(y), np.asarray(s[n]).dtype) for n, y in f.outputs.items()}
+        for f, s in zip(data.flights, noise.sd, strict=True)
+    )
+    blind = evaluate(layout, data, noise._replace(sd=sizes), z)
+    scales = unpack(layout, data, z).scales
+    power: dict[str, list[float]] = {}
+    for raw, one, big, sd in zip(e.raw, blind.innovations, sizes, noise.sd, strict=True):
+        for n, s in one.variance.items():
+            factor = float(scales.get(n, 1.0)) ** 2
+            spread = np.maximum(np.asarray(s) - float(big[n]) ** 2 * factor, 0.0)
+            expected = spread + float(sd[n]) ** 2 * factor
+            seen = np.isfinite(raw[n])
+            have = power.setdefault(n, [0.0, 0.0])
+            with np.errstate(all="ignore"):
+                have[0] += float(np.var(raw[n][seen])) * int(seen.sum())
+                have[1] += float(np.nansum(expected))
+    return {
+        n: float(missed / expected) if np.isfinite(expected) and expected > 0 else 0.0
+        for n, (missed, expected) in power.items()
+    }
+
+
+def _moved(y: Any) -> float:
+    y = np.asarray(y)
+    return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
 
 
 def _disturbance_notes(ratio: float | None) -> list[str]:

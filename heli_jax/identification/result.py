@@ -5,6 +5,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.identification.adequacy import UNJUDGED, Adequacy
 from heli_jax.identification.identifiability import Verdict
 from heli_jax.identification.layout import Reached
 from heli_jax.identification.metrics import Metrics, Whiteness
@@ -117,6 +119,8 @@ class Fit:
     """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
     """with windows: the same simulated in one piece, from the initial state of the first window"""
+    adequacy: Adequacy = UNJUDGED
+    """whether the model explains what was measured, judged against what"""
     coloured: bool = False
     """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0
@@ -126,6 +130,17 @@ class Fit:
     def lost(self) -> tuple[str, ...]:
         """The free parameters that the data do not determine."""
         return tuple(n for n, e in self.estimates.items() if e.sd is None)
+
+    @property
+    def adequate(self) -> bool:
+        """Whether the model explains what was measured (`adequacy` says why not)."""
+        return self.adequacy.adequate
+
+    @property
+    def disturbable(self) -> bool:
+        """Whether filter error could be tried: its model has an axis to disturb and none yet."""
+        model = self.reached.layout.model
+        return model.noise is None and bool(disturbable(model))
 
     @property
     def aic(self) -> float:

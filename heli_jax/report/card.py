@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.identification.adequacy import EXPECTED
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability import ILL_CONDITIONED
 from heli_jax.identification.metrics import Metrics
@@ -54,6 +55,11 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
         lines += _of_agreement(name, m, "held out, simulated", judged=not filtered)
     for name, m in fit.one_step_validation.items():
         lines += _of_agreement(name, m, "held out, one step ahead", judged=True)
+    for one in fit.adequacy.judged:
+        if one.against_disturbance is not None:
+            said = "a simulation knows no disturbance: judged against what the estimated one makes"
+            of, ratio = f"{one.output}, simulated", one.against_disturbance
+            lines.append(_most("error power over expected", of, ratio, "", EXPECTED, said))
     what = "innovations" if filtered else "residuals"
     for name, w in fit.whiteness.items():
         remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
@@ -143,7 +149,7 @@ def _of_agreement(name: str, m: Metrics, how: str, *, judged: bool) -> list[Gate
     ]
     if judged:
         return lines
-    said = "not judged: a simulation does not know the disturbance"
+    said = "a simulation does not know the disturbance: see its error over what is expected"
     return [one._replace(gate="", passed=None, remark=said) for one in lines]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from heli_jax.flights import Flight
 from heli_jax.flights.write import stacked, write_table
+from heli_jax.identification.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.identification.baseline import Baseline
 from heli_jax.identification.choice import Choice
 from heli_jax.identification.fit import Estimate, Fit, Signals
@@ -38,6 +39,8 @@ def fit_json(
             "method": fit.method,
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
+            "adequate": fit.adequate,
+            "adequacy": _adequacy(fit.adequacy),
             "null_directions": list(fit.verdict.null_directions),
             "determined_combinations": _combinations(fit.verdict),
             "verdict": _verdict(fit.verdict),
@@ -73,6 +76,18 @@ def fit_json(
             "seed": fit.seed,
         }
     )
+
+
+def _adequacy(found: Adequacy) -> dict[str, Any]:
+    return {
+        **found._asdict(),
+        "judged": [one._asdict() for one in found.judged],
+        "against": {
+            "explained_at_least": EXPLAINED,
+            "or_other_than_white_noise_at_most": NEARLY_WHITE,
+            "or_power_over_what_the_disturbance_makes_at_most": EXPECTED,
+        },
+    }
 
 
 def _choice(choice: Choice | None) -> dict[str, Any] | None:
@@ -116,8 +131,8 @@ def whiteness_note(fit: Fit) -> str:
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
-            "residuals' autocorrelation. They are honest about a poor estimate: "
-            "filter-error makes a better one."
+            "residuals' autocorrelation. They are honest about a poor estimate"
+            + (": filter-error makes a better one." if fit.disturbable else ".")
         )
     else:
         consequence = "The intervals count every sample as news and are too narrow."
@@ -157,6 +172,8 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
         "determined_combinations": _combinations(verdict),
         "strong_pairs": [p._asdict() for p in verdict.pairs],
         "without_effect": list(verdict.without_effect),
+        "resting_on_priors": list(verdict.resting),
+        "exchangeable_nuisances": list(verdict.exchangeable),
         "names": list(verdict.names),
         "correlation": verdict.correlation,
         "covariance_log": verdict.covariance,

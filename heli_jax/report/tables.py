@@ -45,6 +45,15 @@ def _listed(names: list[str] | tuple[str, ...]) -> str:
 
 
 def headline(fit: Fit) -> Headline:
+    """Did the optimiser arrive; what do the data determine; is the model adequate."""
+    level, word, text = _determined(fit)
+    if not fit.adequate:
+        worst = fit.adequacy.less_than_mean or level == "bad"
+        level = "bad" if worst else "warning"
+    return Headline(level, word, f"{text}; adequate: {fit.adequacy.summary}")
+
+
+def _determined(fit: Fit) -> Headline:
     """The status in words: what the data determine, and whether that may be believed."""
     v, names = fit.verdict, tuple(fit.estimates)
     if fit.status == "not-converged":
@@ -53,8 +62,8 @@ def headline(fit: Fit) -> Headline:
     if fit.status == "not-identifiable":
         lost = [n for n in v.names if n in v.undetermined or n in v.without_effect]
         text = f"the data do not determine {_listed(lost or list(v.names))}"
-        return Headline("bad", "not identifiable", text)
-    resting = v.rank_without_priors < v.rank
+        return Headline("bad", "converged, not identifiable", text)
+    resting = bool(v.resting)
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {_listed(names)}"
     doubts = [

@@ -91,7 +91,9 @@ def test_paper_s_factor_is_told(sound_page):
 
 def test_undetermined_parameters_have_no_numbers(lost, lost_page):
     fit = lost[0]
-    assert "✗ not identifiable: the data do not determine Ixx, If and a" in words(lost_page)
+    assert "✗ converged, not identifiable: the data do not determine Ixx, If and a" in words(
+        lost_page
+    )
     for row in tables.parameters(fit).rows:
         assert row[1] == "not determined"
         assert row[2:5] == ("–",) * 3

@@ -1,0 +1,156 @@
+"""Is a model adequate: white residuals are, drifts and wrong signs are not, each with a remedy that
+exists. Records are made in NumPy."""
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem, cli, fit, models
+from heli_jax.identification.adequacy import Record, assess
+from heli_jax.identification.metrics import metrics, whiteness
+from tests.identification.bench import BENCH, vehicle
+from tests.identification.test_filter_error import FREE, made
+
+N, DT = 400, 0.05
+
+
+class Params(NamedTuple):
+    Lp: float
+    Ld: float
+
+
+class State(NamedTuple):
+    p: float
+
+
+class Inputs(NamedTuple):
+    d: float
+
+
+class Outputs(NamedTuple):
+    p: float
+
+
+own = Model(
+    "own",
+    lambda p, s, u: State(p=p.Lp * s.p + p.Ld * u.d),
+    lambda p, s, u: Outputs(p=s.p),
+    Params, State, Inputs, Outputs, linear=True,
+)  # fmt: skip
+rng = np.random.default_rng(5)
+D = np.repeat(rng.uniform(-1.0, 1.0, N // 8), 8)
+DECAY = np.exp(-2.0 * DT)
+P = scipy.signal.lfilter([0.0, 5.0 * (1.0 - DECAY) / 2.0], [1.0, -DECAY], D)
+WHITE = rng.standard_normal(N)
+SLOW = scipy.signal.lfilter([1.0], [1.0, -0.98], rng.standard_normal(N))
+SLOW /= SLOW.std()
+
+
+def judged(measured, simulated, *, model=own, against=None, **how):
+    if model is own:
+        params, free, inputs, name = Params(-2.0, 5.0), {"Lp": Free(-2.0)}, {"d": D}, "p"
+    else:
+        params, free, inputs, name = (
+            vehicle(BENCH),
+            {"Ixx": Free(0.03)},
+            {"x_roll": 1e-6 * D},
+            "roll",
+        )
+    flight = Flight(dt=DT, inputs=inputs, outputs={name: measured})
+    problem = Problem(model, params, [flight], free, **how)
+    record = Record("flight 1", DT, {name: measured}, {name: simulated})
+    white = {f"flight 1/{name}": whiteness(measured - simulated)}
+    against = None if against is None else {name: against}
+    agreement = {name: metrics(measured, simulated)}
+    return assess(problem, params, (record,), agreement, white, against)
+
+
+def test_white_residuals_are_adequate_whatever_is_explained():
+    for measured, simulated in (
+        (P + 0.05 * WHITE, P), (0.1 * P + 3.0 * WHITE, 0.1 * P), (WHITE, 0.01 * P),
+    ):  # fmt: skip
+        found = judged(measured, simulated)
+        assert found.adequate
+        assert found.summary == "yes"
+        assert found.sentences == ()
+
+
+def test_a_good_fit_with_coloured_residuals_is_adequate():
+    found = judged(P + 0.14 * P.std() * SLOW, P)
+    assert 0.97 < found.judged[0].vaf < 0.99
+    assert not found.judged[0].white
+    assert found.adequate
+
+
+def test_a_slow_rest_asks_for_filter_error_only_where_there_is_an_axis():
+    drift = P + 2.0 * P.std() * SLOW
+    found = judged(drift, P)
+    assert not found.adequate
+    assert "no axis to disturb" in " ".join(found.sentences)
+    assert "filter-error" not in " ".join(found.sentences)
+    flown = judged(drift, 0.1 * P, model=models.roll_on_stand)
+    assert not flown.adequate
+    assert "filter-error with disturbance: {axis: roll, poles: 1}" in " ".join(flown.sentences)
+
+
+def test_a_wrong_sign_is_told_even_where_the_fit_has_shrunk():
+    for simulated in (P, 0.001 * P):
+        found = judged(-P + 0.01 * WHITE, simulated)
+        assert not found.adequate
+        [said] = [s for s in found.advice if "moves against" in s]
+        assert "signs and columns of p and d" in said
+
+
+def test_a_late_input_and_a_divergent_simulation_have_remedies_of_their_own():
+    late = np.concatenate([np.zeros(8), P[:-8]])
+    found = judged(late + 0.3 * SLOW, 0.4 * P)
+    assert not found.adequate
+    assert any("0.4 s later" in s and "nuisance.time_shift: true" in s for s in found.advice)
+    with_shift = judged(late + 0.3 * SLOW, 0.4 * P, nuisance=Nuisance(time_shift=True))
+    assert not any("time_shift" in s for s in with_shift.advice)
+    diverged = judged(P + 0.01 * WHITE, P + 1e-2 * np.exp(0.03 * np.arange(N)))
+    assert diverged.less_than_mean
+    assert "less than its mean" in diverged.summary
+    assert any("fit.shooting: {window: 2.0}" in s for s in diverged.advice)
+    within = judged(P + 0.01 * WHITE, P + 1e-2 * np.exp(0.03 * np.arange(N)), window=2.0)
+    assert not any("fit.shooting" in s for s in within.advice)
+
+
+def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
+    disturbed = P + 1.3 * P.std() * SLOW
+    small, as_expected = judged(disturbed, P, against=30.0), judged(P + 3.0 * WHITE, P, against=1.2)
+    assert not small.adequate
+    assert "5.5 times what the estimated disturbance explains" in small.reasons[0]
+    assert as_expected.adequate
+    # Innovations that are far from white: the filter does not predict what it says.
+    assert not judged(P + 3.0 * P.std() * SLOW, P, against=1.2).adequate
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30, seed):
+    model, _, start, flight = made(bench30, seed)
+    right = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+    assert right.adequate
+    assert 0.2 < right.adequacy.judged[0].against_disturbance < 5.0
+    turned = Flight(
+        dt=flight.dt, inputs={"x_roll": -flight.inputs["x_roll"]}, outputs=flight.outputs
+    )
+    wrong = fit(Problem(model, start, [turned], FREE, method="filter-error"))
+    assert not wrong.adequate
+    assert any("moves against the measured one" in note for note in wrong.notes)
+
+
+@pytest.mark.parametrize(
+    ("status", "less", "code"),
+    [
+        ("converged", False, 0), ("converged", True, 4),
+        ("not-identifiable", True, 3), ("not-converged", True, 4),
+    ],
+)  # fmt: skip
+def test_exit_codes(status, less, code, capsys):
+    adequacy = SimpleNamespace(reasons=("VAF of p is -586",) if less else (), less_than_mean=less)
+    assert cli._fit_code(SimpleNamespace(status=status, adequacy=adequacy)) == code
+    assert ("the model is not adequate: VAF of p is -586" in capsys.readouterr().err) is less
