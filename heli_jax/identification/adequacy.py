@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from heli_jax import naming
 from heli_jax.analysis.linear import modes
@@ -124,6 +125,7 @@ def assess(
     agreement: Mapping[str, Metrics],
     whiteness: Mapping[str, Whiteness],
     against: Mapping[str, float] | None = None,
+    unknowns: int = 0,
 ) -> Adequacy:
     """Judge the fitted flights.
 
@@ -134,6 +136,8 @@ def assess(
         whiteness: by 'flight/output', of the residuals, with filter error of the innovations.
         against: with a disturbance, by output the power of the simulation's error over that which
             disturbance and noise make; without, the simulation has to explain by itself.
+        unknowns: how many were estimated; a response that explains no more than as many unknowns
+            explain of noise by chance shows nothing.
     """
     unstable = _unstable(problem, params)
     judged = tuple(
@@ -142,6 +146,8 @@ def assess(
         if not _still(name, records)
     )
     bad = [one for one in judged if not one.adequate]
+    if judged and not bad and against is None and not _stands_out(judged, records, unknowns):
+        return _nothing_shown(judged)
     advice = [text for one in bad for text in _advice(problem, one, records, unstable)]
     remarks = [
         f"Driven by the inputs alone, the model follows {one.output} worse than its mean does (VAF "
@@ -157,6 +163,36 @@ def assess(
         tuple(_reason(one) for one in bad),
         tuple(dict.fromkeys(advice)),
         tuple(remarks),
+    )
+
+
+_BY_CHANCE = 1e-3
+"""probability that noise alone is explained as well"""
+
+
+def _stands_out(judged: tuple[Judged, ...], records: tuple[Record, ...], unknowns: int) -> bool:
+    """Whether the response of some output stands out of the noise: a likelihood ratio of the model
+    against a constant (Wilks, 1938)."""
+    for one in judged:
+        measured = [r.measured[one.output] for r in records if one.output in r.measured]
+        n = sum(int(np.isfinite(y).sum()) for y in measured)
+        gained = -n * np.log(max(1.0 - one.vaf, 1e-300))
+        if unknowns < 1 or scipy.special.chdtrc(unknowns, max(gained, 0.0)) < _BY_CHANCE:
+            return True
+    return not judged
+
+
+def _nothing_shown(judged: tuple[Judged, ...]) -> Adequacy:
+    outputs = " and ".join(f"{one.output} (VAF {one.vaf:.2g})" for one in judged)
+    return Adequacy(
+        False,
+        False,
+        tuple(one._replace(adequate=False) for one in judged),
+        (
+            f"The response does not stand out of the noise in {outputs}: as many unknowns explain "
+            "as much of noise alone.",
+        ),
+        ("Use larger or more inputs, a longer record, or an output with less noise.",),
     )
 
 

@@ -101,7 +101,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     against = None
     if layout.filtered and not none:
         against = _against_disturbance(layout, data, noise, e, best.z)
-    adequacy = _adequacy(problem, params, signals, white, against)
+    adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = [
         *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
@@ -215,12 +215,13 @@ def _adequacy(
     signals: tuple[Signals, ...],
     white: dict[str, Whiteness],
     against: dict[str, float] | None,
+    unknowns: int,
 ) -> Adequacy:
     records = tuple(
         Record(s.flight, flight.dt, s.measured, s.simulated)
         for s, flight in zip(signals, problem.training, strict=True)
     )
-    return assess(problem, params, records, _pooled(signals), white, against)
+    return assess(problem, params, records, _pooled(signals), white, against, unknowns)
 
 
 _BLIND = 1e4

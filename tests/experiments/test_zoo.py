@@ -1,0 +1,27 @@
+"""One of each kind of the hundred problems with known answers."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+from heli_jax import fit
+
+ZOO = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "zoo.py"))
+KINDS = {kind.__name__: kind for kind, _ in (*ZOO["SOUND"], *ZOO["UNSOUND"])}
+
+
+@pytest.fixture(autouse=True)
+def _from_the_root(monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+
+
+def test_there_are_a_hundred_and_half_are_sound():
+    assert sum(count for _, count in ZOO["SOUND"]) == 50
+    assert sum(count for _, count in ZOO["UNSOUND"]) == 50
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+def test_no_silent_success_and_no_false_alarm(kind):
+    puzzle = kind(0)
+    assert not ZOO["complaint"](puzzle, fit(puzzle.problem))
