@@ -114,7 +114,7 @@ def _stand_may_vanish(problem: Problem) -> bool:
             lower = problem.free[name].lower
             if lower is not None and lower > 0:
                 return False
-        elif any(float(f.known.get(name, values[name])) != 0.0 for f in problem.training):
+        elif any(f.known.get(name, values[name]) != 0.0 for f in problem.training):
             return False
     return True
 

@@ -10,10 +10,18 @@ from heli_jax.identification.data import data_of
 from heli_jax.identification.estimates import deviations, extreme_noise_notes
 from heli_jax.identification.evaluation import evaluate
 from heli_jax.identification.layout import layout_of, unpack
-from heli_jax.identification.noise import first_noise
+from heli_jax.identification.noise import (
+    Settled,
+    disturbance_or_none,
+    first_noise,
+    log_likelihood,
+)
+from heli_jax.identification.optimise import Optimum
+from heli_jax.identification.search import Search
 from heli_jax.identification.start import start_vector
 from heli_jax.naming import asdict
 from tests.identification.bench import BENCH, record, vehicle
+from tests.identification.test_filter_error import made
 
 MODEL = with_disturbance(models.roll_on_stand, "roll")
 FREE = {"Ixx": Free(0.048), "If": Free(6.8e-5)}
@@ -70,3 +78,23 @@ def test_a_disturbance_has_ends():
         assert "tau_w is not determined" in note
         assert words in note
     assert extreme_noise_notes(layout, data, z.at[at - 1].set(0.0)) == []
+
+
+def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
+    # The optimiser's word is 'converged', at a point below the model without disturbance.
+    model, _, start, flight = made(bench30, 1)
+    free = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
+    one = Problem(model, start, [flight], free, method="filter-error")
+    layout, data = layout_of(one, one.training), data_of(one, one.training)
+    noise = first_noise(one, one.training)
+    z = start_vector(layout, data, one)
+    z = z.at[0].add(2.0).at[layout.noise_at("sigma_w")].set(-25.0)
+    z = z.at[layout.noise_at("tau_w")].set(-7.0)
+    found = Settled(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
+    search = Search(one, layout, data, 200)
+    settled = disturbance_or_none(search, found)
+    e = evaluate(layout, data, settled.noise, settled.best.z)
+    best = fit(one)
+    reached = log_likelihood(layout, data, settled.noise, e)
+    assert reached == pytest.approx(best.log_likelihood, abs=2.0)
+    assert any("begun anew" in note for note in settled.notes)
