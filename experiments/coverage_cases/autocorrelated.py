@@ -24,7 +24,7 @@ Missing = Callable[[int, np.random.Generator], np.ndarray]
 MISSING: dict[str, Missing] = {
     "complete": lambda n, rng: np.zeros(n, bool),
     "every second sample missing": lambda n, rng: np.arange(n) % 2 == 1,
-    "a random half missing": lambda n, rng: rng.uniform(size=n) < 0.5,
+    "a random half missing": lambda n, rng: rng.permutation(n) < n // 2,
 }
 
 

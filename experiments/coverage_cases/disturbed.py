@@ -3,22 +3,18 @@
 import numpy as np
 import scipy.linalg
 
+from coverage_cases import Case
 from heli_jax import Helicopter
-
-OUTPUTS = {"roll": 0, "roll_rate": 1}
 
 
 def matrices(v: Helicopter) -> tuple[np.ndarray, np.ndarray]:
     """A (4, 4) and B (4,) of eqs 21-22 on the stand; the state is roll, its rate, the flybar's
     angle and its rate."""
-    g = {
-        n: float(getattr(v, n))
-        for n in (*["a", "R", "c", "R1", "R2", "L1", "L2", "L3", "L4", "L5", "Omega", "rho"],)
-    }
-    moment = 0.5 * g["rho"] * g["Omega"] ** 2 * g["a"] * g["c"] * g["R"] ** 4
-    mixing = moment / float(v.Ixx) / (g["L1"] * (g["L2"] + g["L3"]))
-    lift = g["rho"] * g["Omega"] ** 2 * g["a"] * g["c"] * (g["R2"] ** 4 - g["R1"] ** 4)
-    lift /= 8.0 * float(v.If)
+    names = ("a", "R", "c", "R1", "R2", "L1", "L2", "L3", "L4", "L5", "Omega", "rho", "Ixx", "If")
+    g = {n: float(getattr(v, n)) for n in names}
+    force = g["rho"] * g["Omega"] ** 2 * g["a"] * g["c"]
+    mixing = 0.5 * force * g["R"] ** 4 / (g["Ixx"] * g["L1"] * (g["L2"] + g["L3"]))
+    lift = force * (g["R2"] ** 4 - g["R1"] ** 4) / (8.0 * g["If"])
     A = np.zeros((4, 4))
     A[0, 1] = A[2, 3] = 1.0
     A[1] = [-float(v.kappa), -float(v.zeta), mixing * g["L2"] * g["L4"], 0.0]
@@ -50,5 +46,5 @@ def response(
     return np.array(states)
 
 
-def cases() -> list:
+def cases() -> list[Case]:
     return []

@@ -15,7 +15,7 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.naming import asdict
 from heli_jax.simulation.inputs import random_steps
 
-N, DT, NOISE, SIGMA, TAU = 1500, 0.02, 1e-3, 1.04, 1.0
+N, DT, NOISE, SIGMA, TAU = 4000, 0.02, 1e-3, 1.04, 1.0
 
 
 def one_run(fixed: tuple[str, ...], seed: int) -> Run:
