@@ -19,6 +19,7 @@ from heli_jax.config import (
     signals,
 )
 from heli_jax.dynamics.model import Model, needed_but_missing, zeros
+from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import decide
@@ -155,7 +156,8 @@ def _run(
     start, pilot, ends = None, None, {}
     if is_whole(experiment.model):
         begin = _begin(experiment, wanted, where)
-        start = _extended(model, begin.state)
+        given = {n: jnp.asarray(v) for n, v in experiment.config.initial_state.items()}
+        start = _extended(model, naming.replace(begin.state, **given))
         trimmed = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
         # What trim leaves of a stick in the middle, 1e-79, is for no reader of a log.
         trimmed = {k: v if abs(v) > _MIDDLE else 0.0 for k, v in trimmed.items()}
@@ -224,7 +226,9 @@ def _extended(model: Model, state: Any) -> Any:
 
 def _diverged(experiment: Experiment, run: Trajectory) -> str:
     if not is_whole(experiment.model):
-        return "the run is not finite: the model is unstable with this vehicle"
+        first = {k: float(np.asarray(v)[0]) for k, v in naming.asdict(run.inputs).items()}
+        wrong = cannot_start(experiment.model, experiment.vehicle.params, first)
+        return wrong or "the run is not finite: the model is unstable with this vehicle"
     return (
         f"the run is not finite from {_lost(run):g} s on, wanted is a shorter duration, gentler "
         "inputs or hold_attitude: true"
@@ -306,7 +310,12 @@ def follow(experiment: Experiment) -> Simulated:
         runs[f"{len(runs) + 1}: {flight.name}"] = run
         notes += [f"{flight.name}: {note}" for note in _notes(experiment, run)]
         if not run.finite:
-            notes.append(f"{flight.name}: the run is not finite from {_lost(run):g} s on")
+            first = {n: float(u[0]) for n, u in flight.inputs.items()}
+            params = naming.replace(experiment.vehicle.params, **known)
+            wrong = "" if is_whole(model) else cannot_start(model, params, first)
+            notes.append(
+                f"{flight.name}: {wrong or f'the run is not finite from {_lost(run):g} s on'}"
+            )
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     return Simulated(columns, model, runs, tuple(notes))
 

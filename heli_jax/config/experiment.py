@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import pydantic
 from pydantic import BaseModel
 
-from heli_jax import models
+from heli_jax import models, naming
 from heli_jax.config.schema import Config
 from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, nearest
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import parse_value, read_mapping
@@ -46,10 +47,23 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
 def _model(config: Config, path: Path) -> Model:
     folder = path.absolute().parent
     model = models.by_name(config.model, f"{path}: model", folder)
-    if config.corrections is None:
+    if config.corrections is not None:
+        where = f"{path}: corrections"
+        model = models.by_name(config.model, where, folder, corrections=config.corrections)
+    return _started(config, path, model)
+
+
+def _started(config: Config, path: Path, model: Model) -> Model:
+    """The model with the configuration's initial state."""
+    if not config.initial_state:
         return model
-    where = f"{path}: corrections"
-    return models.by_name(config.model, where, folder, corrections=config.corrections)
+    for name in config.initial_state:
+        if name not in naming.names(model.State):
+            raise InputError(
+                f"{path}: initial_state: model {model.name} has no state {name!r}"
+                f"{nearest(name, naming.names(model.State))}"
+            )
+    return starting_at(model, config.initial_state)
 
 
 def in_wind(experiment: Experiment) -> Experiment:
@@ -66,7 +80,7 @@ def in_wind(experiment: Experiment) -> Experiment:
         corrections=config.corrections,
         wind=True,
     )
-    return experiment._replace(model=model)
+    return experiment._replace(model=_started(config, path, model))
 
 
 def _override(content: dict[str, Any], text: str) -> None:

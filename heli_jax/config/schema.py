@@ -271,6 +271,9 @@ class Config(_Strict):
     corrections: dict[str, StrictBool] | None = None
     """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
     off in place of what the model has; for the whole helicopter only"""
+    initial_state: dict[str, Finite] = {}
+    """values of states at the first sample in SI, in place of the model's own: for models that
+    cannot begin at zero"""
     flights: list[FlightConfig] = []
     fit: FitConfig | None = None
     rls: RLSConfig | None = RLSConfig()

@@ -69,6 +69,11 @@ def sweep_job(
         if made is not None:
             raise InputError(f"{where}.start: wanted is simulate.start, which makes the inputs")
         trimmed = Trimmed(Condition(**wanted.start.model_dump()), sticks=False, of=experiment.model)
+    if trimmed is not None and experiment.config.initial_state:
+        raise InputError(
+            f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
+            "wanted is a configuration without it"
+        )
     try:
         return job(
             model,

@@ -30,6 +30,7 @@ from heli_jax.identification.metrics import (
     cross_correlation,
     noise_guess,
 )
+from heli_jax.identification.operating_point import operating_point
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.simulation.simulate import simulate
 
@@ -139,7 +140,7 @@ def assess(
         unknowns: how many were estimated; a response that explains no more than as many unknowns
             explain of noise by chance shows nothing.
     """
-    unstable = _unstable(problem, params)
+    unstable = against is not None and _unstable(problem, params)
     judged = tuple(
         _judged(name, m, records, whiteness, None if against is None else against[name], unstable)
         for name, m in agreement.items()
@@ -148,6 +149,7 @@ def assess(
     bad = [one for one in judged if not one.adequate]
     if judged and not bad and against is None and not _stands_out(judged, records, unknowns):
         return _nothing_shown(judged)
+    unstable = unstable or (bool(bad) and _unstable(problem, params))
     advice = [text for one in bad for text in _advice(problem, one, records, unstable)]
     remarks = [
         f"Driven by the inputs alone, the model follows {one.output} worse than its mean does (VAF "
@@ -399,11 +401,14 @@ def _unstable(problem: Problem, params: Any) -> bool:
     longest = max(f.duration for f in problem.training)
     longest = longest if problem.window is None else min(longest, problem.window)
     for flight in problem.training:
-        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+        here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
+        at = operating_point(
+            problem.model, here, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
+        )
         try:
-            found = modes(problem.model, naming.replace(params, **known))
-        except np.linalg.LinAlgError:
-            return True
+            found = modes(problem.model, here, at.state, at.inputs)
+        except np.linalg.LinAlgError:  # no finite matrices there: nothing is known of the modes
+            continue
         if np.max(np.real(found)) * longest > _GROWTH:
             return True
     return False

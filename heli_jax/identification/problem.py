@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
+from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.vehicle import impossible, of_helicopter
@@ -321,8 +322,21 @@ def _check_model(problem: Problem) -> None:
             raise ValueError(
                 f"vehicle: {', '.join(missing)} missing, model {problem.model.name} needs it"
             )
+    if not problem.model.linear:
+        _check_start(problem, params)
     if problem.model.linear and linear_misfit(problem.model, params) > 1e-6:
         raise ValueError(
             f"model {problem.model.name} says linear=True, but its vector field or output is not "
             "linear in state and inputs at the start values"
         )
+
+
+def _check_start(problem: Problem, params: Any) -> None:
+    """Refuse a model that cannot begin where it is told to; one of ours begins anywhere."""
+    if of_helicopter(problem.model.Params):
+        return
+    for flight in problem.flights:
+        first = {n: float(u[0]) for n, u in flight.inputs.items()}
+        wrong = cannot_start(problem.model, naming.replace(params, **flight.known), first)
+        if wrong:
+            raise ValueError(wrong)

@@ -87,9 +87,9 @@ def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     """The same without windows: each flight from the initial state of its first."""
     kept, at, k = [np.arange(layout.weak)], layout.weak, len(layout.states)
     for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
-        biases = len(outputs) if layout.bias else 0
-        kept += [at + np.arange(k), at + count * k + np.arange(biases)]
-        at += count * k + biases
+        constants = layout.constants(outputs)
+        kept += [at + np.arange(k), at + count * k + np.arange(constants)]
+        at += count * k + constants
     # As long as one window that holds them all.
     windows = tuple((1, count * m) for count, m in layout.windows)
     return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
@@ -105,7 +105,7 @@ def _notes(held: tuple[Flight, ...], e: Evaluation, arrived: bool) -> list[str]:
             )
     if not arrived and not notes:
         notes.append(
-            "Held out: the initial states and biases that suit the flights best were not found "
+            "Held out: the initial states, biases and offsets that suit the flights best were not found "
             f"(after {_STEPS} steps at most), so the agreement given is a lower bound."
         )
     return notes

@@ -36,6 +36,9 @@ def relative(sd: float | None, value: float) -> str:
     return f"{share:#.2g}".rstrip(".") + " %" if share >= 1e-4 else f"{number(share, 2)} %"
 
 
+_FAR = 10.0
+
+
 def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
     """Values to the second digit of their standard deviation, then that deviation.
 
@@ -50,6 +53,9 @@ def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
     def one(v: float | None) -> str:
         if v is None or not math.isfinite(v):
             return number(v)
+        # An end of an interval over powers of ten has digits of its own.
+        if abs(v - first) > _FAR * sd and abs(v) > _FAR * abs(first):
+            return number(v, 3)
         return _signed(f"{round(v / 10.0**power, places):.{max(places, 0)}f}") + _times(power)
 
     return (*(one(v) for v in values), one(sd))

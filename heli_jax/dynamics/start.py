@@ -1,0 +1,95 @@
+"""Where a model starts: an initial state with some values given, and whether it can start there."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model, field_and_output, plain
+
+
+def starting_at(model: Model, values: Mapping[str, float]) -> Model:
+    """The model with an initial state that has the given values [SI] of some states.
+
+    Raises:
+        ValueError: a state that the model does not have.
+    """
+    for name in values:
+        if name not in naming.names(model.State):
+            raise ValueError(f"model {model.name} has no state {name!r}")
+
+    def start(params: Any) -> Any:
+        own = naming.asdict(model.initial_state(params))
+        given = {n: jnp.asarray(v, jnp.asarray(own[n]).dtype) for n, v in values.items()}
+        return model.State(**{**own, **given})
+
+    return dataclasses.replace(model, start=start)
+
+
+def cannot_start(model: Model, params: Any, inputs: Mapping[str, float] | None = None) -> str:
+    """Why a model cannot begin at its initial state, with the remedy; empty where it can.
+
+    Rates and outputs have to be finite there, and their derivatives by the states.
+
+    Args:
+        params: concrete numbers.
+        inputs: at the first sample; zero where not given.
+    """
+    params = plain(params)
+    names = naming.names(model.State)
+    own = naming.asdict(model.initial_state(params))
+    x = {n: np.float64(own[n]) for n in names}
+    u = model.Inputs(
+        **{n: np.float64((inputs or {}).get(n, 0.0)) for n in naming.names(model.Inputs)}
+    )
+    bad = _not_finite(model, params, x, u)
+    if not bad:
+        return ""
+    # The states at zero whose being elsewhere mends it.
+    zero = [n for n in names if x[n] == 0.0]
+    cause = [n for n in zero if len(_not_finite(model, params, {**x, n: _ONE}, u)) < len(bad)]
+    if not cause and not _not_finite(model, params, {**x, **dict.fromkeys(zero, _ONE)}, u):
+        cause = zero
+    verb = "is" if len(bad) == 1 else "are"
+    what = f"model {model.name}: {' and '.join(bad)} {verb} not finite at the initial state"
+    if not cause:
+        where = ", ".join(f"{n} = {x[n]:g}" for n in names)
+        return f"{what} ({where}); wanted is another Model.start, other parameters or inputs"
+    where = ", ".join(f"{n} = 0" for n in cause)
+    given = ", ".join(f"{n}: 1.0" for n in cause)
+    return (
+        f"{what}, where {where}; wanted is a Model.start that begins elsewhere, or in a "
+        f"configuration initial_state: {{{given}}} with the value of the record"
+    )
+
+
+_ONE = np.float64(1.0)
+
+
+def _not_finite(model: Model, params: Any, x: dict[str, Any], u: Any) -> tuple[str, ...]:
+    """The rates and outputs that are not finite at a point, or whose derivatives are not."""
+    with np.errstate(all="ignore"):
+        rates, outputs = field_and_output(model, params, model.State(**x), u)
+    values = {f"the rate of {n}": v for n, v in naming.asdict(rates).items()}
+    values |= {f"output {n}": v for n, v in naming.asdict(outputs).items()}
+    bad = tuple(n for n, v in values.items() if not np.isfinite(float(v)))
+    return bad or _no_slope(model, params, x, u)
+
+
+def _no_slope(model: Model, params: Any, x: dict[str, Any], u: Any) -> tuple[str, ...]:
+    """The rates whose derivatives by the states are not finite, such as that of a root at zero."""
+    dtype = jnp.result_type(float)
+
+    def rates(x: Any) -> Any:
+        return model.vector_field(params, model.State(**x), u)
+
+    slopes = jax.jacfwd(rates)({n: jnp.asarray(v, dtype) for n, v in x.items()})
+    return tuple(
+        f"the slope of the rate of {n}"
+        for n, by in naming.asdict(slopes).items()
+        if not np.isfinite([float(v) for v in jax.tree.leaves(by)]).all()
+    )
