@@ -10,6 +10,7 @@ import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, models
 from heli_jax.identification.identifiability import Held, Unknown, judge, projected
+from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
@@ -175,3 +176,16 @@ def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
         verdict = judge(hold * bare, (offset,), held=held)
         assert verdict.identifiable is identifiable
         assert verdict.prior_share["L0"] == pytest.approx(1.0 if hold > 10 else 0.75)
+
+
+def test_autocorrelated_residuals_and_a_state_that_no_output_shows():
+    """No warning on the way, and no remedy that there is not: the model has no axis to disturb."""
+    one = problem(BOUNDED, Nuisance(bias=False))
+    flight = one.flights[0]
+    drift = np.cumsum(np.random.default_rng(2).standard_normal(N)) * 0.1
+    slow = Flight(dt=DT, inputs=flight.inputs, outputs={"p": flight.outputs["p"] + drift})
+    found = fit(Problem(roll_rate, one.vehicle, [slow], one.free, one.nuisance))
+    assert found.coloured
+    assert not found.disturbable
+    assert found.nuisance["flight 1/initial unseen"].prior_share == pytest.approx(1.0)
+    assert "filter-error" not in whiteness_note(found) + " ".join(found.notes)
