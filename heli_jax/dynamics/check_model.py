@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import core
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
@@ -39,7 +40,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
             f"State, Inputs, Outputs) makes one, got {kind}"
         )
     # Ours are tested, and what they wrap was looked at when it was wrapped.
-    if str(getattr(model.vector_field, "__module__", "")).startswith("heli_jax."):
+    if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
         return
     parts = _Parts(*(getattr(model, name) for name in _Parts._fields))
     try:
@@ -242,7 +243,7 @@ def _kind(value: Any) -> str:
     """`a tuple of 2`, `None`, `a dict`."""
     if value is None:
         return "None"
-    if isinstance(value, jax.core.Tracer | jax.Array):
+    if isinstance(value, core.Tracer | jax.Array):
         return f"an array of shape {jnp.shape(value)}"
     if isinstance(value, tuple | list) and not _is_named_tuple(value):
         return f"a {type(value).__name__} of {len(value)}"

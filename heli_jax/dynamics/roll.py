@@ -9,8 +9,8 @@ import dataclasses
 import functools
 from typing import Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax import core
 
 from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
@@ -230,4 +230,4 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
 
 def _is_given(value: Scalar) -> bool:
     """Whether an optional constant is there; not so where it is traced, which nobody can tell."""
-    return not isinstance(value, jax.core.Tracer) and not bool(jnp.isnan(value))
+    return not isinstance(value, core.Tracer) and not bool(jnp.isnan(value))

@@ -49,8 +49,15 @@ def open_parquet(path: Path) -> "ParquetTable":
         texts = [f.name for f in schema if _is_text(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
-        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
+        sha256 = _sha256(opened)
     return ParquetTable(str(path), size, sha256, file)
+
+
+def _sha256(file: BinaryIO) -> str:
+    found = hashlib.sha256()
+    while piece := file.read(1 << 20):
+        found.update(piece)
+    return found.hexdigest()
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
@@ -110,12 +109,18 @@ def _spectra(
         return f"wanted are {least} segments of {length * dt:.3g} s, a record of {wanted:.3g} s"
     channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
     at = np.arange(segments)[:, None] * (length // 2) + np.arange(length)[None, :]
-    pieces = scipy.signal.detrend(channels[:, at], axis=-1, type="linear")
-    transforms = np.fft.rfft(pieces * np.hanning(length), axis=-1)[..., 1:-1]
+    transforms = np.fft.rfft(_detrended(channels[:, at]) * np.hanning(length), axis=-1)[..., 1:-1]
     transforms = np.moveaxis(transforms, -1, 0)  # (k, channels, segments)
     omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)[1:-1]
     inputs = np.moveaxis(transforms[:, :-2], 1, 2)
     return _Spectra(omega, inputs, transforms[:, -2], transforms[:, -1])
+
+
+def _detrended(pieces: np.ndarray) -> np.ndarray:
+    """Segments (..., n) less the straight line that fits each best."""
+    t = np.linspace(-1.0, 1.0, pieces.shape[-1])
+    slopes = (pieces @ t / (t @ t))[..., None]
+    return pieces - pieces.mean(axis=-1, keepdims=True) - slopes * t
 
 
 def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
