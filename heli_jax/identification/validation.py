@@ -105,7 +105,7 @@ def _notes(held: tuple[Flight, ...], e: Evaluation, arrived: bool) -> list[str]:
             )
     if not arrived and not notes:
         notes.append(
-            "Held out: the initial states, biases and offsets that suit the flights best were not found "
-            f"(after {_STEPS} steps at most), so the agreement given is a lower bound."
+            "Held out: the initial states, biases and offsets that suit the flights best were not "
+            f"found (after {_STEPS} steps at most), so the agreement given is a lower bound."
         )
     return notes
