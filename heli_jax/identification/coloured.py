@@ -112,7 +112,7 @@ class _Part(NamedTuple):
     def variance(self, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of D' J' r for the columns of D (q, k), and its degrees of freedom."""
         W = self.J @ D
-        power = np.sum((W.conj() * (self.S @ W)).real, axis=1)
+        power = np.sum(np.real(W.conj() * (self.S @ W)), axis=1)
         p = np.fft.irfft(power, self.window.size, axis=0)
         spent = np.sum(np.square(self.window[:, None] * p), axis=0)
         freedom = self.seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
@@ -200,7 +200,8 @@ def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Par
     L = np.fft.rfft(lost * window[:, None, None], axis=0)
     most = int(seen.sum(axis=1).max())
     one = np.broadcast_to(np.eye(J.shape[1]), S.shape)
-    return _Part(J, S, *(_weighed(J, x, size) for x in (S, one, L)), window, most)
+    meat, plain, taken = (_weighed(J, x, size) for x in (S, one, L))
+    return _Part(J, S, meat, plain, taken, window, most)
 
 
 def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -236,7 +237,7 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
         white = np.fft.rfft(rng.standard_normal((size, k)), axis=0)
         made[:] = np.fft.irfft((root @ white[..., None])[..., 0], size, axis=0)[:n]
     # The variance is that of the residuals, whatever was held at zero in the spectrum.
-    have = np.fft.irfft(np.diagonal(S, axis1=1, axis2=2).real, size, axis=0)[0]
+    have = np.fft.irfft(np.real(np.diagonal(S, axis1=1, axis2=2)), size, axis=0)[0]
     want = np.sum(r**2, axis=1) / np.maximum(seen.sum(axis=1), 1)
     scale = np.sqrt(np.divide(want, have, out=np.zeros(k), where=have > 0))
     return np.moveaxis(noise * scale, 1, 2)
@@ -247,7 +248,7 @@ def _weighed(J: np.ndarray, S: np.ndarray, size: int) -> np.ndarray:
     twice = np.full(S.shape[0], 2.0 / size)
     twice[[0, -1]] = 1.0 / size
     left = (J * twice[:, None, None]).reshape(-1, J.shape[2])
-    found = (left.conj().T @ (S @ J).reshape(-1, J.shape[2])).real
+    found = np.real(left.conj().T @ (S @ J).reshape(-1, J.shape[2]))
     return 0.5 * (found + found.T)
 
 
