@@ -134,15 +134,15 @@ def _in_blocks(
     of it; written out sample by sample it would compute every sample from x[k] again.
     """
     assert held.discrete is not None
-    space, Bn = jacobians(model, held.params), held.discrete.Bn
-    C, D = space.C.astype(held.discrete.Ad.dtype), space.D.astype(held.discrete.Ad.dtype)
+    A, B, _, Bn = discrete = held.discrete
+    space = jacobians(model, held.params)
+    C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
     ahead = None if Bn is None else scalars(Bn)
     if Bn is not None:
         # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
         # held ones.
-        held, D = without_next(held)[0], D + product(C, Bn)
-        x0 = _plus(x0, ahead, at(held.inputs, 0), -1.0)
-    A, B, *_ = held.discrete
+        discrete, D = without_next(discrete), D + product(C, Bn)
+        x0, B = _plus(x0, ahead, at(held.inputs, 0), -1.0), discrete.Bd
     rows, columns, power = [C], [B], A
     for _ in range(m - 1):
         rows.append(product(rows[-1], A))
@@ -199,7 +199,7 @@ def _in_blocks(
     rest = n - steps * m
     u = [[v[steps * m + j] for v in U] for j in range(rest)]
     value = samples(x, value, u, jax.tree.map(lambda v: v[steps * m :], data), rest)
-    last, discrete = list(x), held.discrete.in_scalars()
+    last, discrete = list(x), discrete.in_scalars()
     for j in range(rest - 1):
         last = advance(discrete, last, u[j])
     end = jax.tree.unflatten(structure, last)

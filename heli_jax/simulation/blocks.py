@@ -4,7 +4,6 @@ For one record this takes a fraction of the time of a step per sample; for large
 vehicles a step per sample is better, since the products grow with m.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,9 +22,10 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     """
     assert held.discrete is not None
     if held.discrete.Bn is not None:
-        held, ahead = without_next(held)
-        x0 = jax.tree.map(lambda x, a: x - a[0], x0, ahead(x0))
-        return jax.tree.map(jnp.add, blockwise(held, m, x0), ahead(x0))
+        ahead = _ahead(held, x0)
+        held = held._replace(discrete=without_next(held.discrete))
+        x0 = jax.tree.map(lambda x, a: x - a[0], x0, ahead)
+        return jax.tree.map(jnp.add, blockwise(held, m, x0), ahead)
     A, (B, U) = held.discrete.Ad, columns(held)
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
@@ -63,24 +63,23 @@ def columns(held: Held) -> tuple[Array, Array]:
     return jnp.concatenate([M for M, _ in taps], axis=1), jnp.stack(U, axis=1)
 
 
-def without_next(held: Held) -> tuple[Held, Callable[[Any], Any]]:
+def without_next(discrete: Discrete) -> Discrete:
     """The recurrence without the inputs one sample ahead: linear inputs cost what held ones do.
 
     z[k] = x[k] - Bn u[k] turns x[k+1] = Ad x[k] + Bd u[k] + Bn u[k+1] into
-    z[k+1] = Ad z[k] + (Ad Bn + Bd) u[k]. Returns what makes z, and a function of any State that
-    gives Bn u as one, arrays (N,).
+    z[k+1] = Ad z[k] + (Ad Bn + Bd) u[k].
     """
+    A, B, before, after = discrete
+    return Discrete(A, product(A, after) + B, before, None)
+
+
+def _ahead(held: Held, like: Any) -> Any:
+    """Bn u as a State with arrays (N,), built as `like` is."""
     assert held.discrete is not None
-    A, B, before, after = held.discrete
     n = jax.tree.leaves(held.inputs)[0].shape[0]
     k = jnp.arange(n) if held.delay is None else jnp.arange(n) - held.delay[0]
     U = jnp.stack(jax.tree.leaves(at(held.inputs, k)), axis=1)
-
-    def ahead(like: Any) -> Any:
-        return jax.tree.unflatten(jax.tree.structure(like), list((U @ after.T).T))
-
-    plain = Discrete(A, product(A, after) + B, before, None)
-    return held._replace(discrete=plain), ahead
+    return jax.tree.unflatten(jax.tree.structure(like), list((U @ held.discrete.Bn.T).T))
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:
