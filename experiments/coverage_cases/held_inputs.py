@@ -136,12 +136,12 @@ ROLL = Model(
 def late_record(seed: int, hold: str = "linear") -> Flight:
     """A roll rate that answers 17 ms late to a smooth stick, logged at 25 Hz."""
     rng = np.random.default_rng(seed)
-    stick = smooth(rng, 30.0, 0.5)
+    stick = smooth(rng, 120.0, 0.9)
 
     def rates(t: float, x: np.ndarray) -> np.ndarray:
         return LATE["Lp"] * x + LATE["Lda"] * stick(t - LATE["time_shift"])
 
-    t = 0.04 * np.arange(751)
+    t = 0.04 * np.arange(3001)
     run = scipy.integrate.solve_ivp(rates, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9, atol=1e-9)
     p = run.y[0] + 0.05 * rng.standard_normal(t.size)
     da = np.array([stick(one) for one in t])
