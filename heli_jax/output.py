@@ -69,7 +69,7 @@ def print_fit(
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Did the optimiser arrive; what do the data determine; is the model adequate.
-    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {fit.adequacy.summary}")
+    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {report_tables.adequate(fit)}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")
@@ -157,7 +157,7 @@ def rounded(value: float, sd: float) -> tuple[str, str]:
     digits = 2
     if value != 0:
         digits += max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(sd)))
-    return f"{value:#.{min(digits, 12)}g}".rstrip("."), f"{sd:.2g}"
+    return f"{value:#.{min(digits, 9)}g}".rstrip("."), f"{sd:.2g}"
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
@@ -191,7 +191,8 @@ def print_check(found: Check) -> None:
         rows.append((name, expected, f"{found.verdict.prior_share[name]:.2f}"))
     _table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in found.noise.items():
-        print(f"noise of {name}: {sd:.3g}")
+        guess = " (guessed: too small where the log was smoothed; state the output's sd)"
+        print(f"noise of {name}: {sd:.3g}{guess if name in found.guessed else ''}")
     for note in found.notes:
         print(f"! {note}")
 

@@ -51,7 +51,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
             a key twice, or more nested or larger (aliases written out) than any configuration
             would be.
     """
-    data = read_regular(path, "a configuration in YAML", _LIMIT_BYTES)
+    data = read_regular(path, "a YAML file (a configuration or a vehicle)", _LIMIT_BYTES)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
 from heli_jax.identification.problem import Method, Sign
 
@@ -63,12 +63,22 @@ class FreeConfig(_Strict):
     helicopter's parameters keep theirs and those of a model of one's own may have any"""
 
 
+def _offset_choice(value: Any) -> Any:
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, list) and all(isinstance(v, str) for v in value):
+        return value
+    raise ValueError(
+        f"expected true, false or a list of inputs such as [x_roll], got {value!r:.60}"
+    )
+
+
 class NuisanceConfig(_Strict):
     initial_state: bool = True
     bias: bool = True
     time_shift: bool = False
     input_gain: bool = False
-    input_offset: StrictBool | list[str] | None = None
+    input_offset: Annotated[Any, BeforeValidator(_offset_choice)] = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
     the sticks of a machine in free flight"""
 

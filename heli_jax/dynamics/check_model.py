@@ -162,9 +162,9 @@ class _Function:
         self.traced(check)
 
     def check_fields(self, found: Any, record: type, role: str) -> None:
-        expected = (
-            f"expected a {role}, as `return {record.__name__}({naming.names(record)[0]}=...)`"
-        )
+        fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])
+        more = ", ..." if len(naming.names(record)) > 4 else ""
+        expected = f"expected the model's {role}, as `return {record.__name__}({fields}{more})`"
         # Another class with the same fields serves for outputs; states are added to one another.
         alike = role == "Outputs" and all(hasattr(found, n) for n in naming.names(record))
         if not (isinstance(found, record) or alike):
@@ -229,10 +229,13 @@ def _words(e: Exception) -> str:
     if isinstance(e, jax.errors.ConcretizationTypeError | jax.errors.TracerIntegerConversionError):
         return (
             "makes a Python number of a value that is traced (float, int, the functions of math, "
-            "an index); expected jax.numpy, as jnp.sin in place of math.sin"
+            "an index); expected the traced value itself, and jax.numpy in place of math (jnp.sin)"
         )
     said = " ".join(str(e).split())[:200]
-    return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}"
+    order = ""
+    if isinstance(e, AttributeError | TypeError):
+        order = "; the arguments come as (params, state, inputs), start and noise take params alone"
+    return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}{order}"
 
 
 def _is_named_tuple(value: Any) -> bool:

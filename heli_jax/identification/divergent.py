@@ -70,7 +70,8 @@ def _applies(problem: Problem) -> bool:
 
 def _diverges(search: starting.Search, noise: Noise, e: Evaluation) -> bool:
     """Whether the misfit is far larger than that of no model at all."""
-    misfit = float(np.sum(np.square(np.asarray(e.r, np.float64))))
+    with np.errstate(all="ignore"):
+        misfit = float(np.sum(np.square(np.asarray(e.r, np.float64))))
     return misfit > FAR_WORSE * search.misfit_of_nothing(noise)
 
 

@@ -99,6 +99,26 @@ def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     ]
 
 
+_FAR = 3.0
+"""standard deviations of a prior at which an estimate contradicts it"""
+
+
+def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
+    """Where an estimate has left its prior."""
+    notes = []
+    for name, one in estimates.items():
+        prior = problem.free[name].prior
+        if prior is None:
+            continue
+        away = abs(one.value - prior.mean) / prior.sd
+        if away > _FAR:
+            notes.append(
+                f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and priors "
+                "contradict each other, and the interval does not know it."
+            )
+    return notes
+
+
 def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
     """Where a parameter of the disturbance ran to the end of what a record can show."""
     notes = []

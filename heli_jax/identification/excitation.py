@@ -56,10 +56,12 @@ def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
         fastest = float(np.max(np.abs(np.imag(eigenvalues))))
         nyquist = np.pi / flight.dt
         if fastest >= _AT_NYQUIST * nyquist:
+            past = fastest >= nyquist
             found.append(
                 f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s"
-                f"{f' (linearised about {at.words})' if at.words else ''} lies at or past the "
-                f"Nyquist frequency of the sampling ({nyquist:.4g} rad/s): the samples cannot show "
-                "it, and its aliases may be taken for slower dynamics."
+                f"{f' (linearised about {at.words})' if at.words else ''} lies "
+                f"{'at or past' if past else 'near'} the Nyquist frequency of the sampling "
+                f"({nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, and "
+                "its aliases may be taken for slower dynamics."
             )
     return found

@@ -26,6 +26,7 @@ from heli_jax.identification.noise import (
     second_guess,
     settle,
 )
+from heli_jax.identification.nuisances import labels
 from heli_jax.identification.outcome import Ran, assemble, noise_by_name, signals_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, StartRow, Status
@@ -70,7 +71,14 @@ def check(problem: Problem) -> Check:
     lost = (*verdict.undetermined, *verdict.without_effect)
     notes += other_hold(problem, *begin[:4], e, skip=lost)
     scales = unpack(begin.layout, begin.data, begin.z).scales
-    return Check(verdict, noise_by_name(problem, begin.layout, begin.noise, scales), tuple(notes))
+    guessed = tuple(
+        f"{label}/{name}"
+        for label, flight in zip(labels(problem.training), problem.training, strict=True)
+        for name in flight.outputs
+        if name not in flight.sd
+    )
+    sds = noise_by_name(problem, begin.layout, begin.noise, scales)
+    return Check(verdict, sds, tuple(notes), guessed)
 
 
 def fit(

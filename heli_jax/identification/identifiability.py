@@ -19,6 +19,8 @@ FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
 ILL_CONDITIONED = 1e4
 STRONG = 0.99
+_PART = 1e-3
+"""of a unit direction that is not determined: less leaves an unknown determined"""
 _TAKES_PART = 0.1  # of a unit direction: less is not worth naming
 _HELD = 3.0
 """weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
@@ -181,9 +183,14 @@ def judge(
     if not null:
         covariance = _covariance(with_weak, with_weak.singular > 0, scale)
         null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
-        null = null or _weakly_held(without_weak, covariance, unknowns)
-    if not null and reported is not None:
-        null = _reported_too_wide(reported, unknowns)
+    # What one direction leaves open says nothing of the parameters that take no part in it.
+    null += _further(_weakly_held(without_weak, covariance, unknowns), null)
+    null += _further(_single_too_wide(without_weak, unknowns), null)
+    if reported is not None:
+        wide = (
+            _single_too_wide(reported, unknowns) if null else _reported_too_wide(reported, unknowns)
+        )
+        null += _further(wide, null)
     data_kept = data.singular > null_below * max(data.singular[0], 1e-300)
     of_data = _covariance(data, data_kept, scale)
     data_null = []
@@ -198,7 +205,7 @@ def judge(
     groups = _groups(null, covariance, unknowns, dead, exchanged)
     # What the data alone say, so that no prior is in it.
     resting = _groups(data_null, of_data, unknowns, (), exchanged)
-    undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > 1e-3 for v in null))
+    undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > _PART for v in null))
     correlation = _correlation(covariance)
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
@@ -210,7 +217,21 @@ def judge(
     weakest = None
     if not null and condition > ILL_CONDITIONED and not data_null:
         weakest = _weakest(covariance, condition, unknowns)
-    facts = words.Facts(unknowns, dead, groups, resting, pairs, weakest, weak, dict(remedies or {}))
+    facts = words.Facts(
+        unknowns,
+        dead,
+        groups,
+        undetermined,
+        resting,
+        pairs,
+        weakest,
+        weak,
+        {
+            u.name: float(np.clip(covariance[i, i] * u.prior**2, 0, 1))
+            for i, u in enumerate(unknowns)
+        },
+        dict(remedies or {}),
+    )
     return Verdict(
         names=names,
         identifiable=not null,
@@ -380,6 +401,26 @@ def _too_wide(
     plain = _directions(total, np.ones(len(unknowns)))
     weak = [_unit(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * limit < 1]
     return weak or [_unit(plain.right[-1])]
+
+
+def _single_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
+    """For each unknown whose interval reaches too far the direction in which it does."""
+    limit = math.log(FACTOR) / Z95
+    return [
+        _unit(covariance[:, i] / math.sqrt(covariance[i, i]))
+        for i, u in enumerate(unknowns)
+        if (u.logarithmic or u.symmetric) and covariance[i, i] > limit**2
+    ]
+
+
+def _further(directions: list[np.ndarray], null: list[np.ndarray]) -> list[np.ndarray]:
+    """Of the directions those that are led by an unknown which the null ones do not touch."""
+    added: list[np.ndarray] = []
+    for v in directions:
+        leads = int(np.argmax(np.abs(v)))
+        if all(abs(w[leads]) <= _PART for w in (*null, *added)):
+            added.append(v)
+    return added
 
 
 def _reported_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:

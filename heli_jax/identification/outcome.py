@@ -19,6 +19,7 @@ from heli_jax.identification.estimates import (
     estimates_of,
     extreme_noise_notes,
     flight_nuisances,
+    prior_notes,
     stated_noise_notes,
 )
 from heli_jax.identification.evaluation import Evaluation, evaluate
@@ -73,7 +74,9 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     quantile = float(scipy.special.stdtrit(max(n - layout.determined, 1), 0.975))
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
-    coloured = usable and not layout.filtered and not all(w.white for w in white.values())
+    together = correlated_residuals(signals)
+    coloured = usable and not layout.filtered
+    coloured = coloured and (bool(together) or not all(w.white for w in white.values()))
     wider, quantiles = np.ones(layout.size), np.full(layout.size, quantile)
     if coloured:
         curvature = residual_curvature(layout, data, noise, best.z)
@@ -110,7 +113,9 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *settled.notes,
         *_filter_notes(layout, noise, e, n, ill),
         *stated_noise_notes(problem, sds),
-        *bound_notes(estimates),
+        *_correlation_notes(together if coloured else {}),
+        *bound_notes(named),
+        *prior_notes(problem, estimates),
         *_hold_notes(problem, search, settled, e, named),
         *adequacy.sentences,
         *(checked.notes if checked else ()),
@@ -207,6 +212,39 @@ def _hold_notes(
     sd = {n: one.sd for n, one in named.items() if one.sd is not None}
     at = (search.layout, search.data, settled.noise, settled.best.z)
     return other_hold(problem, *at, e, sd, in_doubt=True)
+
+
+_SURELY_CORRELATED = 4.5
+"""standard deviations from zero at which two residuals are taken for correlated"""
+_WORTH_IT = 0.1
+
+
+def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
+    """By 'output and output, flight' the correlation of residuals that are not independent.
+
+    White residuals of two outputs that go together count one piece of news twice.
+    """
+    found = {}
+    for s in signals:
+        names = list(s.measured)
+        for i, a in enumerate(names):
+            for b in names[:i]:
+                x, y = s.residual(a), s.residual(b)
+                seen = np.isfinite(x) & np.isfinite(y)
+                n = int(seen.sum())
+                if n < 8 or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
+                    continue
+                rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
+                if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
+                    found[f"{b} and {a}, {s.flight}"] = rho
+    return found
+
+
+def _correlation_notes(together: dict[str, float]) -> list[str]:
+    if not together:
+        return []
+    words = "; ".join(f"{names}: {rho:+.2f}" for names, rho in together.items())
+    return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
 
 
 def _adequacy(

@@ -204,7 +204,9 @@ def _check_windows(problem: Problem) -> None:
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     if problem.nuisance.time_shift:
-        raise ValueError("window and nuisance.time_shift: wanted is one of the two")
+        raise ValueError(
+            "shooting.window and nuisance.time_shift: expected one of the two, got both"
+        )
     for flight in problem.flights:
         samples = round(problem.window / flight.dt)
         if samples < 4:
@@ -230,6 +232,10 @@ def _check_free(name: str, one: Free, model: Model) -> None:
     if one.prior is not None and one.prior.sd <= 0:
         raise ValueError(f"free.{name}.prior.sd: found {one.prior.sd:g}, wanted is above zero")
     low, high = one.lower, one.upper
+    if one.sign == "keep" and low is not None and high is not None and low < 0 < high:
+        raise ValueError(
+            f"free.{name}.sign: keep needs bounds of one sign, got {low:g} to {high:g}"
+        )
     if low is not None and high is not None and low >= high:
         raise ValueError(f"free.{name}: lower {low:g} is not below upper {high:g}")
     if (low is not None and one.start <= low) or (high is not None and one.start >= high):

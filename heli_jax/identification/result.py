@@ -78,6 +78,8 @@ class Check:
     noise: dict[str, float]
     """sd assumed for each flight and output"""
     notes: tuple[str, ...]
+    guessed: tuple[str, ...] = ()
+    """those of them that nobody stated"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,10 @@ _STATED = 8.0 / 9.0
 would be three times as large without them"""
 
 
+_BY_PRIOR = 0.9
+"""share of its prior above which a parameter is what the prior says"""
+
+
 class Open(NamedTuple):
     """Parameters that no rows tell apart, and how many of them would have to be known."""
 
@@ -41,12 +45,16 @@ class Facts(NamedTuple):
     without_effect: tuple[str, ...]
     groups: tuple[Open, ...]
     """what is not determined"""
+    undetermined: tuple[str, ...]
+    """also those that take a small part in it"""
     resting: tuple[Open, ...]
     """where all is determined: what is so by the priors of parameters alone"""
     pairs: tuple["Pair", ...]
     weakest: Weakest | None
     weak_share: "Mapping[str, float]"
     """by name, the share of what is known that weak priors of nuisances contribute"""
+    prior_share: "Mapping[str, float]"
+    """by name, the share of what is known that its own prior contributes"""
     remedies: "Mapping[str, str]"
     """by name, a further way out, as 'add a run with a known inertia'"""
 
@@ -56,16 +64,25 @@ def sentences(facts: Facts) -> tuple[str, ...]:
     names = tuple(u.name for u in facts.unknowns)
     said = [_without_effect(name) for name in facts.without_effect]
     said += [_open(group, facts) for group in facts.groups]
-    lost = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
+    named = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
+    partners = [n for n in facts.undetermined if n not in named]
+    lost = named | set(partners)
     told = set(lost)
+    if partners:
+        verb = "take part in that and are" if len(partners) > 1 else "takes part in that and is"
+        said.append(f"{listed(partners)} {verb} not determined either.")
+    held = [n for n, share in facts.prior_share.items() if share > _BY_PRIOR and n not in lost]
     if lost:
-        rest = [n for n in names if n not in lost]
+        rest = [n for n in names if n not in lost and n not in held]
         said += [f"The data determine {listed(rest)}."] if rest else []
+        said += _by_prior(held)
     elif facts.resting:
         said += [_resting(group, facts) for group in facts.resting]
         told |= {n for group in facts.resting for n in group.names}
     else:
-        said.append(f"The data determine {listed(names)}.")
+        rest = [n for n in names if n not in held]
+        said += [f"The data determine {listed(rest)}."] if rest else []
+        said += _by_prior(held)
     if facts.weakest is not None:
         said.append(_weakest(facts.weakest, facts))
         told |= set(facts.weakest.parts)
@@ -89,6 +106,15 @@ def sentences(facts: Facts) -> tuple[str, ...]:
             "as large."
         )
     return tuple(said)
+
+
+def _by_prior(names: list[str]) -> list[str]:
+    """What priors say and the data do not."""
+    if not names:
+        return []
+    verb = "rests on its prior" if len(names) == 1 else "rest on their priors"
+    them = "it" if len(names) == 1 else "them"
+    return [f"{listed(names)} {verb}: the data say next to nothing of {them}."]
 
 
 def listed(words: "list[str] | tuple[str, ...]", last: str = "and") -> str:

@@ -39,7 +39,7 @@ def fit_json(
             "method": fit.method,
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
-            "adequate": fit.adequate,
+            "adequate": None if adequate_unjudged(fit) else fit.adequate,
             "adequacy": _adequacy(fit.adequacy),
             "null_directions": list(fit.verdict.null_directions),
             "determined_combinations": _combinations(fit.verdict),
@@ -88,6 +88,11 @@ def _adequacy(found: Adequacy) -> dict[str, Any]:
             "or_power_over_what_the_disturbance_makes_at_most": EXPECTED,
         },
     }
+
+
+def adequate_unjudged(fit: Fit) -> bool:
+    """Whether an adequate look means nothing, since no optimum was reached."""
+    return fit.status == "not-converged" and fit.adequate
 
 
 def _choice(choice: Choice | None) -> dict[str, Any] | None:

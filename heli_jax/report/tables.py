@@ -50,7 +50,16 @@ def headline(fit: Fit) -> Headline:
     if not fit.adequate:
         worst = fit.adequacy.less_than_mean or level == "bad"
         level = "bad" if worst else "warning"
-    return Headline(level, word, f"{text}; adequate: {fit.adequacy.summary}")
+    if fit.adequacy.doubtful and level == "good":
+        level = "warning"
+    return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
+
+
+def adequate(fit: Fit) -> str:
+    """`yes`, `no (...)`; what stopped before an optimum and looks adequate was not judged."""
+    if fit.status == "not-converged" and fit.adequate:
+        return "not judged"
+    return fit.adequacy.summary
 
 
 def _determined(fit: Fit) -> Headline:
@@ -68,7 +77,8 @@ def _determined(fit: Fit) -> Headline:
     text = f"{who} determine {_listed(names)}"
     doubts = [
         ("the intervals are too narrow", fit.narrow),
-        ("the residuals are not white", fit.coloured),
+        ("the residuals are not white", fit.coloured and not fit.white),
+        ("residuals of outputs are correlated", fit.coloured and fit.white),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]

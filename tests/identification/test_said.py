@@ -1,0 +1,111 @@
+"""What a fit says agrees with what it gives: no word of an unknown that is not determined."""
+
+from typing import Annotated, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
+from heli_jax.identification.identifiability import Unknown, judge
+from heli_jax.naming import Scalar
+from heli_jax.simulation.inputs import random_steps
+
+N, DT = 600, 0.02
+
+
+class Params(NamedTuple):
+    L: Annotated[Scalar, "1/s", "damping"]
+    B: Annotated[Scalar, "1/s^2", "effectiveness"]
+
+
+class State(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "rate"]
+
+
+class Inputs(NamedTuple):
+    d: Annotated[Scalar, "1", "stick"]
+
+
+class Outputs(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "rate"]
+    again: Annotated[Scalar, "rad/s", "the same by another sensor"]
+
+
+MODEL = Model(
+    "roll-rate",
+    lambda p, s, u: State(p=p.L * s.p + p.B * u.d),
+    lambda p, s, u: Outputs(p=s.p, again=s.p),
+    Params,
+    State,
+    Inputs,
+    Outputs,
+    linear=True,
+)
+
+
+def record(seed: int, shared: float, own: float) -> Flight:
+    """Two sensors of one rate, with noise in common and noise of their own."""
+    rng = np.random.default_rng(seed)
+    u = random_steps(N, DT, rng, (0.2, 1.0))
+    held = scipy.signal.cont2discrete(([3.0], [1.0, 2.0]), DT)
+    y = scipy.signal.lfilter(np.ravel(held[0]), held[1], u) + shared * rng.standard_normal(N)
+    both = {n: y + own * rng.standard_normal(N) for n in ("p", "again")}
+    return Flight(dt=DT, inputs={"d": u}, outputs=both)
+
+
+def problem(flight: Flight, **free: Free) -> Problem:
+    params = Params(jnp.asarray(-2.0), jnp.asarray(3.0))
+    return Problem(MODEL, params, [flight], free, Nuisance(input_offset=False))
+
+
+def test_noise_that_two_outputs_share_is_not_counted_twice():
+    free = {"L": Free(-1.0), "B": Free(2.0)}
+    found = fit(problem(record(0, 0.05, 1e-4), **free))
+    assert found.coloured
+    assert any("correlated" in note for note in found.notes)
+    for e in found.estimates.values():
+        assert e.sd == pytest.approx(2**0.5 * e.sd_white, rel=0.2)
+    apart = fit(problem(record(0, 0.0, 0.05), **free))
+    assert not any("correlated" in note for note in apart.notes)
+
+
+def test_an_estimate_that_leaves_its_prior_is_told():
+    found = fit(problem(record(1, 0.0, 0.02), L=Free(-2.0, prior=Prior(-3.0, 0.1)), B=Free(2.0)))
+    assert any(note.startswith("L lies") and "contradict" in note for note in found.notes)
+    agreed = fit(problem(record(1, 0.0, 0.02), L=Free(-2.0, prior=Prior(-2.1, 0.1)), B=Free(2.0)))
+    assert not any("contradict" in note for note in agreed.notes)
+
+
+def unknowns(*names: str, **priors: float) -> tuple[Unknown, ...]:
+    return tuple(Unknown(n, 1.0, True, 1.0, priors.get(n, 0.0)) for n in names)
+
+
+def test_the_factor_of_ten_is_asked_of_the_others_too_where_one_has_no_effect():
+    sensitivity = np.array([[100.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    verdict = judge(sensitivity, unknowns("L", "B", "D"))
+    assert set(verdict.undetermined) == {"B", "D"}
+    assert "The data determine L." in verdict.text
+    assert "determine L and B" not in verdict.text
+
+
+def test_the_reported_interval_is_asked_of_the_others_too():
+    sensitivity = np.array([[100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
+    reported = np.diag([1e-4, 4.0, 0.0])
+    verdict = judge(sensitivity, unknowns("L", "B", "D"), reported=reported)
+    assert set(verdict.undetermined) == {"B", "D"}
+
+
+def test_who_takes_a_small_part_is_not_called_determined():
+    sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 1.0]])
+    verdict = judge(sensitivity, unknowns("a", "c", "B"))
+    assert set(verdict.undetermined) == {"a", "c"}
+    assert "The data determine B." in verdict.text
+
+
+def test_what_rests_on_its_prior_is_not_called_determined_by_the_data():
+    sensitivity = np.array([[1.0, 0.0], [0.0, 50.0]])
+    verdict = judge(sensitivity, unknowns("a", "B", a=100.0))
+    assert "The data determine B." in verdict.text
+    assert "a rests on its prior" in verdict.text
