@@ -38,7 +38,7 @@ def open_parquet(path: Path) -> "ParquetTable":
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
             n_rows = metadata.num_rows
-        except (pa.ArrowException, OSError) as e:
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
             raise wrong(str(path), "is no whole Parquet file") from e
         if not len(schema) or not n_rows:
             raise wrong(str(path), "holds no rows, wanted is a log")

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimates import deviations
 from heli_jax.identification.evaluation import Evaluation, evaluate
-from heli_jax.identification.layout import Data, Layout, Noise
+from heli_jax.identification.layout import Data, Layout, Noise, noise_limits
 from heli_jax.identification.metrics import noise_guess
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
@@ -197,7 +197,32 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
         found = again._replace(
             trace=(*found.trace, *again.trace), ratio=found.ratio, notes=found.notes
         )
-    return found
+    return _off_the_limit(search, found)
+
+
+def _off_the_limit(search: Search, found: Settled) -> Settled:
+    """Where the correlation time ran to an end of what a record can show, the better of that and of
+    a search begun anew with the disturbance at its start: white noise is a local optimum of short
+    records."""
+    layout, data = search.layout, search.data
+    if "tau_w" not in layout.noise:
+        return found
+    low, high = (float(v) for v in noise_limits(data)["tau_w"])
+    if low < float(found.best.z[layout.noise_at("tau_w")]) < high:
+        return found
+    z = with_noise_guess(search, found)
+    noise = levelled(data, evaluate(layout, data, found.noise, z), found.noise)
+    [best] = search.run(noise, z[None, :])
+    again = settle(search, noise, best)
+    before = log_likelihood(
+        layout, data, found.noise, evaluate(layout, data, found.noise, found.best.z)
+    )
+    after = log_likelihood(
+        layout, data, again.noise, evaluate(layout, data, again.noise, again.best.z)
+    )
+    if not (bool(again.best.converged) and after > before):
+        return found
+    return again._replace(trace=(*found.trace, *again.trace), ratio=found.ratio, notes=found.notes)
 
 
 def _sure(layout: Layout, found: Settled, e: Evaluation) -> bool:
