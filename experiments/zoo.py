@@ -13,7 +13,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -119,6 +119,8 @@ class Puzzle:
     """of the free parameters that the record determines"""
     lost: tuple[str, ...] = ()
     """free parameters that it does not"""
+    hardly: dict[str, float] = field(default_factory=dict)
+    """of which it says next to nothing: not determined, or an interval with truth and zero in it"""
     adequate: bool = True
 
 
@@ -362,7 +364,7 @@ def too_short(seed: int) -> Puzzle:
     """Twelve seconds of a machine that needs a thousand, in noise."""
     r = rolled(seed, Lp=-0.001, Ld=0.5)
     problem = of_roll(r, ("Lp", "Ld"), [r.flight("p", noise=0.3)])
-    return Puzzle("record too short for the damping", problem, true(r, "Ld"), ("Lp",))
+    return Puzzle("record too short for the damping", problem, {}, hardly=true(r, "Lp"))
 
 
 def paper(seed: int) -> Puzzle:
@@ -423,6 +425,12 @@ def complaint(puzzle: Puzzle, found: Any) -> str:
     if not puzzle.adequate:
         if found.status == "converged" and found.adequate:
             return "silent success: converged and adequate"
+        return ""
+    for name, value in puzzle.hardly.items():
+        e = found.estimates[name]
+        if e.sd is not None and not (e.lower95 < min(value, 0.0) and e.upper95 > max(value, 0.0)):
+            return f"silent success: {name} is {e.value:.4g} +- {e.sd:.2g}"
+    if puzzle.hardly:
         return ""
     if puzzle.lost:
         told = [n for n in puzzle.lost if found.estimates[n].sd is not None]

@@ -6,7 +6,7 @@ parameters of a wrong model are found and determined as well as those of the rig
 What is judged is the simulated response of every fitted output. The acceptance card asks for a
 variance accounted for (VAF) of 0.9 (Tischler and Remple, 2012, and Jategaonkar, 2006, gate fits of
 flights in that region). A model is called inadequate only where it misses that by far: where it
-leaves more than 30 % of what is not white noise unexplained, three times what the gate allows.
+leaves more than a fifth of what is not white noise unexplained, twice what the gate allows.
 Between the two there is doubt, and the same advice. White
 residuals are adequate whatever the VAF: then all that is left is measurement noise. With filter
 error the simulation does not know the disturbance, so it is judged against what the estimated
@@ -35,7 +35,7 @@ from heli_jax.identification.operating_point import operating_point
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.simulation.simulate import simulate
 
-EXPLAINED = 0.7
+EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
 GATE = 0.9
 """VAF that the acceptance card asks for: below it, with residuals not white, there is doubt"""

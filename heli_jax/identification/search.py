@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification import coordinates
 from heli_jax.identification.layout import Data, Layout, Noise, layout_of, unpack
-from heli_jax.identification.optimise import Optimum, optimise, residuals_count
+from heli_jax.identification.optimise import Optimum, optimise, residuals_count, slopes
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.residual import predict, rows_of
 from heli_jax.identification.result import StartRow
@@ -19,6 +19,8 @@ Progress = Callable[[str], None]
 
 
 _SHIFTS = 41
+_NEAR = 0.1
+"""standard deviations from the optimum at which it counts as reached"""
 
 
 def first_guess(
@@ -175,10 +177,29 @@ class Search:
         runs = []
         for i in range(points.shape[0]):
             found = optimise(layout, self.data, noise, points[i], self.max_steps)
-            runs.append(jax.device_get(found)._replace(z=found.z))
+            run = jax.device_get(found)._replace(z=found.z)
+            if not bool(run.converged) and not layout.filtered:
+                near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
+                run = run._replace(converged=np.asarray(near))
+            runs.append(run)
             if tell is not None and points.shape[0] > 1:
                 tell(f"{i + 1} of {points.shape[0]} starts done")
         return runs
+
+    def _is_near(self, layout: Layout, noise: Noise, z: Array) -> bool:
+        """Whether the optimum is within a tenth of a standard deviation of every unknown.
+
+        Along a valley that weak priors alone close the optimiser goes on in steps that change no
+        likelihood. What a Gauss-Newton step would gain there is the squared distance to the
+        optimum in standard deviations of whichever unknown lies furthest.
+        """
+        at = slopes(layout, self.data, noise, z)
+        r, J = np.asarray(at.r, np.float64), np.asarray(at.J, np.float64)
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            return False
+        norms = np.linalg.norm(J, axis=0)
+        Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
+        return bool(np.sum((Q.T @ r) ** 2) < _NEAR**2)
 
     def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
