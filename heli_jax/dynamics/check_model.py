@@ -229,7 +229,7 @@ def _words(e: Exception) -> str:
     if isinstance(e, jax.errors.ConcretizationTypeError | jax.errors.TracerIntegerConversionError):
         return (
             "makes a Python number of a value that is traced (float, int, the functions of math, "
-            "an index); expected the traced value itself, and jax.numpy in place of math (jnp.sin)"
+            "an index); expected the value itself, and jax.numpy, as jnp.sin in place of math.sin"
         )
     said = " ".join(str(e).split())[:200]
     order = ""

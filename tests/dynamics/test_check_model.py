@@ -82,13 +82,16 @@ BROKEN = {
     "two arguments": ({"vector_field": of_two}, ["of_two", "TypeError", "positional"]),
     "a tuple": (
         {"vector_field": lambda p, s, u: (s.p, p.Lp * s.p)},
-        ["vector_field", "return State(phi=...)", "got a tuple of 2"],
+        ["vector_field", "return State(phi=..., p=...)", "got a tuple of 2"],
     ),
     "a dictionary": (
         {"vector_field": lambda p, s, u: {"phi": s.p, "p": s.p}},
-        ["return State(phi=...)", "got a dict"],
+        ["return State(phi=..., p=...)", "got a dict"],
     ),
-    "nothing": ({"vector_field": lambda p, s, u: None}, ["return State(phi=...)", "got None"]),
+    "nothing": (
+        {"vector_field": lambda p, s, u: None},
+        ["return State(phi=..., p=...)", "got None"],
+    ),
     "another class": (
         {"vector_field": lambda p, s, u: Other(phi=s.p)}, ["State", "an object of class Other"],
     ),

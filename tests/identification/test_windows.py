@@ -90,7 +90,7 @@ def test_a_flight_held_out_is_cut_as_well():
         ({"window": 1.0, "continuity": 0.0}, "continuity is 0, wanted is above zero"),
         ({"window": 0.05}, "a window of 0.05 s holds 2 samples, wanted are 4"),
         ({"window": 1.0, "nuisance": Nuisance(initial_state=False)}, "windows need"),
-        ({"window": 1.0, "nuisance": Nuisance(time_shift=True)}, "wanted is one of the two"),
+        ({"window": 1.0, "nuisance": Nuisance(time_shift=True)}, "expected one of the two"),
     ],
 )
 def test_refused(how, words):
