@@ -27,6 +27,10 @@ _HELD = 3.0
 Z95 = 1.959963984540054
 
 
+_FAR = math.log(FACTOR) / Z95
+"""sd in relative coordinates of an interval that reaches just as far as the factor"""
+
+
 class Unknown(NamedTuple):
     """One free parameter as the verdict sees it."""
 
@@ -210,7 +214,7 @@ def judge(
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
     condition = float(total.singular[0] / smallest) if smallest > 0 else math.inf
-    share, weak = _shares(covariance, without_weak, unknowns)
+    own, weak, share = _shares(covariance, without_weak, unknowns)
     for group in groups:
         if group.nuisances:
             share |= dict.fromkeys(group.names, 1.0)
@@ -226,10 +230,7 @@ def judge(
         pairs,
         weakest,
         weak,
-        {
-            u.name: float(np.clip(covariance[i, i] * u.prior**2, 0, 1))
-            for i, u in enumerate(unknowns)
-        },
+        own,
         dict(remedies or {}),
     )
     return Verdict(
@@ -318,15 +319,16 @@ def _weakly_held(
 
 def _shares(
     covariance: np.ndarray, without_weak: np.ndarray, unknowns: tuple[Unknown, ...]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """By name, the share of what is known that comes from priors, and from weak priors alone."""
-    share, weak = {}, {}
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """By name, the share of what is known that comes from the unknown's own prior, from the weak
+    priors of nuisances, and from both."""
+    own, weak, share = {}, {}, {}
     for i, u in enumerate(unknowns):
-        own = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
+        own[u.name] = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
         ratio = covariance[i, i] / without_weak[i, i] if without_weak[i, i] > 0 else 1.0
         weak[u.name] = float(np.clip(1.0 - ratio, 0.0, 1.0))
-        share[u.name] = 1.0 - (1.0 - own) * (1.0 - weak[u.name])
-    return share, weak
+        share[u.name] = 1.0 - (1.0 - own[u.name]) * (1.0 - weak[u.name])
+    return own, weak, share
 
 
 def _groups(
@@ -389,27 +391,31 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v if v[np.argmax(np.abs(v))] > 0 else -v
 
 
+def _reaching_too_far(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[int]:
+    """The unknowns whose 95 % interval reaches further than the factor."""
+    return [
+        i
+        for i, u in enumerate(unknowns)
+        if (u.logarithmic or u.symmetric) and covariance[i, i] > _FAR**2
+    ]
+
+
 def _too_wide(
     total: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
 ) -> list[np.ndarray]:
     """Directions of full rank along which a 95 % interval still spans more than the factor."""
-    limit = math.log(FACTOR) / Z95
-    sized = [u.logarithmic or u.symmetric for u in unknowns]
-    wide = [s and covariance[i, i] > limit**2 for i, s in enumerate(sized)]
-    if not any(wide):
+    if not _reaching_too_far(covariance, unknowns):
         return []
     plain = _directions(total, np.ones(len(unknowns)))
-    weak = [_unit(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * limit < 1]
+    weak = [_unit(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * _FAR < 1]
     return weak or [_unit(plain.right[-1])]
 
 
 def _single_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
     """For each unknown whose interval reaches too far the direction in which it does."""
-    limit = math.log(FACTOR) / Z95
     return [
         _unit(covariance[:, i] / math.sqrt(covariance[i, i]))
-        for i, u in enumerate(unknowns)
-        if (u.logarithmic or u.symmetric) and covariance[i, i] > limit**2
+        for i in _reaching_too_far(covariance, unknowns)
     ]
 
 
@@ -425,12 +431,10 @@ def _further(directions: list[np.ndarray], null: list[np.ndarray]) -> list[np.nd
 
 def _reported_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
     """As `_too_wide` has them, by the covariance of the intervals that are reported."""
-    limit = math.log(FACTOR) / Z95
-    sized = [u.logarithmic or u.symmetric for u in unknowns]
-    if not any(s and covariance[i, i] > limit**2 for i, s in enumerate(sized)):
+    if not _reaching_too_far(covariance, unknowns):
         return []
     values, vectors = np.linalg.eigh(covariance)
-    return [_unit(v) for v in vectors[:, values > limit**2].T] or [_unit(vectors[:, -1])]
+    return [_unit(v) for v in vectors[:, values > _FAR**2].T] or [_unit(vectors[:, -1])]
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:

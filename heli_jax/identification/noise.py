@@ -14,7 +14,7 @@ from heli_jax.identification.layout import Data, Layout, Noise, noise_limits
 from heli_jax.identification.metrics import noise_guess
 from heli_jax.identification.optimise import Optimum, residuals_count
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.search import Search, noise_guess_at
+from heli_jax.identification.search import Search, gauss_newton_gain, noise_guess_at
 
 NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
@@ -242,13 +242,11 @@ def _far_better(search: Search, found: Settled, e: Evaluation) -> bool:
     """
     layout, data, noise = search.layout, search.data, found.noise
     alone = evaluate(layout, data, noise, _silenced(search, found))
-    if not (np.isfinite(alone.r).all() and np.isfinite(alone.J).all()):
+    gained = gauss_newton_gain(alone.r, alone.J)
+    if not np.isfinite(gained):
         return False
-    r, J = np.asarray(alone.r, np.float64), np.asarray(alone.J, np.float64)
-    norms = np.linalg.norm(J, axis=0)
-    Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
-    before = float(r @ r)
-    after = max(before - float(np.sum((Q.T @ r) ** 2)), 1e-300)
+    before = float(np.sum(np.square(np.asarray(alone.r, np.float64))))
+    after = max(before - gained, 1e-300)
     n = residuals_count(data)
     gain = 0.5 * (n * np.log(before / after) if layout.concentrated else before - after)
     without = log_likelihood(layout, data, noise, alone) + gain

@@ -1,6 +1,7 @@
 """Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -194,12 +195,8 @@ class Search:
         optimum in standard deviations of whichever unknown lies furthest.
         """
         at = slopes(layout, self.data, noise, z)
-        r, J = np.asarray(at.r, np.float64), np.asarray(at.J, np.float64)
-        if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            return False
-        norms = np.linalg.norm(J, axis=0)
-        Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
-        return bool(np.sum((Q.T @ r) ** 2) < _NEAR**2)
+        gain = gauss_newton_gain(at.r, at.J)
+        return bool(np.isfinite(gain) and gain < _NEAR**2)
 
     def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
@@ -235,6 +232,17 @@ class Search:
             x = jnp.asarray(value, z.dtype)
             z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *args))
         return z
+
+
+def gauss_newton_gain(r: Any, J: Any) -> float:
+    """By how much a Gauss-Newton step lowers the sum of squares of residuals r (n,) with the
+    Jacobian J (n, q), as the linear model of them has it; NaN where either is not finite."""
+    r, J = np.asarray(r, np.float64), np.asarray(J, np.float64)
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return float("nan")
+    norms = np.linalg.norm(J, axis=0)
+    Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
+    return float(np.sum((Q.T @ r) ** 2))
 
 
 def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:

@@ -9,10 +9,10 @@ from jaxtyping import Array
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.data import data_of
-from heli_jax.identification.estimates import labels
 from heli_jax.identification.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.layout import Data, Layout, Noise, layout_of
 from heli_jax.identification.noise import first_noise
+from heli_jax.identification.nuisances import labels
 from heli_jax.identification.optimise import optimise
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.start import start_vector

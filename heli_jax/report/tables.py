@@ -16,7 +16,7 @@ from heli_jax.identification.intervals import Intervals
 from heli_jax.identification.metrics import Metrics, diverges
 from heli_jax.identification.problem import Problem
 from heli_jax.report.card import Gate, shown
-from heli_jax.report.files import whiteness_note
+from heli_jax.report.files import adequate_unjudged, whiteness_note
 from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.style import pretty
 from heli_jax.vehicle import Constant, of_helicopter
@@ -57,9 +57,7 @@ def headline(fit: Fit) -> Headline:
 
 def adequate(fit: Fit) -> str:
     """`yes`, `no (...)`; what stopped before an optimum and looks adequate was not judged."""
-    if fit.status == "not-converged" and fit.adequate:
-        return "not judged"
-    return fit.adequacy.summary
+    return "not judged" if adequate_unjudged(fit) else fit.adequacy.summary
 
 
 def _determined(fit: Fit) -> Headline:
