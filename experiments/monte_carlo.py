@@ -21,13 +21,12 @@ from matplotlib.figure import Figure
 
 from heli_jax import Flight, Free, Problem, fit, load_vehicle, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.baseline import baseline
-from heli_jax.identification.data import data_of
-from heli_jax.identification.estimates import deviations
-from heli_jax.identification.evaluation import evaluate
-from heli_jax.identification.layout import Noise, layout_of
-from heli_jax.identification.noise import levelled
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.noise_covariance import levelled
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Noise, layout_of
 from heli_jax.naming import asdict, names, replace
 from heli_jax.simulation.inputs import random_steps
 

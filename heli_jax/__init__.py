@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from heli_jax.flights import Flight as Flight
     from heli_jax.flights import Signal as Signal
     from heli_jax.flights import read_flight as read_flight
+    from heli_jax.identification.equation_error.rls import rls as rls
     from heli_jax.identification.fit import check as check
     from heli_jax.identification.fit import fit as fit
     from heli_jax.identification.problem import Free as Free
     from heli_jax.identification.problem import Nuisance as Nuisance
     from heli_jax.identification.problem import Prior as Prior
     from heli_jax.identification.problem import Problem as Problem
-    from heli_jax.identification.rls import rls as rls
     from heli_jax.simulation.accumulate import accumulate as accumulate
     from heli_jax.simulation.simulate import simulate as simulate
     from heli_jax.sweeps.run import sweep as sweep
@@ -47,7 +47,7 @@ _HOMES = {
     "Nuisance": "identification.problem",
     "check": "identification.fit",
     "fit": "identification.fit",
-    "rls": "identification.rls",
+    "rls": "identification.equation_error.rls",
     "c2d": "analysis.lti",
     "d2c": "analysis.lti",
     "linearize": "analysis.linear",

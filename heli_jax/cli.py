@@ -166,7 +166,7 @@ def _fit(options: argparse.Namespace) -> int:
     run_directory.require_free(out)
     _prepare_jax()
     from heli_jax import config as configuration
-    from heli_jax.identification.baseline import baseline
+    from heli_jax.identification.equation_error.baseline import baseline
     from heli_jax.identification.fit import fit
 
     experiment = configuration.load(config, options.set)
@@ -221,8 +221,8 @@ def _fit_code(found: Any) -> int:
 def _further(experiment: Any, problem: Any, found: Any) -> Any:
     """Model choice and further intervals, where the configuration asks for them."""
     from heli_jax import config as configuration
-    from heli_jax.identification.choice import choose
-    from heli_jax.identification.intervals import intervals
+    from heli_jax.identification.model_selection import choose
+    from heli_jax.identification.uncertainty.comparison import intervals
     from heli_jax.report.files import Further
 
     wanted = experiment.config.fit

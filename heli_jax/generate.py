@@ -27,7 +27,7 @@ from heli_jax.simulation import events
 from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
-from heli_jax.sweeps.job import Trimmed
+from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
 

@@ -15,19 +15,19 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.errors import InputError
 from heli_jax.flights import write as tables
-from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate, Fit
-from heli_jax.identification.identifiability import Combination, Verdict
-from heli_jax.identification.metrics import Metrics, diverges
+from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
-    from heli_jax.sweeps.job import Job
     from heli_jax.sweeps.run import Progress
+    from heli_jax.sweeps.spec import Job
 
 
 def write_fit(

@@ -32,8 +32,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # axes name no argument) and analysis.lti (its own errors for wrong arguments are tested).
 _CHECKED = (
     "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
-    "analysis.linear identification.coordinates identification.baseline identification.metrics "
-    "identification.residual"
+    "analysis.linear identification.unknowns.transforms identification.equation_error.baseline "
+    "identification.validation.metrics "
+    "identification.estimation.residual"
 )
 jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")
 

@@ -39,10 +39,10 @@ from heli_jax import (
     rls,
 )
 from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.identification.data import data_of
-from heli_jax.identification.layout import Noise, layout_of
-from heli_jax.identification.optimise import optimise
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.levenberg_marquardt import optimise
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Noise, layout_of
 from heli_jax.naming import replace
 
 jax.config.update("jax_enable_x64", True)

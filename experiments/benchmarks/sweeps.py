@@ -398,8 +398,8 @@ def ours_at(flight: Flight, n: int) -> float:
 
 def on_gpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
     """The compiled part alone on a GPU, whole batches at once, and what a step of it takes."""
-    from heli_jax.sweeps.job import job
     from heli_jax.sweeps.program import Program, arguments
+    from heli_jax.sweeps.spec import job
 
     flight, rows, drawn = record(6000), [], {}
     for precision in ("float64", "float32"):

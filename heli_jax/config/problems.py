@@ -17,7 +17,7 @@ from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
 if TYPE_CHECKING:
-    from heli_jax.identification.choice import Alternatives
+    from heli_jax.identification.model_selection import Alternatives
 
 
 def problem(experiment: Experiment) -> Problem:
@@ -101,7 +101,9 @@ def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
     Raises:
         InputError: no axis of the model can be disturbed.
     """
-    from heli_jax.identification.choice import alternatives  # not before it is needed: slow
+    from heli_jax.identification.model_selection import (
+        alternatives,  # not before it is needed: slow
+    )
 
     model, wanted = experiment.model, experiment.config.disturbance
     axes = disturbable(model)

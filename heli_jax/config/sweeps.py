@@ -15,12 +15,12 @@ from heli_jax.config.schema import AxisConfig, DesignConfig, ReduceConfig, Sweep
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.table import open_table
+from heli_jax.flights.open_log import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
 from heli_jax.sweeps.design import Between, Design
-from heli_jax.sweeps.job import Job, Trajectories, Trimmed, axis_unit, job
 from heli_jax.sweeps.reducers import HOWS, LINEAR, Reduce, Streaming
+from heli_jax.sweeps.spec import Job, Trajectories, Trimmed, axis_unit, job
 
 _DRAWN = ("seed", "sigma_w", "tau_w")
 """axes that are of the disturbance"""

@@ -10,7 +10,8 @@ import numpy as np
 from heli_jax import units
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
-from heli_jax.flights.table import Survey, Table, column, open_table, require_columns, wrong
+from heli_jax.flights.open_log import open_table
+from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 _UNIT_AT_END = re.compile(

@@ -11,9 +11,10 @@ from heli_jax import units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.open_log import open_table
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
-from heli_jax.flights.table import Table, column, open_table, shown, wrong
+from heli_jax.flights.table import Table, column, shown, wrong
 
 _FEWEST = 8
 _MOST_UPSAMPLING = 100

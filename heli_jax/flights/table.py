@@ -1,16 +1,13 @@
 """A log as named columns of numbers, whatever the file's format."""
 
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
-from heli_jax.regular_file import require_regular
 
 
 @dataclass(frozen=True)
@@ -95,30 +92,3 @@ def require_columns(path: str, have: Sequence[str], wanted: Sequence[str]) -> No
         if times == 0:
             known = {n[:40] for n in have if n}
             raise wrong(path, f"no column {shown(name)}{nearest(name[:40], known)}")
-
-
-def open_table(path: str | Path) -> Table:
-    """Open a log; its columns are read when they are asked for.
-
-    Raises:
-        InputError: there is no such file, it is no regular one, it is larger than a log of its
-            format may be, it cannot be read, or it is of no readable format.
-    """
-    from heli_jax.flights.csv_table import open_csv
-    from heli_jax.flights.parquet_table import open_parquet
-
-    path = Path(path)
-    readers = {".parquet": open_parquet} | dict.fromkeys((".csv", ".txt", ".tsv"), open_csv)
-    try:
-        if not require_regular(path, "a log in CSV or Parquet", sys.maxsize):
-            raise wrong(str(path), "is empty, wanted is a log in CSV or Parquet")
-        reader = readers.get(path.suffix.lower())
-        if reader is None:
-            raise wrong(
-                str(path),
-                f"logs ending in {shown(path.suffix)} cannot be read, wanted is .csv, .txt, .tsv"
-                " or .parquet; convert other logs to CSV or Parquet first",
-            )
-        return reader(path)
-    except OSError as e:
-        raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e

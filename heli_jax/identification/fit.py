@@ -5,32 +5,33 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
-from heli_jax.identification import excitation
-from heli_jax.identification import search as starting
-from heli_jax.identification.data import data_of
-from heli_jax.identification.divergent import SAID, by_windows
-from heli_jax.identification.evaluation import Evaluation, evaluate
-from heli_jax.identification.holds import other_hold
-from heli_jax.identification.judgement import verdict_of
-from heli_jax.identification.layout import (
-    Data,
-    Layout,
-    Noise,
-    layout_of,
-    unpack,
-)
-from heli_jax.identification.noise import (
+from heli_jax.identification.assemble import Ran, assemble, noise_by_name, signals_of
+from heli_jax.identification.estimation import multistart as starting
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.multistart import StartRow
+from heli_jax.identification.estimation.noise_covariance import (
     disturbance_or_none,
     first_noise,
     levelled,
     second_guess,
     settle,
 )
-from heli_jax.identification.nuisances import labels
-from heli_jax.identification.outcome import Ran, assemble, noise_by_name, signals_of
+from heli_jax.identification.estimation.shooting_start import SAID, by_windows
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.result import Check, Estimate, Fit, Signals, StartRow, Status
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    layout_of,
+    unpack,
+)
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.other_hold import other_hold
 
 __all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
 

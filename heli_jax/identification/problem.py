@@ -52,7 +52,7 @@ class Nuisance(NamedTuple):
 
     `input_offset` is a constant that is added to the logged input, since no stick is centred: True
     for all inputs, or their names; None leaves it to the machine: on for the sticks of one in free
-    flight, where an offset is integrated (`heli_jax.identification.offsets`).
+    flight, where an offset is integrated (`heli_jax.identification.unknowns.input_offsets`).
     """
 
     initial_state: bool = True

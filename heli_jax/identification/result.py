@@ -6,10 +6,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from heli_jax.dynamics.disturbance import disturbable
-from heli_jax.identification.adequacy import UNJUDGED, Adequacy
-from heli_jax.identification.identifiability import Verdict
-from heli_jax.identification.layout import Reached
-from heli_jax.identification.metrics import Metrics, Whiteness
+from heli_jax.identification.estimation.multistart import StartRow
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.unknowns.layout import Reached
+from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
+from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
@@ -56,18 +57,6 @@ class Signals(NamedTuple):
     def error(self, output: str) -> np.ndarray:
         """What the fit makes white: the innovations with filter error, else the residual."""
         return self.residual(output) if self.innovations is None else self.innovations[output]
-
-
-class StartRow(NamedTuple):
-    """Where one start led."""
-
-    start: dict[str, float]
-    end: dict[str, float]
-    cost: float
-    steps: int
-    converged: bool
-    optimum: int
-    """1 for the best optimum, 2 for the next, ...; 0 where it did not converge"""
 
 
 @dataclass(frozen=True, eq=False)

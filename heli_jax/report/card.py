@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.identification.adequacy import EXPECTED
 from heli_jax.identification.fit import Estimate, Fit
-from heli_jax.identification.identifiability import ILL_CONDITIONED
-from heli_jax.identification.metrics import Metrics
+from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.adequacy import EXPECTED
+from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.report import frequency
 from heli_jax.report.coherence import Coherence, coherences
 

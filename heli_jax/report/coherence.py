@@ -13,8 +13,8 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
-from heli_jax.identification.operating_point import OperatingPoint
 from heli_jax.identification.result import Signals
+from heli_jax.identification.validation.operating_point import OperatingPoint
 from heli_jax.report import frequency
 
 SIZEABLE = 0.1

@@ -14,11 +14,11 @@ from matplotlib.transforms import ScaledTranslation
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit, Signals, StartRow
-from heli_jax.identification.identifiability import Verdict
-from heli_jax.identification.intervals import Intervals
-from heli_jax.identification.metrics import (
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.validation.metrics import (
     autocorrelation,
     cross_correlation,
     lags_for,

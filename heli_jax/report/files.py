@@ -9,13 +9,13 @@ import numpy as np
 
 from heli_jax.flights import Flight
 from heli_jax.flights.write import stacked, write_table
-from heli_jax.identification.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
-from heli_jax.identification.baseline import Baseline
-from heli_jax.identification.choice import Choice
+from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit, Signals
-from heli_jax.identification.identifiability import Verdict
-from heli_jax.identification.intervals import Intervals
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.report.card import card
 from heli_jax.versions import versions
 

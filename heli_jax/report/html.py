@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from matplotlib.figure import Figure
 
 from heli_jax import naming
-from heli_jax.identification.baseline import Baseline
+from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables

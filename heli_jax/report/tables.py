@@ -8,13 +8,14 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.baseline import Baseline
-from heli_jax.identification.choice import Choice
+from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit
-from heli_jax.identification.identifiability import ILL_CONDITIONED, Verdict
-from heli_jax.identification.intervals import Intervals
-from heli_jax.identification.metrics import Metrics, diverges
+from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import adequate_unjudged, whiteness_note
 from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd

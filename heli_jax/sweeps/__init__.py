@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from heli_jax.sweeps.design import sobol as sobol
     from heli_jax.sweeps.design import table as table
     from heli_jax.sweeps.design import zipped as zipped
-    from heli_jax.sweeps.job import Trajectories as Trajectories
-    from heli_jax.sweeps.job import Trimmed as Trimmed
     from heli_jax.sweeps.reducers import Reduce as Reduce
     from heli_jax.sweeps.reducers import Streaming as Streaming
     from heli_jax.sweeps.run import sweep as sweep
+    from heli_jax.sweeps.spec import Trajectories as Trajectories
+    from heli_jax.sweeps.spec import Trimmed as Trimmed
 
 # Loaded when they are first used: the store's libraries take a second that other commands spare.
 _HOMES = {
@@ -29,7 +29,7 @@ _HOMES = {
         ("Between", "Design", "grid", "lhs", "listed", "product", "sobol", "table", "zipped"),
         "design",
     ),
-    **dict.fromkeys(("Trajectories", "Trimmed"), "job"),
+    **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
     **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
     "sweep": "run",
 }

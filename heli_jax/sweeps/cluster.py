@@ -21,9 +21,9 @@ from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from heli_jax.errors import InputError
-from heli_jax.sweeps.job import Job
-from heli_jax.sweeps.lanes import split_for
-from heli_jax.sweeps.work import Split, Worker
+from heli_jax.sweeps.batching import split_for
+from heli_jax.sweeps.spec import Job
+from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import versions
 
 _RETRIES = 5

@@ -17,8 +17,8 @@ from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.job import Job, Plan
 from heli_jax.sweeps.reducers import Measured, Reduce
+from heli_jax.sweeps.spec import Job, Plan
 
 OK, DIVERGED, OUT_OF_RANGE, NOT_RUN = 0, 1, 2, 255
 MEANINGS = {OK: "ok", DIVERGED: "diverged", OUT_OF_RANGE: "out_of_range", NOT_RUN: "not_run"}

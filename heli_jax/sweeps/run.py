@@ -14,13 +14,13 @@ from heli_jax import run_directory
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.sweeps import store as stores
+from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.design import Design, table
-from heli_jax.sweeps.job import Job, Precision, Trajectories, Trimmed, unread
-from heli_jax.sweeps.job import job as checked
-from heli_jax.sweeps.lanes import split_for
 from heli_jax.sweeps.reducers import Reduce
+from heli_jax.sweeps.spec import Job, Precision, Trajectories, Trimmed, unread
+from heli_jax.sweeps.spec import job as checked
 from heli_jax.sweeps.summary import write_summary
-from heli_jax.sweeps.work import Split, Worker
+from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import versions
 
 _SAMPLED = 64

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from heli_jax import run_directory
-from heli_jax.sweeps.job import Job
-from heli_jax.sweeps.pieces import pieces
+from heli_jax.sweeps.chunks import pieces
 from heli_jax.sweeps.program import MEANINGS, OK
+from heli_jax.sweeps.spec import Job
 
 _WORST = 5
 _SMALL_IS_BAD = ("fit", "vaf")

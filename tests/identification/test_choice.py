@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models, naming
-from heli_jax.identification.choice import Candidate, _test, alternatives, choose
+from heli_jax.identification.model_selection import Candidate, _test, alternatives, choose
 from tests.identification.bench import steps
 from tests.identification.test_filter_error import FREE, made
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax.identification.coloured import drawn, sandwich
+from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn, sandwich
 
 N, DT = 20000, 0.01
 

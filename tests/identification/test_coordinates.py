@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from heli_jax import Free
-from heli_jax.identification.coordinates import (
+from heli_jax.identification.unknowns.transforms import (
     KINDS,
     inside,
     kind,

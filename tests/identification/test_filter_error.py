@@ -9,12 +9,12 @@ import pytest
 
 from heli_jax import Flight, Free, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.bootstrap import _disturbed
-from heli_jax.identification.data import data_of
-from heli_jax.identification.layout import Reached, layout_of, unpack
-from heli_jax.identification.metrics import whiteness
-from heli_jax.identification.noise import first_noise
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.uncertainty.bootstrap import _disturbed
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Reached, layout_of, unpack
+from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
 from tests.dynamics.paper import BENCH, matrices

@@ -7,12 +7,12 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.data import data_of
-from heli_jax.identification.evaluation import evaluate
-from heli_jax.identification.layout import layout_of
-from heli_jax.identification.noise import first_noise, levelled
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.noise_covariance import first_noise, levelled
 from heli_jax.identification.problem import Nuisance
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import asdict
 from tests.dynamics.paper import BENCH, matrices
 

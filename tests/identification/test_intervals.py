@@ -8,10 +8,10 @@ import pytest
 import scipy.stats
 
 from heli_jax import Free, Prior, Problem, fit, models
-from heli_jax.identification.bootstrap import bootstrap
-from heli_jax.identification.intervals import _sentences, apart, intervals
-from heli_jax.identification.nuts import Posterior
-from heli_jax.identification.profile import profile
+from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.comparison import _sentences, apart, intervals
+from heli_jax.identification.uncertainty.nuts import Posterior
+from heli_jax.identification.uncertainty.profile_likelihood import profile
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "kappa": Free(3.0)}

@@ -12,7 +12,7 @@ import scipy.stats
 from heli_jax import models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.identification.kalman import innovations
+from heli_jax.identification.estimation.kalman import innovations
 from heli_jax.naming import asdict, names, replace
 
 N, DT = 40, 0.02

@@ -7,7 +7,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heli_jax.identification.metrics import metrics, noise_guess, whiteness
+from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.validation.metrics import metrics, whiteness
 
 SIGNAL = np.sin(0.1 * np.arange(500))
 

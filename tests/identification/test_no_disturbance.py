@@ -6,19 +6,19 @@ import pytest
 
 from heli_jax import Free, Problem, fit, models
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.data import data_of
-from heli_jax.identification.estimates import deviations, extreme_noise_notes
-from heli_jax.identification.evaluation import evaluate
-from heli_jax.identification.layout import layout_of, unpack
-from heli_jax.identification.noise import (
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum
+from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.noise_covariance import (
     Settled,
     disturbance_or_none,
     first_noise,
     log_likelihood,
 )
-from heli_jax.identification.optimise import Optimum
-from heli_jax.identification.search import Search
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.uncertainty.estimates import extreme_noise_notes
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of, unpack
 from heli_jax.naming import asdict
 from tests.identification.bench import BENCH, record, vehicle
 from tests.identification.test_filter_error import made

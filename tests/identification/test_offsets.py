@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
-from heli_jax.identification.data import data_of
-from heli_jax.identification.layout import layout_of
-from heli_jax.identification.offsets import offset_inputs
-from heli_jax.identification.residual import differentiate, rows_of
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.residual import differentiate, rows_of
+from heli_jax.identification.unknowns.input_offsets import offset_inputs
+from heli_jax.identification.unknowns.layout import layout_of
 from heli_jax.naming import Scalar
 from tests.identification.bench import BENCH, amplitude_for, response, steps, vehicle
 

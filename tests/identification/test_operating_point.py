@@ -10,9 +10,9 @@ import scipy.integrate
 
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.excitation import sampling
-from heli_jax.identification.operating_point import operating_point
 from heli_jax.identification.result import Signals
+from heli_jax.identification.validation.excitation import sampling
+from heli_jax.identification.validation.operating_point import operating_point
 from heli_jax.report import figures, frequency
 from tests.dynamics import whole_helicopter as oracle
 

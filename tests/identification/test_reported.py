@@ -5,9 +5,10 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
-from heli_jax.identification.coloured import residual_curvature
-from heli_jax.identification.identifiability import FACTOR, Z95, Unknown, judge
-from heli_jax.identification.optimise import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.identifiability.analysis import judge
+from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
+from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
 
 N, DT = 600, 0.02

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import rls
-from heli_jax.identification.rls import (
+from heli_jax.identification.equation_error.rls import (
     regressors,
     rls_init,
     rls_regression,

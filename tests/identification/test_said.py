@@ -8,7 +8,8 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
-from heli_jax.identification.identifiability import Unknown, judge
+from heli_jax.identification.identifiability.analysis import judge
+from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
 

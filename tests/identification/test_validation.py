@@ -12,7 +12,7 @@ import pytest
 import scipy.integrate
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
-from heli_jax.identification.metrics import diverges
+from heli_jax.identification.validation.metrics import diverges
 from heli_jax.report.files import fit_json
 from heli_jax.report.tables import agreement
 

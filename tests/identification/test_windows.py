@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
-from heli_jax.identification.data import data_of
-from heli_jax.identification.evaluation import evaluate
-from heli_jax.identification.layout import layout_of
-from heli_jax.identification.noise import first_noise
-from heli_jax.identification.residual import rows_of
-from heli_jax.identification.start import start_vector
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4)}

@@ -11,7 +11,7 @@ from heli_jax import models
 from heli_jax.analysis.lti import c2d
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.fit import Signals, StartRow
-from heli_jax.identification.metrics import lags_for
+from heli_jax.identification.validation.metrics import lags_for
 from heli_jax.report import figures, frequency, style
 
 

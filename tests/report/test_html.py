@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from heli_jax.identification.metrics import Whiteness
+from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import numbers, tables
 from heli_jax.report.html import write_report
 from heli_jax.vehicle import Constant

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from heli_jax.report import style, sweeps
 from heli_jax.report.numbers import number
 from heli_jax.report.sweeps import columns
-from heli_jax.sweeps import pieces
+from heli_jax.sweeps import chunks as pieces
 
 UNITS = {"Ixx": "kg*m^2", "If": "kg*m^2", "initial.phi": "rad", "misfit": "rad", "fit": "%"}
 

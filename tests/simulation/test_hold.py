@@ -15,7 +15,7 @@ import scipy.signal
 
 from heli_jax import Flight, Model, accumulate, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.kalman import innovations
+from heli_jax.identification.estimation.kalman import innovations
 from heli_jax.simulation.accumulate import accumulated
 from tests.dynamics.paper import BENCH
 

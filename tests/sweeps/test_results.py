@@ -12,7 +12,7 @@ from heli_jax.analysis.linear import modes
 from heli_jax.analysis.pilot import attitude_hold
 from heli_jax.analysis.trim import Condition, trim
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.metrics import metrics
+from heli_jax.identification.validation.metrics import metrics
 from heli_jax.simulation.accumulate import accumulated
 from heli_jax.sweeps import (
     Between,

@@ -13,10 +13,10 @@ from heli_jax import Flight, models, sweep
 from heli_jax.errors import InputError
 from heli_jax.sweeps import Between, Reduce, listed, pieces, sobol
 from heli_jax.sweeps import store as stores
-from heli_jax.sweeps.job import job
-from heli_jax.sweeps.lanes import split_for
+from heli_jax.sweeps.batching import split_for
+from heli_jax.sweeps.spec import job
 from heli_jax.sweeps.summary import summary
-from heli_jax.sweeps.work import Worker
+from heli_jax.sweeps.worker import Worker
 
 ROLL = models.roll_on_stand
 DESIGN = sobol({"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}, 300, seed=2)
@@ -311,7 +311,7 @@ def test_a_result_that_is_nowhere_a_number_is_finished_too(run, tmp_path):
 
 
 def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
-    import heli_jax.sweeps.lanes as lanes
+    import heli_jax.sweeps.batching as lanes
 
     def cut(n, **asked):
         design = sobol({"Ixx": Between(0.02, 0.05)}, n)

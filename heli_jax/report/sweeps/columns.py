@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from heli_jax.sweeps.pieces import pieces
+from heli_jax.sweeps.chunks import pieces
 
 WIDE = 30.0
 """factor over which numbers of one sign are drawn logarithmically"""

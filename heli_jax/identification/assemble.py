@@ -1,0 +1,446 @@
+"""From an optimum to a Fit: estimates, verdict, signals, metrics, whiteness, notes."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, residuals_count
+from heli_jax.identification.estimation.multistart import Search, table
+from heli_jax.identification.estimation.noise_covariance import (
+    NO_DISTURBANCE,
+    Settled,
+    innovation_sums,
+    log_likelihood,
+    noise_unknowns,
+)
+from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.identifiability.verdict import Z95, Verdict
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Fit, Signals, Status
+from heli_jax.identification.uncertainty.autocorrelated_residuals import (
+    Sandwich,
+    residual_curvature,
+    sandwich,
+)
+from heli_jax.identification.uncertainty.estimates import (
+    bound_notes,
+    estimates_of,
+    extreme_noise_notes,
+    flight_nuisances,
+    prior_notes,
+    stated_noise_notes,
+)
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, unpack
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.adequacy import Adequacy, Record, assess
+from heli_jax.identification.validation.held_out import validate
+from heli_jax.identification.validation.metrics import (
+    NO_METRICS,
+    Metrics,
+    Whiteness,
+    metrics,
+    whiteness,
+)
+from heli_jax.identification.validation.other_hold import other_hold
+
+
+class Ran(NamedTuple):
+    """How the optimiser was run."""
+
+    before: Verdict
+    points: Array
+    runs: list[Optimum]
+    seed: int
+    timing: dict[str, float]
+
+
+def noise_by_name(
+    problem: Problem, layout: Layout, noise: Noise, scales: dict[str, Any]
+) -> dict[str, float]:
+    """sd of the measurement noise as 'flight/output'."""
+    return {
+        f"{label}/{n}": float(s) * float(scales.get(n, 1.0))
+        for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
+        for n, s in by_name.items()
+    }
+
+
+def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fit:
+    """All that a fit says, from where the optimiser ended."""
+    layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
+    e = evaluate(layout, data, noise, best.z)
+    usable = bool(np.all(np.isfinite(e.J)))
+    verdict = verdict_of(problem, layout, e) if usable else ran.before
+    n = residuals_count(data)
+    quantile = float(scipy.special.stdtrit(max(n - layout.determined, 1), 0.975))
+    signals = signals_of(e, problem.training)
+    white = _whiteness(signals, e)
+    together = correlated_residuals(signals)
+    coloured = usable and not layout.filtered
+    coloured = coloured and (bool(together) or not all(w.white for w in white.values()))
+    wider, quantiles = np.ones(layout.size), np.full(layout.size, quantile)
+    if coloured:
+        curvature = residual_curvature(layout, data, noise, best.z)
+        errors = sandwich(layout, data, e, curvature)
+        wider, quantiles = errors.inflation(), np.maximum(errors.quantile(), quantile)
+        verdict = verdict_of(problem, layout, e, _reported(errors, layout, e, quantiles))
+        verdict = _widened(verdict, errors, _along(verdict, layout, e))
+    named = estimates_of(problem, layout, e, verdict, quantiles, wider)
+    estimates = {k: named[k] for k in layout.free}
+    nuisance = {k: v for k, v in named.items() if k not in layout.free}
+    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantiles, wider)
+    none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
+    if none:
+        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
+    held = tuple(f for f in problem.flights if f.hold_out)
+    checked = validate(problem, layout, best.z, noise, held) if held else None
+    validation = signals_of(checked.e, held) if checked else ()
+    free_run = _free_run(held, checked.free_run) if checked else ()
+    sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
+    ill = _ill_conditioned(problem, e, sds)
+    dtype = jnp.result_type(float)
+    values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
+    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    params = naming.replace(problem.vehicle, **values)
+    against = None
+    if layout.filtered and not none:
+        against = _against_disturbance(layout, data, noise, e, best.z)
+    adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
+    notes = [
+        *_stopped_notes(layout, best, settled),
+        *excitation.sampling(problem, reached),
+        *_disturbance_notes(settled.ratio if none else None),
+        *([] if none else extreme_noise_notes(layout, data, best.z)),
+        *settled.notes,
+        *_filter_notes(layout, noise, e, n, ill),
+        *stated_noise_notes(problem, sds),
+        *_correlation_notes(together if coloured else {}),
+        *bound_notes(named),
+        *prior_notes(problem, estimates),
+        *_hold_notes(problem, search, settled, e, named),
+        *adequacy.sentences,
+        *(checked.notes if checked else ()),
+    ]
+    return Fit(
+        model=problem.model.name,
+        method=problem.method,
+        status=_status(best, usable and not ill, verdict),
+        n_samples=n,
+        estimates=estimates,
+        nuisance=nuisance,
+        params=params,
+        verdict_before=ran.before,
+        verdict=verdict,
+        noise=sds,
+        log_likelihood=log_likelihood(layout, data, noise, e),
+        unknowns=layout.determined + noise_unknowns(layout) - (len(layout.noise) if none else 0),
+        signals=(*signals, *validation),
+        metrics=_pooled(signals),
+        validation=_pooled(validation),
+        validation_free_run=_pooled(free_run),
+        one_step=_pooled(signals, one_step=True),
+        one_step_validation=_pooled(validation, one_step=True),
+        whiteness=white,
+        adequacy=adequacy,
+        coloured=coloured,
+        starts=table(layout, data, ran.points, ran.runs),
+        steps=sum(s for s, _ in settled.trace),
+        trace=settled.trace,
+        notes=tuple(notes),
+        reached=Reached(layout, data, noise, best.z),
+        seed=ran.seed,
+        timing=ran.timing,
+    )
+
+
+def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
+    """The logarithms of the verdict's combinations as directions (k, q) of the unknowns."""
+    # What a logarithm gains by the optimiser's coordinate.
+    slopes = np.asarray(e.slopes) / np.asarray(e.named)
+    along = np.zeros((len(verdict.combinations), layout.size))
+    for k, c in enumerate(verdict.combinations):
+        for name, power in c.exponents.items():
+            i = layout.named.index(name)
+            along[k, i] = power * slopes[i]
+    return along
+
+
+def _reported(errors: Sandwich, layout: Layout, e: Evaluation, quantiles: np.ndarray) -> np.ndarray:
+    """Covariance (k, k) of the named unknowns with autocorrelated residuals, as wide as the
+    intervals that are reported."""
+    named = np.eye(layout.size)[: len(layout.named)]
+    factor = quantiles[: len(layout.named)] / Z95
+    return errors.covariance(named) * np.outer(factor, factor)
+
+
+def _widened(verdict: Verdict, errors: Sandwich, along: np.ndarray) -> Verdict:
+    """The verdict with intervals of its combinations, directions (k, q), that allow for
+    autocorrelated residuals."""
+    if not verdict.combinations:
+        return verdict
+    wider = errors.inflation(along)
+    reach = wider * errors.quantile(along) / Z95
+    combinations = tuple(
+        c._replace(
+            sd=float(c.sd * w),
+            lower95=float(c.value * (c.lower95 / c.value) ** r),
+            upper95=float(c.value * (c.upper95 / c.value) ** r),
+        )
+        for c, w, r in zip(verdict.combinations, wider, reach, strict=True)
+    )
+    return replace(verdict, combinations=combinations)
+
+
+def _status(best: Optimum, usable: bool, verdict: Verdict) -> Status:
+    if not bool(best.converged) or not usable:
+        return "not-converged"
+    return "converged" if verdict.identifiable else "not-identifiable"
+
+
+def _absent(name: str, one: Estimate) -> Estimate:
+    """The estimate of a disturbance parameter where no disturbance shows."""
+    gone = name == "sigma_w"
+    value = 0.0 if gone else one.value
+    return one._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
+
+
+def _hold_notes(
+    problem: Problem, search: Search, settled: Settled, e: Evaluation, named: dict[str, Estimate]
+) -> list[str]:
+    """Where the log let inputs be taken as linear between samples, and it matters."""
+    if not bool(settled.best.converged):
+        return []
+    sd = {n: one.sd for n, one in named.items() if one.sd is not None}
+    at = (search.layout, search.data, settled.noise, settled.best.z)
+    return other_hold(problem, *at, e, sd, in_doubt=True)
+
+
+_SURELY_CORRELATED = 4.5
+"""standard deviations from zero at which two residuals are taken for correlated"""
+_WORTH_IT = 0.1
+
+
+def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
+    """By 'output and output, flight' the correlation of residuals that are not independent.
+
+    White residuals of two outputs that go together count one piece of news twice.
+    """
+    found = {}
+    for s in signals:
+        names = list(s.measured)
+        for i, a in enumerate(names):
+            for b in names[:i]:
+                x, y = s.residual(a), s.residual(b)
+                seen = np.isfinite(x) & np.isfinite(y)
+                n = int(seen.sum())
+                if n < 8 or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
+                    continue
+                rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
+                if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
+                    found[f"{b} and {a}, {s.flight}"] = rho
+    return found
+
+
+def _correlation_notes(together: dict[str, float]) -> list[str]:
+    if not together:
+        return []
+    words = "; ".join(f"{names}: {rho:+.2f}" for names, rho in together.items())
+    return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
+
+
+def _adequacy(
+    problem: Problem,
+    params: Any,
+    signals: tuple[Signals, ...],
+    white: dict[str, Whiteness],
+    against: dict[str, float] | None,
+    unknowns: int,
+) -> Adequacy:
+    records = tuple(
+        Record(s.flight, flight.dt, s.measured, s.simulated)
+        for s, flight in zip(signals, problem.training, strict=True)
+    )
+    return assess(problem, params, records, _pooled(signals), white, against, unknowns)
+
+
+_BLIND = 1e4
+"""so many times the signal is a noise from which a filter learns nothing"""
+
+
+def _against_disturbance(
+    layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
+) -> dict[str, float]:
+    """By output, the power of the simulation's error over that which disturbance and noise make.
+
+    A filter whose measurements are all but noise never corrects its state: the variance of its
+    innovations is then that of a simulation's error. The program is the one that is compiled.
+    """
+    sizes = tuple(
+        {n: np.asarray(_BLIND * _moved(y), np.asarray(s[n]).dtype) for n, y in f.outputs.items()}
+        for f, s in zip(data.flights, noise.sd, strict=True)
+    )
+    blind = evaluate(layout, data, noise._replace(sd=sizes), z)
+    scales = unpack(layout, data, z).scales
+    power: dict[str, list[float]] = {}
+    for raw, one, big, sd in zip(e.raw, blind.innovations, sizes, noise.sd, strict=True):
+        for n, s in one.variance.items():
+            factor = float(scales.get(n, 1.0)) ** 2
+            spread = np.maximum(np.asarray(s) - float(big[n]) ** 2 * factor, 0.0)
+            expected = spread + float(sd[n]) ** 2 * factor
+            seen = np.isfinite(raw[n])
+            have = power.setdefault(n, [0.0, 0.0])
+            with np.errstate(all="ignore"):
+                have[0] += float(np.var(raw[n][seen])) * int(seen.sum())
+                have[1] += float(np.nansum(expected))
+    return {
+        n: float(missed / expected) if np.isfinite(expected) and expected > 0 else 0.0
+        for n, (missed, expected) in power.items()
+    }
+
+
+def _moved(y: Any) -> float:
+    y = np.asarray(y)
+    return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
+
+
+def _disturbance_notes(ratio: float | None) -> list[str]:
+    if ratio is None:
+        return []
+    return [
+        "No disturbance shows in the record (twice the log-likelihood gained by one is "
+        f"{ratio:.2g}): output error suffices, and these are its numbers."
+    ]
+
+
+_DIGITS = 1e13
+"""Variance of an innovation over that of the measurement beyond which float64 has no digits left
+for what the measurement says of the state."""
+_TOLERANCE = 1e-6
+
+
+def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]:
+    """What to do where the optimiser has not arrived."""
+    if bool(best.converged):
+        return []
+    steps = sum(s for s, _ in settled.trace)
+    windows = sum(count for count, _ in layout.windows)
+    remedy = "start nearer, with bounds or several starts, or allow more steps"
+    if windows > len(layout.windows) and layout.continuity is None:
+        remedy = (
+            "tie the windows together (continuity), since a state that no output shows is free in "
+            f"each of them; or {remedy}"
+        )
+    return [
+        f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
+        f"Remedy: {remedy}."
+    ]
+
+
+def _ill_conditioned(problem: Problem, e: Evaluation, sds: dict[str, float]) -> bool:
+    """Whether the filter has lost its digits: variances that are none, or beyond all digits."""
+    if problem.method != "filter-error":
+        return False
+    found = np.concatenate(_variances(problem, e, sds))
+    found = found[~np.isnan(found)] if np.isfinite(e.r).all() else found
+    return bool(
+        not found.size
+        or not np.isfinite(found).all()
+        or found.min() < 1.0 - _TOLERANCE
+        or found.max() > _DIGITS
+    )
+
+
+def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, n: int, ill: bool) -> list[str]:
+    """What is wrong with the filter, and the remedy."""
+    if ill:
+        return [
+            "The Kalman filter is ill-conditioned: next to the disturbance the measurement noise "
+            "is too small for the digits of a computer. These numbers are no result. State a "
+            "measurement noise (sd) of at least the log's resolution, or begin with a smaller "
+            "sigma_w."
+        ]
+    if not layout.filtered or layout.concentrated:
+        return []
+    size = float(np.sqrt(innovation_sums(e, noise)[0] / n))
+    if 0.8 < size < 1.25:
+        return []
+    return [
+        f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
+        "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
+    ]
+
+
+def _variances(problem: Problem, e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
+    """Of the innovations over the measurement noise's, by flight and output."""
+    return [
+        np.asarray(s) / sds[f"{label}/{n}"] ** 2
+        for label, one in zip(labels(problem.training), e.innovations, strict=True)
+        for n, s in one.variance.items()
+    ]
+
+
+def _whiteness(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
+    """Of the innovations where there are some, else of the residuals."""
+    if e.innovations:
+        errors = {
+            f"{s.flight}/{n}": error / np.sqrt(one.variance[n])
+            for s, one in zip(signals, e.innovations, strict=True)
+            for n, error in one.error.items()
+        }
+    else:
+        errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+    return {name: whiteness(error, len(errors)) for name, error in errors.items()}
+
+
+def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
+    """Measured and simulated signals; what is simulated carries the bias."""
+    errors = [one.error for one in e.innovations] or [None] * len(flights)
+    return tuple(
+        Signals(
+            label,
+            f.hold_out,
+            f.times,
+            dict(f.inputs),
+            dict(f.outputs),
+            {n: np.asarray(v) for n, v in by_name.items()},
+            error,
+        )
+        for label, f, by_name, error in zip(
+            labels(flights), flights, e.simulated, errors, strict=True
+        )
+    )
+
+
+def _free_run(
+    flights: tuple[Flight, ...], runs: tuple[dict[str, np.ndarray], ...] | None
+) -> tuple[Signals, ...]:
+    """The flights held out as simulated in one piece."""
+    return tuple(
+        Signals(label, f.hold_out, f.times, dict(f.inputs), dict(f.outputs), run)
+        for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
+    )
+
+
+def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
+    """Metrics by output over all the flights that have it; of one-step predictions none without
+    innovations."""
+    if one_step:
+        signals = tuple(s for s in signals if s.innovations is not None)
+    outputs = sorted({n for s in signals for n in s.measured})
+    pooled = {}
+    for n in outputs:
+        have = [s for s in signals if n in s.measured]
+        measured = np.concatenate([s.measured[n] for s in have])
+        model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
+        finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
+        pooled[n] = metrics(measured, model) if finite else NO_METRICS
+    return pooled

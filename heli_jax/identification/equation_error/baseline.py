@@ -1,0 +1,267 @@
+"""The paper's way on the same data: RLS, d2c, and from H(s) to a/Ixx and a/If."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from heli_jax import naming
+from heli_jax.analysis.lti import d2c
+from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.roll import ratios_from_denominator
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.equation_error.rls import rls, transfer_function
+from heli_jax.identification.validation.metrics import NO_METRICS, Metrics, metrics, whiteness
+from heli_jax.vehicle import of_helicopter
+
+_solve_banded: Any = get_lapack_funcs("tbtrs")
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """RLS on one input and one output of one flight, and what can be read from it."""
+
+    flight: str
+    output: str
+    input: str
+    order: int
+    forgetting: float
+    dt: float
+    theta: np.ndarray
+    """(2n + 1,) final [-a1 ... -an, b0 ... bn]"""
+    num: np.ndarray
+    den: np.ndarray
+    """of Hd(z), highest power first"""
+    poles: np.ndarray
+    history: np.ndarray
+    """(N, 2n + 1)"""
+    continuous_num: np.ndarray | None
+    continuous_den: np.ndarray | None
+    exact: bool
+    """whether the continuous form gives Hd back when it is sampled"""
+    note: str
+    combinations: dict[str, float]
+    times: np.ndarray
+    measured: np.ndarray
+    simulated: np.ndarray
+    metrics: Metrics
+    trusted: bool
+    sentences: tuple[str, ...]
+
+
+def baseline(
+    model: Model, params: Any, flight: Flight, *, order: int = 4, forgetting: float = 1.0
+) -> Baseline:
+    """RLS of one flight: its first output (an angle before its rate) from its first input.
+
+    Both signals are scaled to unit rms, so that P(0) = 1e12 I means the same whatever the units;
+    Theta is scaled back. The first samples, whose past was not recorded, only serve as past.
+
+    Raises:
+        ValueError: too few samples in a row.
+    """
+    output = _output(model, flight)
+    input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
+    part = _longest_whole(flight.outputs[output])
+    if part.stop - part.start < 10 * order:
+        raise ValueError(
+            f"the longest stretch of {output} without a missing sample has {part.stop - part.start}"
+            f", wanted for order {order} are {10 * order}"
+        )
+    u, y = flight.inputs[input_][part], flight.outputs[output][part]
+    u_scale, y_scale = _rms(u), _rms(y)
+    run = rls(
+        jnp.asarray(u / u_scale),
+        jnp.asarray(y / y_scale),
+        order=order,
+        forgetting=jnp.asarray(forgetting),
+        p0=jnp.asarray(1e12),
+    )
+    back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
+    history = np.asarray(run.history) * back
+    theta = history[-1]
+    num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
+    poles = np.roots(den)
+    with np.errstate(all="ignore"):
+        simulated = _simulate(num, den, u, y)
+    continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
+    combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
+    agreement = _metrics(y, simulated)
+    sentences = [
+        *_gaps(flight, output, part),
+        *_stability(poles),
+        *([note] if note else []),
+        *doubts,
+        *_bias(np.asarray(run.error)[order:] * y_scale, simulated, y, agreement),
+    ]
+    return Baseline(
+        flight=flight.name or "flight 1",
+        output=output,
+        input=input_,
+        order=order,
+        forgetting=forgetting,
+        dt=flight.dt,
+        theta=theta,
+        num=num,
+        den=den,
+        poles=poles,
+        history=history,
+        continuous_num=continuous_num,
+        continuous_den=continuous_den,
+        exact=exact,
+        note=note,
+        combinations=combinations,
+        times=flight.times[part],
+        measured=y,
+        simulated=simulated,
+        metrics=agreement,
+        trusted=not sentences,
+        sentences=tuple(sentences),
+    )
+
+
+def _longest_whole(y: np.ndarray) -> slice:
+    """The longest stretch without a missing sample."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], np.isnan(y), [True]]).astype(int)))
+    if not edges.size:
+        return slice(0, 0)
+    starts, ends = edges[::2], edges[1::2]
+    best = int(np.argmax(ends - starts))
+    return slice(int(starts[best]), int(ends[best]))
+
+
+def _gaps(flight: Flight, output: str, part: slice) -> list[str]:
+    y = flight.outputs[output]
+    if not np.isnan(y).any():
+        return []
+    return [
+        f"It needs every sample: {int(np.isnan(y).sum())} of {output} are missing, so it saw only "
+        f"the {part.stop - part.start} samples from {part.start * flight.dt:.4g} s on."
+    ]
+
+
+def _rms(signal: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(signal**2))) or 1.0
+
+
+def _simulate(num: np.ndarray, den: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Hd driven by the whole input, started from the first measured outputs."""
+    n = den.size - 1
+    forced = np.convolve(u, num / den[0])[n : u.size]
+    band = np.tile(np.asarray(den / den[0])[:, None], u.size - n)
+    past = np.convolve(np.concatenate([y[:n], np.zeros(n)]), den / den[0])[n : 2 * n]
+    forced[:n] -= past[: forced.size]
+    # den(q) y = num(q) u row by row is a triangular banded system.
+    rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
+    return np.concatenate([y[:n], np.ravel(rest)])
+
+
+def _output(model: Model, flight: Flight) -> str:
+    present = [n for n in naming.names(model.Outputs) if n in flight.outputs]
+    angles = [n for n in present if naming.unit(model.Outputs, n) == "rad"]
+    return (angles or present)[0]
+
+
+def _metrics(y: np.ndarray, simulated: np.ndarray) -> Metrics:
+    if not np.isfinite(simulated).all() or np.abs(simulated).max() > 1e6 * np.abs(y).max():
+        return NO_METRICS
+    return metrics(y, simulated)
+
+
+def _continuous(
+    num: np.ndarray, den: np.ndarray, dt: float
+) -> tuple[np.ndarray | None, np.ndarray | None, bool, str]:
+    """H(s), whether it is the inverse of the zero-order hold, and why not."""
+    try:
+        return *d2c(num, den, dt, "zoh"), True, ""
+    except ValueError as e:
+        refused = str(e).split(";")[0]
+    try:
+        continuous = d2c(num, den, dt, "real-log")
+    except ValueError as e:
+        return None, None, False, f"It has no continuous form: {e}."
+    return (
+        *continuous,
+        False,
+        f"Its continuous form is the real part of a matrix logarithm, which is another system: "
+        f"{refused}.",
+    )
+
+
+def _combinations(
+    model: Model, params: Any, flight: Flight, output: str, den: np.ndarray | None, order: int
+) -> tuple[dict[str, float], list[str]]:
+    """a/Ixx and a/If where the structure of eq. 23 allows to read them off."""
+    if (
+        not of_helicopter(model.Params)
+        or output not in ("roll", "pitch")
+        or len(naming.names(model.State)) != 4
+    ):
+        return {}, [
+            "No way leads from its coefficients to physical parameters of this model and "
+            f"output ({output})."
+        ]
+    if den is None:
+        return {}, []
+    if order != 4:
+        return {}, [
+            f"Order {order} is not the fourth order of eq. 23: no physical parameters "
+            "can be read from it."
+        ]
+    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+    p = naming.replace(params, **known)
+    p = p if "stand" in model.name else naming.replace(p, zeta=0.0 * p.zeta)
+    ratios = ratios_from_denominator(p, den, output)
+    values = {n: float(v) for n, v in ratios.values.items()}
+    doubts = []
+    wrong = [f"{n} = {v:.4g}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]
+    if wrong:
+        doubts.append(f"It gives {' and '.join(wrong)}, which no helicopter has.")
+    off = float(ratios.p2) / float(ratios.p2_expected) - 1.0
+    if abs(off) > 0.05:
+        doubts.append(
+            f"Its coefficient of s^2 is {float(ratios.p2):.4g} where its other coefficients and "
+            f"the rotor speed ask for {float(ratios.p2_expected):.4g}: it does not have the "
+            "structure of eq. 23, and its physical parameters mean little."
+        )
+    return values, doubts
+
+
+def _stability(poles: np.ndarray) -> list[str]:
+    size = float(np.max(np.abs(poles)))
+    if size >= 1.0:
+        return [
+            f"It has a pole of size {size:.4f}, outside the unit circle: its simulation diverges."
+        ]
+    return []
+
+
+_STARTING = 100
+
+
+def _bias(
+    errors: np.ndarray, simulated: np.ndarray, y: np.ndarray, agreement: Metrics
+) -> list[str]:
+    """Noise biases equation error: told by coloured errors or a poor simulation."""
+    said = []
+    # While P falls from its start the errors are those of no model.
+    errors = errors[min(_STARTING, errors.size // 4) :]
+    one_step = float(np.sqrt(np.mean(errors**2)))
+    if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
+        return said  # no noise at all: what is left is rounding
+    if math.isnan(agreement.rmse):
+        said.append("Its simulation diverges from the measured output; no metrics are given.")
+    elif agreement.rmse > 1.5 * one_step:
+        said.append(
+            f"It predicts one sample ahead to {one_step:.2g} but simulates to {agreement.rmse:.2g} "
+            "only: least squares on past measured outputs is biased by their noise."
+        )
+    if not whiteness(errors).white:
+        said.append(
+            "Its one-step errors are not white: noise on the measured output or disturbances bias "
+            "its coefficients."
+        )
+    return said

@@ -1,0 +1,95 @@
+"""The numbers of a problem over its flights, as the residual wants them."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    FlightData,
+    Layout,
+    Noise,
+    layout_of,
+)
+
+
+def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
+    """The numbers of a problem over the given flights."""
+    dtype = np.dtype(jnp.result_type(float))
+    nuisance, frees = problem.nuisance, list(problem.free.values())
+    bounds = [coordinates.limits(f) for f in frees]
+
+    def column(values: list[float]) -> np.ndarray:
+        return np.array(values, dtype)
+
+    numbers = Data(
+        base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
+        sign=column([coordinates.sign_or_scale(f) for f in frees]),
+        low=column([b[0] for b in bounds]),
+        high=column([b[1] for b in bounds]),
+        prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
+        prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
+        flights=tuple(_flight_data(problem, f, dtype) for f in flights),
+    )
+    numbers = jax.device_put(numbers)
+    if not nuisance.initial_state:
+        return numbers
+    return _with_state_scales(problem, layout_of(problem, flights), numbers)
+
+
+def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:
+    model = problem.model
+    inputs = {n: np.asarray(flight.inputs[n], dtype) for n in naming.names(model.Inputs)}
+    # By name, as JAX orders them in everything that is compiled.
+    outputs = {n: np.asarray(y, dtype) for n, y in sorted(flight.outputs.items())}
+    return FlightData(
+        dt=np.asarray(flight.dt, dtype),
+        inputs=model.Inputs(**inputs),
+        outputs=outputs,
+        known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
+        state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
+        bias_scale={
+            n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
+        },
+        offset_scale={n: np.asarray(10.0 * _moved(u), dtype) for n, u in inputs.items()},
+    )
+
+
+def _size(values: Any) -> float:
+    """rms of a signal, 1 where that says nothing."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = float(np.sqrt(np.mean(np.square(np.asarray(values)))))
+    return rms if np.isfinite(rms) and rms > 0 else 1.0
+
+
+def _moved(u: np.ndarray) -> float:
+    """How far an input moves (rms about its mean), or its size where it never does."""
+    moved = float(np.std(u))
+    return moved if np.isfinite(moved) and moved > 0 else _size(u)
+
+
+def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
+    """Ten times what each state does in a run from the start values: a weak prior's sd.
+
+    The run is brought to the size of the measured outputs first, since a gain may be unknown.
+    """
+    z = start_vector(layout, data, problem)
+    one = np.ones((), z.dtype)
+    sd = tuple(dict.fromkeys(flight.outputs, one) for flight in data.flights)
+    e = evaluate(layout, data, Noise(sd, np.zeros((), z.dtype)), z)
+    scaled, names = [], naming.names(layout.model.State)
+    for flight, runs, rms in zip(data.flights, e.simulated, e.state_rms, strict=True):
+        y = {n: np.asarray(v) for n, v in flight.outputs.items()}
+        y = {n: v[np.isfinite(v)] for n, v in y.items()}
+        ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))
+        scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
+        scaled.append(flight._replace(state_scale=jax.device_put(scale)))
+    return data._replace(flights=tuple(scaled))

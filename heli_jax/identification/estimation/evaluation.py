@@ -1,0 +1,100 @@
+"""Everything that one point tells, for what is not compiled."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.kalman import Innovations
+from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.residual import Shown, predict, shown_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
+
+_TAKES_PART = 1e-3
+"""part of a unit direction without effect from which on a coordinate is lost with it"""
+
+
+class Evaluation(NamedTuple):
+    """Everything that one point tells, as NumPy arrays."""
+
+    simulated: tuple[dict[str, Any], ...]
+    """with the bias, SI, by flight and output"""
+    raw: tuple[dict[str, Any], ...]
+    """measured - simulated, SI, by flight and output; NaN where nothing is measured"""
+    state_rms: Any
+    """(flights, states) root mean square of each simulated state"""
+    innovations: tuple[Innovations, ...]
+    r: Any
+    J: Any
+    named: Any
+    """values of the named unknowns"""
+    slopes: Any
+    """their derivatives by their own coordinates"""
+
+
+def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
+    """The slopes, the simulation, and the named unknowns."""
+    at = slopes(layout, data, noise, z)
+    shown = _shown(layout, data, z) if at.shown is None else at.shown
+    found = jax.device_get((shown, at.innovations, at.r, at.J, *_named(layout, data, z)))
+    (outputs, biases, rms), *rest = found
+    bias = iter(biases)
+    simulated = tuple(
+        {n: y + next(bias) for n, y in zip(names, run, strict=True)}
+        for run, names in zip(outputs, layout.outputs, strict=True)
+    )
+    raw = tuple(
+        {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
+        for flight, run in zip(data.flights, simulated, strict=True)
+    )
+    return Evaluation(simulated, raw, rms, *rest)
+
+
+def simulated_outputs(
+    layout: Layout, data: Data, z: Float[Array, " q"]
+) -> tuple[dict[str, np.ndarray], ...]:
+    """By flight and output the simulation (N,) with the bias, SI."""
+    outputs, biases, _ = jax.device_get(_shown(layout, data, z))
+    bias = iter(biases)
+    return tuple(
+        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
+        for run, names in zip(outputs, layout.outputs, strict=True)
+    )
+
+
+@eqx.filter_jit
+def _shown(layout: Layout, data: Data, z: Array) -> Shown:
+    u = unpack(layout, data, z)
+    return shown_of(u, predict(layout, data, u))
+
+
+@eqx.filter_jit
+def _named(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
+    def named(z: Array) -> Array:
+        u = unpack(layout, data, z)
+        shift = () if u.shift is None else (u.shift,)
+        return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
+
+    return named(z), jnp.diagonal(jax.jacfwd(named)(z))
+
+
+def deviations(J: np.ndarray) -> np.ndarray:
+    """Standard deviations (q,) of all coordinates from whitened rows (n, q).
+
+    Infinite for a coordinate without effect, and for those that take part in a direction without:
+    what leaves no trace in the rows is not known, rather than known exactly.
+    """
+    J = np.asarray(J, dtype=np.float64)
+    q = J.shape[1]
+    if not np.isfinite(J).all():
+        return np.full(q, np.inf)
+    norms = np.linalg.norm(J, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    sizes = np.concatenate([sizes, np.zeros(q - sizes.size)])
+    kept = sizes > 1e-10 * sizes[0]
+    sds = np.sqrt(np.sum((right[kept] / sizes[kept, None]) ** 2, axis=0)) / norms
+    return np.where(np.any(np.abs(right[~kept]) > _TAKES_PART, axis=0), np.inf, sds)

@@ -1,0 +1,303 @@
+"""Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.levenberg_marquardt import (
+    Optimum,
+    optimise,
+    residuals_count,
+    slopes,
+)
+from heli_jax.identification.estimation.residual import predict, rows_of
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
+from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of, unpack
+
+Progress = Callable[[str], None]
+
+
+class StartRow(NamedTuple):
+    """Where one start led."""
+
+    start: dict[str, float]
+    end: dict[str, float]
+    cost: float
+    steps: int
+    converged: bool
+    optimum: int
+    """1 for the best optimum, 2 for the next, ...; 0 where it did not converge"""
+
+
+_SHIFTS = 41
+_NEAR = 0.1
+"""standard deviations from the optimum at which it counts as reached"""
+
+
+def first_guess(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
+    linear least squares; what is not among the unknowns stays."""
+    z0 = noise_guess_at(layout, data, noise, z0) if layout.noise else z0
+    if not (layout.shift or len(layout.gains) == 1):
+        return z0
+    grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
+    coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
+    costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        return z0
+    q = len(layout.free)
+    if len(layout.gains) == 1:
+        z0 = z0.at[q].set(gains[best])
+    if layout.shift:
+        z0 = z0.at[q + len(layout.gains)].set(coordinate[best])
+    return z0
+
+
+def noise_guess_at(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
+    """sigma_w and tau_w of the greatest likelihood on a coarse grid about the start."""
+    at = len(layout.named)
+    steps = {
+        "sigma_w": np.log(10.0) * np.arange(-3.0, 2.5),
+        "tau_w": np.log(10.0) * np.arange(-1, 2),
+    }
+    grid = np.stack(np.meshgrid(*(steps[n] for n in layout.noise), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(layout.noise))
+    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
+    points[:, at : at + len(layout.noise)] += grid
+    costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    return jnp.asarray(points[best], z0.dtype)
+
+
+@eqx.filter_jit
+def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
+    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
+
+
+@eqx.filter_jit
+def _scan(
+    layout: Layout, data: Data, noise: Noise, z0: Array, shifts: Array
+) -> tuple[Array, Array]:
+    """Cost and best single gain for each time shift, with means taken off both signals."""
+    q = len(layout.free)
+
+    def at(shift: Array) -> tuple[Array, Array]:
+        z = z0.at[q + len(layout.gains)].set(shift) if layout.shift else z0
+        runs = predict(layout, data, unpack(layout, data, z))
+        ys, ms = [], []
+        for flight, names, run, s in zip(data.flights, layout.outputs, runs, noise.sd, strict=True):
+            for n, y in flight.outputs.items():
+                m = run.outputs[names.index(n)]
+                seen = jnp.isfinite(y)
+                ys.append(_centred(y, seen) / s[n])
+                ms.append(_centred(m, seen) / s[n])
+        y, m = jnp.concatenate(ys), jnp.concatenate(ms)
+        gain = jnp.ones_like(y[0])
+        if len(layout.gains) == 1:
+            power = jnp.sum(m * m)
+            gain = jnp.where(power > 0, jnp.sum(y * m) / jnp.where(power > 0, power, 1.0), gain)
+        return jnp.mean(jnp.square(y - gain * m)), gain
+
+    return jax.lax.map(at, shifts)
+
+
+def _centred(signal: Array, seen: Array) -> Array:
+    """Less its mean over the samples seen; zero elsewhere."""
+    share = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
+    return jnp.where(seen, signal - share, 0.0)
+
+
+def draw(
+    layout: Layout, problem: Problem, z0: Float[Array, " q"], starts: int, seed: int
+) -> Float[Array, "s q"]:
+    """Starts (s, q): the first is z0, the others differ in the free parameters.
+
+    Between two bounds of one sign the draw is uniform in log, between two of different sign
+    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
+    and of either sign where that may be any.
+    """
+    rng = np.random.default_rng(seed)
+    rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
+    dtype = z0.dtype
+    for i, (free, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
+        values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
+        sign = jnp.asarray(coordinates.sign_or_scale(free), dtype)
+        low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
+        rows[1:, i] = np.asarray(coordinates.to_coordinate(how, values, sign, low, high))
+    return jnp.asarray(rows, dtype)
+
+
+def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
+    share = rng.uniform(0.02, 0.98, size)
+    low, high = free.lower, free.upper
+    if low is not None and high is not None:
+        if low * high > 0:
+            return low * (high / low) ** share
+        return low + (high - low) * share
+    width = 1.1
+    if free.prior is not None and free.prior.mean:
+        width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
+    values = free.start * np.exp(width * rng.standard_normal(size))
+    if coordinates.changes_sign(free):
+        values = _either_sign(free, width, rng.standard_normal((2, size)))
+    return np.where([coordinates.inside(free, float(v)) for v in values], values, free.start)
+
+
+def _either_sign(free: Free, width: float, drawn: np.ndarray) -> np.ndarray:
+    """Values of the start's size; about the prior's mean where there is one, which knows more."""
+    if free.prior is not None:
+        return free.prior.mean + 2.0 * free.prior.sd * drawn[0]
+    return coordinates.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
+
+
+class Search:
+    """The optimiser over a problem: log coordinates first, bounded ones where that leaves them.
+
+    An optimum inside the bounds is the same in any coordinates; the bounded ones are needed, and
+    compiled, only where the free optimum lies outside.
+    """
+
+    def __init__(self, problem: Problem, layout: Layout, data: Data, max_steps: int) -> None:
+        self.problem, self.layout, self.data = problem, layout, data
+        self.max_steps = max_steps
+        self.bounded = layout_of(problem, problem.training, bounded=True)
+
+    def run(
+        self, noise: Noise, points: Float[Array, "s q"], tell: Progress | None = None
+    ) -> list[Optimum]:
+        """An optimum for each start, all in the coordinates of `layout`."""
+        runs = [self._worth(run, noise) for run in self._run(self.layout, noise, points, tell)]
+        if self.bounded.kinds == self.layout.kinds:
+            return runs
+        left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
+        if left:
+            starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
+            for i, run in zip(left, self._run(self.bounded, noise, starts, tell), strict=True):
+                runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
+        return runs
+
+    def _run(
+        self, layout: Layout, noise: Noise, points: Array, tell: Progress | None
+    ) -> list[Optimum]:
+        # One after another: on two cores a vmap over the starts, which goes on until the slowest
+        # has converged, took four times as long as this, and had to be compiled besides.
+        runs = []
+        for i in range(points.shape[0]):
+            found = optimise(layout, self.data, noise, points[i], self.max_steps)
+            run = jax.device_get(found)._replace(z=found.z)
+            if not bool(run.converged) and not layout.filtered:
+                near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
+                run = run._replace(converged=np.asarray(near))
+            runs.append(run)
+            if tell is not None and points.shape[0] > 1:
+                tell(f"{i + 1} of {points.shape[0]} starts done")
+        return runs
+
+    def _is_near(self, layout: Layout, noise: Noise, z: Array) -> bool:
+        """Whether the optimum is within a tenth of a standard deviation of every unknown.
+
+        Along a valley that weak priors alone close the optimiser goes on in steps that change no
+        likelihood. What a Gauss-Newton step would gain there is the squared distance to the
+        optimum in standard deviations of whichever unknown lies furthest.
+        """
+        at = slopes(layout, self.data, noise, z)
+        gain = gauss_newton_gain(at.r, at.J)
+        return bool(np.isfinite(gain) and gain < _NEAR**2)
+
+    def _worth(self, run: Optimum, noise: Noise) -> Optimum:
+        """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        nothing = self.misfit_of_nothing(noise) / residuals_count(self.data)
+        return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
+
+    def misfit_of_nothing(self, noise: Noise) -> float:
+        """Sum of squares that a model without any response leaves."""
+        power = [
+            float(np.nansum(np.square(np.asarray(y) / np.asarray(s[n]))))
+            for flight, s in zip(self.data.flights, noise.sd, strict=True)
+            for n, y in flight.outputs.items()
+        ]
+        return sum(power)
+
+    def _inside(self, z: Array) -> bool:
+        values = named_values(self.layout, self.data, z)
+        return all(
+            not np.isfinite(v) or coordinates.inside(f, float(v))
+            for f, v in zip(self.problem.free.values(), values.values(), strict=True)
+        )
+
+    def _convert(self, z: Array, old: Layout, new: Layout) -> Array:
+        """The same point in another layout's coordinates; a value at a bound is moved inside."""
+        for i, (free, value) in enumerate(
+            zip(self.problem.free.values(), named_values(old, self.data, z).values(), strict=True)
+        ):
+            low, high = (float(b) for b in coordinates.limits(free))
+            if np.isfinite(low) and np.isfinite(high):
+                edge = 1e-9 * (high - low)
+                value = min(max(value, low + edge), high - edge)
+            args = (self.data.sign[i], self.data.low[i], self.data.high[i])
+            x = jnp.asarray(value, z.dtype)
+            z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *args))
+        return z
+
+
+def gauss_newton_gain(r: Any, J: Any) -> float:
+    """By how much a Gauss-Newton step lowers the sum of squares of residuals r (n,) with the
+    Jacobian J (n, q), as the linear model of them has it; NaN where either is not finite."""
+    r, J = np.asarray(r, np.float64), np.asarray(J, np.float64)
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return float("nan")
+    norms = np.linalg.norm(J, axis=0)
+    Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
+    return float(np.sum((Q.T @ r) ** 2))
+
+
+def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:
+    """The free parameters' values at z."""
+    at, sign, low, high = (np.asarray(v) for v in (z, data.sign, data.low, data.high))
+    return {
+        n: float(coordinates.to_value(how, at[i], sign[i], low[i], high[i]))
+        for i, (n, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
+    }
+
+
+def table(
+    layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
+) -> tuple[StartRow, ...]:
+    """Start, end and cost of every run, best first; equal optima share a number."""
+    order = sorted(range(len(runs)), key=lambda i: rank(runs[i]))
+    rows, optimum, last = [], 0, None
+    for i in order:
+        cost, converged = _cost(runs[i]), bool(runs[i].converged)
+        if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
+            optimum, last = optimum + 1, cost
+        rows.append(
+            StartRow(
+                named_values(layout, data, points[i]),
+                named_values(layout, data, runs[i].z),
+                cost,
+                int(runs[i].steps),
+                converged,
+                optimum if converged else 0,
+            )
+        )
+    return tuple(rows)
+
+
+def rank(run: Optimum) -> tuple[bool, float]:
+    """Sorts runs: those that converged first, then by cost."""
+    return not bool(run.converged), _cost(run)
+
+
+def _cost(run: Optimum) -> float:
+    cost = float(run.cost)
+    return cost if np.isfinite(cost) else float("inf")

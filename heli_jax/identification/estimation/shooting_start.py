@@ -1,0 +1,85 @@
+"""A start where the model's simulation diverges: parameters from short windows first.
+
+Where a damping begins with the wrong sign, a simulation over the whole record grows by many powers
+of ten, and least squares finds no way back: the gradient is all in the growth. Over short windows,
+each from an initial state of its own, nothing has the time to grow (multiple shooting; Bock, 1983).
+"""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.identification.estimation import multistart as starting
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Noise, layout_of
+
+FAR_WORSE = 10.0
+"""times the misfit of no model at all from which a start is taken for one that diverges"""
+_WINDOWS = 16
+_PER_STATE = 5
+"""samples that a window has at least for each initial state that it brings"""
+_STEPS = 60
+
+SAID = (
+    "The simulation diverges at the start values, so the parameters were first fitted to short "
+    "windows of the record (multiple shooting), and the fit began from there."
+)
+
+
+def by_windows(
+    problem: Problem, search: starting.Search, noise: Noise, e: Evaluation, z0: Array, best: Optimum
+) -> Optimum | None:
+    """The optimum from the parameters that short windows give, where the search from z0 failed
+    and the simulation diverges there; None where that is not so or windows do not help.
+
+    Args:
+        e: at z0.
+        best: the best optimum so far.
+    """
+    if bool(best.converged) or not _applies(problem) or not _diverges(search, noise, e):
+        return None
+    cut = _cut(problem)
+    if cut is None:
+        return None
+    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
+    z = start_vector(layout, data, cut)
+    z = z.at[: layout.weak].set(z0[: layout.weak])
+    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
+    if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
+        return None
+    begin = z0.at[: layout.weak].set(short.z[: layout.weak])
+    [run] = search.run(noise, begin[None, :])
+    return run if starting.rank(run) < starting.rank(best) else None
+
+
+def _applies(problem: Problem) -> bool:
+    return (
+        problem.method == "output-error"
+        and problem.window is None
+        and problem.nuisance.initial_state
+        and not problem.nuisance.time_shift
+    )
+
+
+def _diverges(search: starting.Search, noise: Noise, e: Evaluation) -> bool:
+    """Whether the misfit is far larger than that of no model at all."""
+    with np.errstate(all="ignore"):
+        misfit = float(np.sum(np.square(np.asarray(e.r, np.float64))))
+    return misfit > FAR_WORSE * search.misfit_of_nothing(noise)
+
+
+def _cut(problem: Problem) -> Problem | None:
+    """The problem in windows; None where the record is too short for them."""
+    states = len(naming.names(problem.model.State))
+    flights = problem.training
+    dt = max(f.dt for f in flights)
+    shortest = min(f.n_samples * f.dt for f in flights)
+    window = max(shortest / _WINDOWS, max(8, _PER_STATE * states) * dt)
+    return replace(problem, window=window) if window < 0.5 * shortest else None

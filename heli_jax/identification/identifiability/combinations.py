@@ -1,0 +1,93 @@
+"""Products of powers, such as a/Ixx, that the data determine where the parameters are not."""
+
+import math
+
+import numpy as np
+
+from heli_jax.identification.identifiability.verdict import Z95, Combination, Unknown
+
+TAKES_PART = 0.1
+"""of a unit direction: less is not worth naming"""
+
+
+def unit_vector(v: np.ndarray) -> np.ndarray:
+    """Of length one, its largest part positive."""
+    v = v / np.linalg.norm(v)
+    return v if v[np.argmax(np.abs(v))] > 0 else -v
+
+
+def combinations(
+    null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> tuple[Combination, ...]:
+    """Products of powers that do not change along the null directions."""
+    if not null:
+        return ()
+    per_log = np.array([u.per_log for u in unknowns])
+    null = [unit_vector(v * per_log) for v in null]
+    covariance = covariance * np.outer(per_log, per_log)
+    W, pivots = row_reduced(np.array(null), unknowns)
+    found = []
+    for i in range(len(unknowns)):
+        if i in pivots or np.all(np.abs(W[:, i]) < TAKES_PART):
+            continue
+        exponents = np.zeros(len(unknowns))
+        exponents[i] = 1.0
+        exponents[pivots] = -W[:, i]
+        exponents = np.array([_rounded(e) for e in exponents])
+        if exponents[pivots].sum() < 0:  # a/Ixx rather than Ixx/a
+            exponents = -exponents
+        if all(unknowns[k].logarithmic for k in np.flatnonzero(exponents)):
+            found.append(_combination(exponents, covariance, unknowns))
+    return tuple(found)
+
+
+def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarray, list[int]]:
+    """Row-reduce the null directions; pivots are late parameters, so that ratios read a/Ixx."""
+    W, pivots = W.copy(), []
+    for k in range(W.shape[0]):
+        size = np.max(np.abs(W[k:]), axis=0)
+        size[pivots] = 0.0
+        near = [i for i in range(W.shape[1]) if size[i] >= 0.5 * size.max()]
+        proper = [i for i in near if unknowns[i].is_parameter and unknowns[i].logarithmic]
+        pivot = (proper or near)[-1]
+        row = k + int(np.argmax(np.abs(W[k:, pivot])))
+        W[[k, row]] = W[[row, k]]
+        W[k] /= W[k, pivot]
+        for other in range(W.shape[0]):
+            if other != k:
+                W[other] -= W[other, pivot] * W[k]
+        pivots.append(pivot)
+    return W, pivots
+
+
+def _rounded(exponent: float) -> float:
+    """A small fraction where the exponent is one, else two digits."""
+    quarter = round(exponent * 4) / 4
+    return quarter if abs(exponent - quarter) < 0.02 else round(exponent, 2)
+
+
+def _combination(
+    exponents: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+) -> Combination:
+    by_name = {u.name: float(e) for u, e in zip(unknowns, exponents, strict=True) if e}
+    log = sum(e * math.log(abs(u.value)) for u, e in zip(unknowns, exponents, strict=True) if e)
+    value = math.exp(log) if abs(log) < 700 else math.inf
+    sd = math.sqrt(max(0.0, float(exponents @ covariance @ exponents)))
+    reach = math.exp(min(Z95 * sd, 700.0))
+    return Combination(
+        combination_name(by_name), by_name, value, value * sd, value / reach, value * reach
+    )
+
+
+def combination_name(exponents: dict[str, float]) -> str:
+    """`a/Ixx` for {a: 1, Ixx: -1}."""
+
+    def power(name: str, e: float) -> str:
+        return name if e == 1 else f"{name}^{e:g}"
+
+    over = [power(n, e) for n, e in exponents.items() if e > 0]
+    under = [power(n, -e) for n, e in exponents.items() if e < 0]
+    if not under:
+        return " * ".join(over)
+    below = under[0] if len(under) == 1 else f"({' * '.join(under)})"
+    return f"{' * '.join(over) or '1'}/{below}"

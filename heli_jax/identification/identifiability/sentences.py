@@ -1,0 +1,209 @@
+"""The identifiability analysis in sentences; each names a way out that exists."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
+
+_NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+_STATED = 8.0 / 9.0
+"""share of what is known of a parameter above which it is said that weak priors hold it: its sd
+would be three times as large without them"""
+
+
+_BY_PRIOR = 0.9
+"""share of its prior above which a parameter is what the prior says"""
+
+
+class Open(NamedTuple):
+    """Parameters that no rows tell apart, and how many of them would have to be known."""
+
+    names: tuple[str, ...]
+    count: int
+    combinations: tuple[Combination, ...]
+    """what is determined of them all the same"""
+    nuisances: tuple[str, ...] = ()
+    """what they are exchanged with where weak priors alone hold them, as 'the bias of p'"""
+    switches: tuple[str, ...] = ()
+    """nuisances that would determine them if they were switched off, as 'nuisance.bias'"""
+
+
+class Weakest(NamedTuple):
+    """The least determined direction where all is determined, but hardly."""
+
+    parts: dict[str, float]
+    combinations: tuple[Combination, ...]
+    condition: float
+
+
+class Facts(NamedTuple):
+    """What the sentences say."""
+
+    unknowns: tuple[Unknown, ...]
+    without_effect: tuple[str, ...]
+    groups: tuple[Open, ...]
+    """what is not determined"""
+    undetermined: tuple[str, ...]
+    """also those that take a small part in it"""
+    resting: tuple[Open, ...]
+    """where all is determined: what is so by the priors of parameters alone"""
+    pairs: tuple[Pair, ...]
+    weakest: Weakest | None
+    weak_share: Mapping[str, float]
+    """by name, the share of what is known that weak priors of nuisances contribute"""
+    prior_share: Mapping[str, float]
+    """by name, the share of what is known that its own prior contributes"""
+    remedies: Mapping[str, str]
+    """by name, a further way out, as 'add a run with a known inertia'"""
+
+
+def sentences(facts: Facts) -> tuple[str, ...]:
+    """What the data determine, what they do not, and what can be done, most important first."""
+    names = tuple(u.name for u in facts.unknowns)
+    said = [_without_effect(name) for name in facts.without_effect]
+    said += [_open(group, facts) for group in facts.groups]
+    named = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
+    partners = [n for n in facts.undetermined if n not in named]
+    lost = named | set(partners)
+    told = set(lost)
+    if partners:
+        verb = "take part in that and are" if len(partners) > 1 else "takes part in that and is"
+        said.append(f"{listed(partners)} {verb} not determined either.")
+    held = [n for n, share in facts.prior_share.items() if share > _BY_PRIOR and n not in lost]
+    if lost:
+        rest = [n for n in names if n not in lost and n not in held]
+        said += [f"The data determine {listed(rest)}."] if rest else []
+        said += _by_prior(held)
+    elif facts.resting:
+        said += [_resting(group, facts) for group in facts.resting]
+        told |= {n for group in facts.resting for n in group.names}
+    else:
+        rest = [n for n in names if n not in held]
+        said += [f"The data determine {listed(rest)}."] if rest else []
+        said += _by_prior(held)
+    if facts.weakest is not None:
+        said.append(_weakest(facts.weakest, facts))
+        told |= set(facts.weakest.parts)
+    for pair in facts.pairs:
+        if {pair.first, pair.second} <= told:
+            continue
+        both = (pair.first, pair.second)
+        said.append(
+            f"{pair.first} and {pair.second} can hardly be told apart (correlation "
+            f"{pair.correlation:+.5f}): {way_out(both, facts, 1)}."
+        )
+    leaning = {
+        n: (1.0 - share) ** -0.5
+        for n, share in facts.weak_share.items()
+        if _STATED < share < 1.0 and n not in lost
+    }
+    if leaning:
+        said.append(
+            "Without the weak priors of initial states, biases and input offsets (ten times the "
+            f"signal) the sd of {listed(list(leaning))} would be {max(leaning.values()):.2g} times "
+            "as large."
+        )
+    return tuple(said)
+
+
+def _by_prior(names: list[str]) -> list[str]:
+    """What priors say and the data do not."""
+    if not names:
+        return []
+    verb = "rests on its prior" if len(names) == 1 else "rest on their priors"
+    them = "it" if len(names) == 1 else "them"
+    return [f"{listed(names)} {verb}: the data say next to nothing of {them}."]
+
+
+def listed(words: list[str] | tuple[str, ...], last: str = "and") -> str:
+    """`a, b and c`"""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def _without_effect(name: str) -> str:
+    # A gain or a shift has no value in the configuration: it goes with its switch.
+    switch = _switch(name)
+    remedy = f"switch off {switch}" if switch else "fix it"
+    return f"{name} has no effect on the measured outputs: {remedy}."
+
+
+def _switch(name: str) -> str:
+    """What switches an unknown off that is no parameter; empty for parameters."""
+    if name.startswith("gain "):
+        return "nuisance.input_gain"
+    return "nuisance.time_shift" if name == "time_shift" else ""
+
+
+def _open(group: Open, facts: Facts) -> str:
+    names = group.names
+    if group.combinations:
+        what = (
+            f"the data determine only {listed([c.name for c in group.combinations])} of "
+            f"{listed(names)}"
+        )
+    elif len(names) == 1:
+        what = f"the data do not determine {names[0]}"
+    else:
+        what = f"the data determine no part of {listed(names)}"
+    if group.nuisances:
+        what = f"{listed([*names, *group.nuisances])} are exchangeable, so {what}"
+    what = what[0].upper() + what[1:] if what.startswith("the") else what
+    return f"{what}: {way_out(names, facts, group.count, group.switches)}."
+
+
+def way_out(
+    names: tuple[str, ...], facts: Facts, count: int, switches: tuple[str, ...] = ()
+) -> str:
+    """What can be done about parameters that the data do not tell apart.
+
+    Args:
+        names: the parameters, gains and the time shift concerned.
+        count: how many of them have to be known for the rest to be determined.
+        switches: nuisances whose absence would determine them too.
+    """
+    parameters = [u.name for u in facts.unknowns if u.name in names and u.is_parameter]
+    off = [*switches, *dict.fromkeys(s for s in map(_switch, names) if s)]
+    ways = []
+    if off:
+        ways.append(f"switch off {listed(off, 'or')}")
+    if len(parameters) == 1 and len(names) == 1:
+        ways += [f"fix {parameters[0]}", "give it a prior"]
+    elif len(parameters) == 1:
+        ways += [f"fix {parameters[0]}", f"give {parameters[0]} a prior"]
+    elif parameters:
+        number = _NUMBERS[min(count, len(parameters), len(_NUMBERS) - 1)]
+        which = ", ".join(parameters)
+        if min(count, len(parameters)) == 1:
+            ways += [f"fix one of {which}", "give it a prior"]
+        else:
+            ways += [f"fix {number} of {which}", "give them priors"]
+    further = [facts.remedies[n] for n in parameters if n in facts.remedies]
+    ways += dict.fromkeys(further)
+    return listed(ways, "or") if len(ways) < 3 else f"{', '.join(ways[:-1])}, or {ways[-1]}"
+
+
+def _resting(group: Open, facts: Facts) -> str:
+    with_prior = [u.name for u in facts.unknowns if u.prior > 0 and u.name in group.names]
+    owners = f"the prior of {listed(with_prior)}" if with_prior else "the priors"
+    verb = "rests" if len(group.names) == 1 else "rest"
+    if group.combinations:
+        what = f"only {listed([c.name for c in group.combinations])}"
+        text = f"The data alone determine {what}; {listed(group.names)} {verb} on {owners}"
+    else:
+        text = f"The data alone do not determine {listed(group.names, 'or')}: "
+        text += f"{'it' if len(group.names) == 1 else 'they'} {verb} on {owners}"
+    if group.nuisances:
+        text += f", since {listed([*group.names, *group.nuisances])} are exchangeable"
+    return text + "."
+
+
+def _weakest(weakest: Weakest, facts: Facts) -> str:
+    words = ", ".join(f"{n} {v:+.2f}" for n, v in weakest.parts.items())
+    names, combos = tuple(weakest.parts), weakest.combinations
+    better = listed([c.name for c in combos]) if combos else "their combinations"
+    return (
+        f"They are hardly separated (condition number {weakest.condition:.1e}): the weakest "
+        f"direction is ({words}) in log coordinates, and {better} "
+        f"{'is' if len(combos) == 1 else 'are'} determined far better than {listed(names)}; "
+        f"{way_out(names, facts, 1)}."
+    )

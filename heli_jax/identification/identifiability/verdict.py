@@ -1,0 +1,85 @@
+"""What the identifiability analysis says: plain data."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+FACTOR = 10.0
+"""A 95 % interval that reaches further than this factor to either side determines nothing."""
+Z95 = 1.959963984540054
+
+
+class Unknown(NamedTuple):
+    """One free parameter as the verdict sees it."""
+
+    name: str
+    value: float
+    logarithmic: bool
+    """whether its relative coordinate is log |value|"""
+    scale: float
+    """size of its prior or interval in that coordinate; 1 where it has neither"""
+    prior: float
+    """1 / sd of its prior in that coordinate; 0 without one"""
+    is_parameter: bool = True
+    """False for gains and time shifts"""
+    per_log: float = 1.0
+    """what turns its relative coordinate into log |value|"""
+    symmetric: bool = False
+    """whether it may have either sign: its interval is then symmetric about the value, and
+    determines nothing where it reaches further than log 10 times its size to either side"""
+
+
+class Combination(NamedTuple):
+    """A product of powers that the data determine."""
+
+    name: str
+    exponents: dict[str, float]
+    value: float
+    sd: float
+    lower95: float
+    upper95: float
+
+
+class Pair(NamedTuple):
+    """Two parameters that the data hardly tell apart."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What the data (with the priors) determine."""
+
+    names: tuple[str, ...]
+    identifiable: bool
+    rank: int
+    rank_without_priors: int
+    condition: float
+    singular_values: np.ndarray
+    """(q,) of the whitened, scaled sensitivity, largest first"""
+    null_directions: tuple[dict[str, float], ...]
+    """unit vectors in relative coordinates along which nothing changes"""
+    combinations: tuple[Combination, ...]
+    """what the data alone determine of parameters that they do not determine one by one"""
+    pairs: tuple[Pair, ...]
+    without_effect: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    covariance: np.ndarray
+    """(q, q) in relative coordinates; the undetermined directions are left out of it"""
+    correlation: np.ndarray
+    prior_share: dict[str, float]
+    """share of what is known of a parameter that came from priors: its own, and the weak ones of
+    the nuisances; 1 where the data said nothing"""
+    sentences: tuple[str, ...]
+    resting: tuple[str, ...] = ()
+    """parameters that are determined by priors, and not by the data alone"""
+    exchangeable: tuple[str, ...] = ()
+    """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
+
+    @property
+    def text(self) -> str:
+        """The verdict in words."""
+        return " ".join(self.sentences)

@@ -1,0 +1,281 @@
+"""Covariance of output-error estimates when the residuals are autocorrelated.
+
+The estimate minimises r'r with residuals whose covariance R is not the unit matrix, so that its
+covariance is H^-1 (J' R J) H^-1 (Klein and Morelli, Aircraft System Identification, 2006, section
+5.3; White, 1982), where H is half the Hessian of r'r: J'J and what the residuals themselves add
+where the model is curved, which counts once they are as large as the response.
+
+R comes from the residuals: autocovariances over the pairs of samples that are seen, under Parzen's
+lag window with a length that the record chooses (Andrews, 1991), their spectrum held at zero or
+above, so that no variance is lost. Two effects of a short record are allowed for: the fit takes
+from the residuals what lies along the sensitivities (as in HC2, MacKinnon and White, 1985), and
+few independent parts of a spectrum tell a variance poorly, which Student's t with their number
+(Satterthwaite) answers for.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+
+_LENGTH = 6.0
+"""Parzen's window over tau^(4/5) n^(1/5), where tau is the sum of squared autocorrelations. The
+smallest mean squared error has 3.5 here (Andrews, 1991, Table I); intervals suffer more from the
+bias than from the variance and want a longer one (Sun, Phillips and Jin, 2008)."""
+_LONGEST = 0.5
+"""of the window, as a part of the record"""
+_RESOLVED = 1e-3
+"""singular value over the largest below which finite differences tell no curvature"""
+_FLATTEST = 0.05
+"""curvature over that of J'J that is believed at least"""
+
+
+class Sandwich(NamedTuple):
+    """The covariance of all unknowns z (q,) with autocorrelated residuals, in parts."""
+
+    norms: np.ndarray
+    """(q,) of the columns of J, by which all else is scaled"""
+    white: np.ndarray
+    """(q, q) inverse of J'J"""
+    bread: np.ndarray
+    """(q, q) inverse of the Hessian"""
+    parts: tuple["_Part", ...]
+    """by flight"""
+    rest: np.ndarray
+    """(q, q) J'J of the rows that are no measurements (priors), whose variance is known"""
+
+    def inflation(self, along: np.ndarray | None = None) -> np.ndarray:
+        """How much wider than white noise says the standard deviations of the combinations
+        `along` (k, q) of unknowns are, or without it of every unknown; (k,) or (q,)."""
+        along = self._scaled(along)
+        by_white = np.sum(along @ self.white * along, axis=1)
+        variance, _ = self._variance(along)
+        ratio = variance / np.where(by_white > 0, by_white, 1.0)
+        return np.sqrt(np.maximum(ratio, 0.0))
+
+    def quantile(self, along: np.ndarray | None = None) -> np.ndarray:
+        """Student's 97.5 % quantile of each combination, as `inflation` has them."""
+        _, freedom = self._variance(self._scaled(along))
+        return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
+
+    def covariance(self, along: np.ndarray) -> np.ndarray:
+        """(k, k) of combinations, with the variances that `inflation` has."""
+        along = self._scaled(along)
+        D = along @ self.bread
+        whole = D @ (self.rest + sum(p.meat for p in self.parts)) @ D.T
+        variance, _ = self._variance(along)
+        plain = np.diag(whole)
+        factor = np.sqrt(np.divide(variance, plain, out=np.ones_like(plain), where=plain > 0))
+        return whole * np.outer(factor, factor)
+
+    def _scaled(self, along: np.ndarray | None) -> np.ndarray:
+        along = np.eye(self.norms.size) if along is None else along
+        return along / np.where(self.norms > 0, self.norms, 1.0)
+
+    def _variance(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(k,) of combinations, and the degrees of freedom with which they are known."""
+        D = self.bread @ along.T
+        variance = np.sum(D * (self.rest @ D), axis=0)
+        uncertainty = np.zeros_like(variance)
+        for part in self.parts:
+            own, freedom = part.variance(D)
+            variance = variance + own
+            uncertainty += own**2 / freedom
+        known = uncertainty <= 1e-12 * variance**2
+        return variance, np.where(known, 1e12, variance**2 / np.where(known, 1.0, uncertainty))
+
+
+class _Part(NamedTuple):
+    """What one flight adds: sensitivities and residuals as spectra over f frequencies."""
+
+    J: np.ndarray
+    """(f, outputs, q)"""
+    S: np.ndarray
+    """(f, outputs, outputs) spectrum of the residuals"""
+    meat: np.ndarray
+    """(q, q) J' R J"""
+    plain: np.ndarray
+    """(q, q) J'J"""
+    taken: np.ndarray
+    """(q, q) what the fit takes from J' R J, were R one"""
+    window: np.ndarray
+    """over all lags, (2 f - 2,)"""
+    seen: int
+    """samples, of the output that has most"""
+
+    def variance(self, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of D' J' r for the columns of D (q, k), and its degrees of freedom."""
+        W = self.J @ D
+        power = np.sum(np.real(W.conj() * (self.S @ W)), axis=1)
+        p = np.fft.irfft(power, self.window.size, axis=0)
+        spent = np.sum(np.square(self.window[:, None] * p), axis=0)
+        freedom = self.seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
+        white = np.sum(D * (self.plain @ D), axis=0)
+        taken = np.sum(D * (self.taken @ D), axis=0) / np.where(white > 0, white, 1.0)
+        return np.maximum(p[0], 0.0) / (1.0 - np.clip(taken, 0.0, 0.75)), np.maximum(freedom, 1.0)
+
+
+def sandwich(
+    layout: Layout, data: Data, e: Evaluation, curvature: np.ndarray | None = None
+) -> Sandwich:
+    """The covariance of the unknowns at an optimum of output error.
+
+    Several outputs of a flight enter with their cross-covariances, flights are independent.
+
+    Args:
+        curvature: (q, q) what the residuals add to J'J in the Hessian (`residual_curvature`);
+            nothing unless given.
+    """
+    J, r = np.asarray(e.J, np.float64), np.asarray(e.r, np.float64)
+    norms = np.linalg.norm(J, axis=0)
+    scale = np.where(norms > 0, norms, 1.0)
+    J = J / scale
+    _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
+    kept = singular > 1e-10 * max(singular[0], 1e-300)
+    T = right[kept].T / singular[kept]
+    bread = white = T @ T.T
+    if curvature is not None:
+        bread = _bread(T, singular[kept], curvature / np.outer(scale, scale))
+    at, parts = 0, []
+    for flight, outputs in zip(data.flights, layout.outputs, strict=True):
+        measured = np.stack([np.asarray(flight.outputs[n]) for n in outputs])
+        k, n = measured.shape
+        rows = slice(at, at + k * n)
+        parts.append(
+            _part(J[rows].reshape(k, n, -1), r[rows].reshape(k, n), ~np.isnan(measured), T)
+        )
+        at += k * n
+    rest = J[at:]
+    return Sandwich(norms, white, bread, tuple(parts), rest.T @ rest)
+
+
+def residual_curvature(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> np.ndarray:
+    """What the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
+
+    By central differences of J'r along the named unknowns; the others (initial states, biases)
+    enter linearly, or are so near to it that they are left at J'J. Zero where it is not finite.
+    """
+    step = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
+    at = slopes(layout, data, noise, z)
+    J = np.asarray(at.J, np.float64)
+    q, k = J.shape[1], len(layout.named)
+    found = np.zeros((q, q))
+    with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
+        for i in range(k):
+            ends = []
+            for sign in (1.0, -1.0):
+                near = slopes(layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype)))
+                ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
+            found[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
+    found[:k, :k] = 0.5 * (found[:k, :k] + found[:k, :k].T)
+    found[:k, k:] = found[k:, :k].T
+    return found if np.all(np.isfinite(found)) else np.zeros((q, q))
+
+
+def _bread(T: np.ndarray, singular: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Inverse of J'J + curvature, where T'(J'J)T = 1."""
+    resolved = singular > _RESOLVED * singular[0]
+    added = T.T @ curvature @ T
+    added[~resolved] = 0.0
+    added[:, ~resolved] = 0.0
+    values, vectors = np.linalg.eigh(np.eye(singular.size) + added)
+    V = T @ vectors
+    return V / np.maximum(values, _FLATTEST) @ V.T
+
+
+def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Part:
+    """Of sensitivities (outputs, N, q) and residuals (outputs, N), zero where not seen."""
+    S, apart, window = _spectrum(r, seen)
+    size = window.size
+    J = np.moveaxis(np.fft.rfft(J, size, axis=1), 0, 1)
+    U = J @ T
+    lost = np.fft.irfft(U @ U.conj().swapaxes(1, 2), size, axis=0) * apart
+    L = np.fft.rfft(lost * window[:, None, None], axis=0)
+    most = int(seen.sum(axis=1).max())
+    one = np.broadcast_to(np.eye(J.shape[1]), S.shape)
+    meat, plain, taken = (_weighed(J, x, size) for x in (S, one, L))
+    return _Part(J, S, meat, plain, taken, window, most)
+
+
+def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spectrum (f, outputs, outputs) of residuals (outputs, N), zero where not seen; one over the
+    number of pairs (2 f - 2, outputs, outputs), and the lag window (2 f - 2,)."""
+    k, n = r.shape
+    size = 2 << (n - 1).bit_length()
+    pairs, R = _pairs(seen, size), _pairs(r, size)
+    apart = np.divide(1.0, pairs, where=pairs > 0.5, out=np.zeros_like(pairs))
+    R *= apart
+    window = _window(n, size, [_memory(R[:, a, a], pairs[:, a, a], n) for a in range(k)])
+    S = np.fft.rfft(R * window[:, None, None], axis=0)
+    # Counting pairs, a spectrum may come out below zero somewhere.
+    values, vectors = np.linalg.eigh(0.5 * (S + S.conj().swapaxes(1, 2)))
+    S = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.conj().swapaxes(1, 2)
+    return S, apart, window
+
+
+def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise (runs, outputs, N) with the variances and correlations, over time and between
+    outputs, of residuals (outputs, N) that are NaN where nothing is measured.
+
+    By circulant embedding (Dietrich and Newsam, 1997).
+    """
+    seen = ~np.isnan(residual)
+    r = np.where(seen, residual, 0.0)
+    S, _, window = _spectrum(r, seen)
+    k, n, size = *r.shape, window.size
+    values, vectors = np.linalg.eigh(S)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    noise = np.empty((runs, n, k))
+    for made in noise:
+        white = np.fft.rfft(rng.standard_normal((size, k)), axis=0)
+        made[:] = np.fft.irfft((root @ white[..., None])[..., 0], size, axis=0)[:n]
+    # The variance is that of the residuals, whatever was held at zero in the spectrum.
+    have = np.fft.irfft(np.real(np.diagonal(S, axis1=1, axis2=2)), size, axis=0)[0]
+    want = np.sum(r**2, axis=1) / np.maximum(seen.sum(axis=1), 1)
+    scale = np.sqrt(np.divide(want, have, out=np.zeros(k), where=have > 0))
+    return np.moveaxis(noise * scale, 1, 2)
+
+
+def _weighed(J: np.ndarray, S: np.ndarray, size: int) -> np.ndarray:
+    """The sum over samples i, k of J_i R(i - k) J_k' by spectra, (q, q)."""
+    twice = np.full(S.shape[0], 2.0 / size)
+    twice[[0, -1]] = 1.0 / size
+    left = (J * twice[:, None, None]).reshape(-1, J.shape[2])
+    found = np.real(left.conj().T @ (S @ J).reshape(-1, J.shape[2]))
+    return 0.5 * (found + found.T)
+
+
+def _pairs(x: np.ndarray, size: int) -> np.ndarray:
+    """The sums over k of x_a[k + lag] x_b[k] for x (outputs, N), (size, outputs, outputs)."""
+    spectra = np.fft.rfft(x.astype(np.float64), size, axis=1).T
+    return np.fft.irfft(spectra[:, :, None] * spectra[:, None, :].conj(), size, axis=0)
+
+
+def _memory(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
+    """The sum of squared autocorrelations over all lags, in samples; 1 for white noise.
+
+    What the noise of the autocorrelations adds to it is taken off again.
+    """
+    lags = np.arange(1, max(n // 5, 1) + 1)
+    lags = lags[pairs[lags] > 0.5]
+    if lags.size == 0 or not R[0] > 0:
+        return 1.0
+    # Lags at which no pair is seen count as those between which they lie.
+    whole = 1.0 + 2.0 * (n // 5) * float(np.mean((R[lags] / R[0]) ** 2))
+    return max(1.0, whole / (1.0 + 2.0 * (n // 5) / n))
+
+
+def _window(n: int, size: int, memories: list[float]) -> np.ndarray:
+    """Parzen's lag window over all lags (size,)."""
+    length = max(_LENGTH * m * (n / m) ** 0.2 for m in memories)
+    x = np.minimum(np.arange(size // 2 + 1) / min(max(length, 2.0), max(_LONGEST * n, 2.0)), 1.0)
+    half = np.where(x < 0.5, 1.0 - 6.0 * x**2 * (1.0 - x), 2.0 * (1.0 - x) ** 3)
+    return np.concatenate([half, half[-2:0:-1]])

@@ -1,0 +1,153 @@
+"""Draws from the posterior by the No-U-Turn sampler, on the residual that the fit minimised."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
+from heli_jax.identification.result import Fit
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, value_of
+
+_CHAINS = 4
+_TARGET = 0.8
+
+
+class Posterior(NamedTuple):
+    """Draws of the free parameters and whether they may be believed."""
+
+    draws: dict[str, np.ndarray]
+    """by free parameter, (chains, draws)"""
+    rhat: float
+    """the largest potential scale reduction (Gelman and Rubin); 1 where the chains agree"""
+    effective: float
+    """the smallest effective number of draws"""
+    divergent: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the chains agree, and are long enough for an interval."""
+        return self.rhat < 1.01 and self.effective > 400 and self.divergent == 0
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """2.5 and 97.5 % of the draws."""
+        low, high = np.percentile(self.draws[name], [2.5, 97.5])
+        return float(low), float(high)
+
+
+def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Posterior:
+    """Four chains of `draws` draws each, begun about the optimum in its own ellipse.
+
+    The prior is flat in the optimiser's coordinates (log of a parameter of one sign) beside the
+    priors of the problem; the scale of the noise is integrated out (Jeffreys).
+
+    Raises:
+        ValueError: blackjax is not installed, or the data do not determine every parameter.
+    """
+    try:
+        import blackjax
+    except ImportError as e:
+        raise ValueError(
+            "nuts: blackjax is not installed, wanted is the extra: pip install 'heli_jax[bayes]'"
+        ) from e
+    at = fit.reached
+    if fit.lost:
+        raise ValueError(f"nuts: the data do not determine {', '.join(fit.lost)}")
+    e = evaluate(at.layout, at.data, at.noise, at.z)
+    # Whitened by the Gaussian approximation, so that all directions have size one.
+    triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
+    root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
+
+    # Traced once each, where blackjax asks for them ten times.
+    @jax.jit
+    def density(xi: Array) -> Array:
+        return log_posterior(at.layout, at.data, at.noise, at.z + root @ xi)
+
+    @jax.custom_vjp
+    def forward(xi: Array) -> Array:
+        return density(xi)
+
+    # Few unknowns and long records: the gradient by forward mode, as everywhere here.
+    @jax.jit
+    def primal(xi: Array) -> tuple[Array, Array]:
+        value, push = jax.linearize(density, xi)
+        return value, jax.vmap(push)(jnp.eye(xi.shape[0], dtype=xi.dtype))
+
+    forward.defvjp(primal, lambda gradient, ct: (ct * gradient,))
+
+    # blackjax mixes dtypes and ranks where this package would not.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        positions, divergent = _sample(blackjax, forward, at, draws, warmup, seed)
+        z = np.asarray(at.z + positions @ root.T)
+        return _posterior(at, z, int(np.sum(np.asarray(divergent))))
+
+
+def _sample(
+    blackjax: Any, density: Any, at: Reached, draws: int, warmup: int, seed: int
+) -> tuple[Array, Array]:
+    """Positions (chains, draws, q) and whether each step diverged (chains, draws)."""
+    q = at.layout.size
+    keys = jax.random.split(jax.random.key(seed), 3)
+    adaptation = blackjax.window_adaptation(
+        blackjax.nuts, density, target_acceptance_rate=_TARGET, initial_step_size=0.5
+    )
+    first = 0.1 * jax.random.normal(keys[0], (q,), at.z.dtype)
+    run = jax.jit(adaptation.run, static_argnums=2)
+    (state, parameters), _ = run(keys[1], first, warmup)
+    sampler = blackjax.nuts(density, **parameters)
+    settling = warmup // 2
+
+    def chain(key: Array) -> tuple[Array, Array]:
+        start_key, key = jax.random.split(key)
+        begin = state.position + 0.5 * jax.random.normal(start_key, (q,), at.z.dtype)
+
+        def step(now: Any, key: Array) -> tuple[Any, Any]:
+            now, info = sampler.step(key, now)
+            return now, (now.position, info.is_divergent)
+
+        keys = jax.random.split(key, draws + settling)
+        _, (positions, divergent) = jax.lax.scan(step, sampler.init(begin), keys)
+        return positions[settling:], divergent[settling:]
+
+    return jax.jit(jax.vmap(chain))(jax.random.split(keys[2], _CHAINS))
+
+
+def _posterior(at: Reached, z: np.ndarray, divergent: int) -> Posterior:
+    from blackjax import diagnostics
+
+    named = jnp.asarray(z[:, :, : len(at.layout.free)])
+    rhat = np.max(np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named)))
+    effective = np.min(np.asarray(jax.jit(diagnostics.effective_sample_size)(named)))
+    found = {
+        name: np.asarray(value_of(at.layout, at.data, i, named[:, :, i]))
+        for i, name in enumerate(at.layout.free)
+    }
+    return Posterior(found, float(rhat), float(effective), divergent)
+
+
+def log_posterior(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
+    """Log density of z but for a constant, from the fit's own rows.
+
+    The scale of the noise is integrated out under Jeffreys' prior: of each flight and output with
+    output error, the common one with filter error, unless it was given.
+    """
+    rows = rows_of(layout, data, noise, z)
+    rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
+    rows = rows[: rows.shape[0] - rest.shape[0]]
+    beside = -0.5 * jnp.sum(rest**2)
+    if layout.filtered and not layout.concentrated:
+        return beside - 0.5 * jnp.sum(rows**2)
+    if layout.filtered:
+        counted = [jnp.isfinite(y) for f in data.flights for y in f.outputs.values()]
+        n = jnp.sum(jnp.concatenate(counted).astype(z.dtype))
+        return beside - 0.5 * n * jnp.log(jnp.sum(rows**2))
+    at = 0
+    for flight in data.flights:
+        for y in flight.outputs.values():
+            n = jnp.sum(jnp.isfinite(y).astype(z.dtype))
+            beside -= 0.5 * n * jnp.log(jnp.sum(rows[at : at + y.shape[0]] ** 2))
+            at += y.shape[0]
+    return beside

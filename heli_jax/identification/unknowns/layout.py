@@ -1,0 +1,297 @@
+"""The unknowns of a problem: one vector z, what stands where in it, and the numbers beside it.
+
+z holds coordinates of the free parameters, then input gains, the time shift, the disturbance, then
+for each flight the initial state, the biases and the offsets of the inputs.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns.input_offsets import offset_inputs
+
+_BLOCK = 32
+_SCALES = 40.0
+"""logarithm by which the noise of one output may differ from its guess"""
+_FAINTEST, _STRONGEST = 60.0, 10.0
+"""logarithms: how far sigma_w may fall below the measured motion, and rise above what would move
+the model as far as it was measured within one sample"""
+
+
+class FlightData(NamedTuple):
+    """One flight as arrays: what a trace may see of it."""
+
+    dt: Any
+    inputs: Any
+    """the model's Inputs, arrays (N,)"""
+    outputs: dict[str, Any]
+    """measured, arrays (N,)"""
+    known: dict[str, Any]
+    state_scale: dict[str, Any]
+    """sd of the weak prior on the initial state"""
+    bias_scale: dict[str, Any]
+    """sd of the weak prior on the bias"""
+    offset_scale: dict[str, Any]
+    """sd of the weak prior on the offset of each input"""
+
+
+class Data(NamedTuple):
+    """All numbers of a problem."""
+
+    base: Any
+    """the vehicle's parameters by name"""
+    sign: Any
+    """of the start; of a linear coordinate its scale"""
+    low: Any
+    high: Any
+    prior_mean: Any
+    prior_sd: Any
+    """inf where a parameter has no prior"""
+    flights: tuple[FlightData, ...]
+
+
+class Layout(eqx.Module):
+    """The static side of a problem: what the unknowns are, in which order."""
+
+    model: Model
+    free: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    gains: tuple[str, ...] = eqx.field(static=True)
+    shift: bool = eqx.field(static=True)
+    initial_state: bool = eqx.field(static=True)
+    bias: bool = eqx.field(static=True)
+    offsets: tuple[str, ...] = eqx.field(static=True)
+    """inputs with an offset of their own in each flight"""
+    outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    """by flight, sorted by name: the order of the residuals"""
+    noise: tuple[str, ...] = eqx.field(static=True)
+    """parameters of the disturbance, estimated beside the others by filter error"""
+    scaled: tuple[str, ...] = eqx.field(static=True)
+    """filter error: outputs whose noise has an unknown factor of its own"""
+    filtered: bool = eqx.field(static=True)
+    """whether the residuals are a Kalman filter's innovations"""
+    concentrated: bool = eqx.field(static=True)
+    """filter error: whether a common factor of all noise is taken out of the likelihood"""
+    solver: str | None = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+    """samples per step of the exact recurrence"""
+    windows: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    """by flight: how many windows, and the samples of each"""
+    continuity: float | None = eqx.field(static=True)
+    """see `Problem.continuity`"""
+    holds: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The unknowns that the verdict speaks of: parameters, gains, the shift."""
+        gains = tuple(f"gain {name}" for name in self.gains)
+        return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The states whose initial values are unknowns: all that are not random there."""
+        if not self.initial_state:
+            return ()
+        random = self.model.spread_names
+        return tuple(n for n in naming.names(self.model.State) if n not in random)
+
+    @property
+    def weak(self) -> int:
+        """Where in z the initial states, biases and input offsets begin."""
+        return len(self.named) + len(self.noise) + len(self.scaled)
+
+    def noise_at(self, name: str) -> int:
+        """Where in z a parameter of the disturbance stands."""
+        return len(self.named) + self.noise.index(name)
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return self.weak + sum(
+            count * len(self.states) + self.constants(outputs)
+            for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
+        )
+
+    def constants(self, outputs: tuple[str, ...]) -> int:
+        """The biases and input offsets of a flight with these outputs."""
+        return (len(outputs) if self.bias else 0) + len(self.offsets)
+
+    def hold(self, i: int) -> dict[str, str]:
+        """What the inputs of the i-th flight do between samples, by name."""
+        return dict(zip(naming.names(self.model.Inputs), self.holds[i], strict=True))
+
+    @property
+    def determined(self) -> int:
+        """Unknowns that the data have to determine: those that windows tie together count once."""
+        if self.continuity is None:
+            return self.size
+        return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
+
+
+class Noise(NamedTuple):
+    """What the residuals are measured by."""
+
+    sd: tuple[dict[str, Any], ...]
+    """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
+    level: Any
+    """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
+    the likelihood is laid out in rows, so that they have variance 1"""
+
+
+class Reached(NamedTuple):
+    """Where a fit ended, for what goes on from there."""
+
+    layout: Layout
+    data: Data
+    noise: Noise
+    z: Any
+
+
+class Unknowns(NamedTuple):
+    """The vector z taken apart, in the units of the model."""
+
+    params: dict[str, Any]
+    noise: dict[str, Any]
+    scales: dict[str, Any]
+    """factors of the measurement noise by output"""
+    gains: dict[str, Any]
+    shift: Any
+    states: tuple[Any, ...]
+    """by flight the State at the first sample, with arrays (windows,) where there are several; None
+    where it is the model's own"""
+    biases: tuple[dict[str, Any], ...]
+    offsets: tuple[dict[str, Any], ...]
+    """of the inputs, by flight"""
+
+
+def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
+    """The static side of a problem over the given flights.
+
+    `bounded` keeps the free parameters within their bounds by logit coordinates.
+    """
+    filtering = problem.method == "filter-error"
+    how = coordinates.kind if bounded else coordinates.plain_kind
+    nuisance = problem.nuisance
+    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
+    measured = tuple(sorted({n for f in problem.training for n in f.outputs}))
+    unknown = filtering and "sigma_y" not in problem.fixed_noise
+    concentrated = unknown and "sigma_w" not in problem.fixed_noise
+    return Layout(
+        model=problem.model,
+        free=tuple(problem.free),
+        kinds=tuple(how(f) for f in problem.free.values()),
+        gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
+        shift=nuisance.time_shift,
+        initial_state=nuisance.initial_state,
+        bias=nuisance.bias,
+        offsets=offset_inputs(problem),
+        outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
+        noise=tuple(problem.noise),
+        scaled=measured[concentrated:] if unknown else (),
+        filtered=filtering,
+        concentrated=concentrated,
+        solver=problem.solver,
+        substeps=problem.substeps,
+        block=_BLOCK if exact else 1,
+        windows=tuple(_windows(problem, flight) for flight in flights),
+        continuity=problem.continuity,
+        holds=tuple(_holds(problem.model, flight) for flight in flights),
+    )
+
+
+def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
+    return tuple(flight.hold[n] for n in naming.names(model.Inputs))
+
+
+def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
+    """How many windows, and the samples of each; a short rest belongs to the last window."""
+    n = flight.n_samples
+    if problem.window is None:
+        return 1, n
+    samples = round(problem.window / flight.dt)
+    count = max(1, round(n / samples))
+    return count, -(-n // count)
+
+
+def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
+    """The i-th free parameter at its coordinate z (any shape)."""
+    return coordinates.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
+
+
+def noise_limits(data: Data) -> dict[str, tuple[Any, Any]]:
+    """Lowest and highest logarithm of each parameter of the disturbance.
+
+    A correlation time below a hundredth of a sample is white noise to any record, one above a
+    thousand records is a random walk; beyond these a likelihood without a maximum would take the
+    numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
+    with room for a disturbance that is none.
+    """
+    dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
+    longest = functools.reduce(
+        jnp.maximum,
+        [f.dt * next(iter(f.outputs.values())).shape[0] for f in data.flights],
+    )
+    # A bias's scale is ten times what the output does.
+    motion = functools.reduce(
+        jnp.maximum, [0.1 * s for f in data.flights for s in f.bias_scale.values()]
+    )
+    size = jnp.log(motion)
+    return {
+        "sigma_w": (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST),
+        "tau_w": (jnp.log(0.01 * dt), jnp.log(1e3 * longest)),
+    }
+
+
+def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
+    """Names for the entries of z."""
+    q = len(layout.free)
+    params = {name: value_of(layout, data, i, z[i]) for i, name in enumerate(layout.free)}
+    gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
+    at = q + len(layout.gains)
+    shift = None
+    if layout.shift:
+        shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
+        at += 1
+    limits = noise_limits(data)
+    noise = {
+        name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noise)
+    }
+    at += len(layout.noise)
+    scales = {
+        name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
+        for i, name in enumerate(layout.scaled)
+    }
+    at = layout.weak
+    states, biases, offsets = [], [], []
+    for flight, outputs, (count, _) in zip(
+        data.flights, layout.outputs, layout.windows, strict=True
+    ):
+        state = None
+        if layout.initial_state:
+            k = len(layout.states)
+            own = z[at : at + count * k].reshape(count, k)
+            own = own[0] if count == 1 else own
+            values = dict.fromkeys(naming.names(layout.model.State), jnp.zeros_like(own[..., 0]))
+            values |= {n: own[..., i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
+            state, at = layout.model.State(**values), at + count * k
+        bias = {n: jnp.zeros_like(z[0]) for n in outputs}
+        if layout.bias:
+            bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
+            at += len(outputs)
+        offset = {n: z[at + i] * flight.offset_scale[n] for i, n in enumerate(layout.offsets)}
+        at += len(layout.offsets)
+        states.append(state)
+        biases.append(bias)
+        offsets.append(offset)
+    by_flight = (tuple(states), tuple(biases), tuple(offsets))
+    return Unknowns(params, noise, scales, gains, shift, *by_flight)

@@ -1,0 +1,111 @@
+"""Flights held out: predicted with the estimates, their own initial states and biases adjusted."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
+from heli_jax.identification.estimation.levenberg_marquardt import optimise
+from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
+from heli_jax.identification.unknowns.nuisances import labels
+
+_STEPS = 60
+
+
+class Validation(NamedTuple):
+    """Flights held out, at the optimum of what is their own."""
+
+    e: Evaluation
+    free_run: tuple[dict[str, np.ndarray], ...] | None
+    """with windows: by flight and output the simulation (N,) in one piece from the initial state of
+    the first window, with the bias; None without windows"""
+    notes: tuple[str, ...]
+
+
+def validate(
+    problem: Problem, layout: Layout, z: Array, noise: Noise, held: tuple[Flight, ...]
+) -> Validation:
+    """Predict the flights held out with the estimates; only their initial states (of every window)
+    and biases are adjusted, by least squares.
+
+    Nothing is raised where that fails: the notes say so.
+
+    Args:
+        z: (q,) the optimum of the fitted flights in `layout`.
+        noise: that of the fitted flights.
+    """
+    other, data = layout_of(problem, held), data_of(problem, held)
+    begin = jnp.zeros(other.size - layout.weak, z.dtype)
+    if not problem.model.linear:
+        begin = start_vector(other, data, problem)[layout.weak :]
+    full = jnp.concatenate([z[: layout.weak], begin])
+    theirs = first_noise(problem, held)
+    if layout.filtered:
+        known = {n: s for one in noise.sd for n, s in one.items()}
+        sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
+        theirs = theirs._replace(sd=sd)
+    arrived = True
+    if other.size > layout.weak:
+        adjust = _linear if problem.model.linear else _damped
+        full, arrived = adjust(other, data, theirs, full)
+    e = evaluate(other, data, theirs, full)
+    free_run = None
+    if any(count > 1 for count, _ in other.windows):
+        one_piece, whole = _in_one_piece(other, full)
+        free_run = simulated_outputs(one_piece, data, whole)
+    return Validation(e, free_run, tuple(_notes(held, e, arrived)))
+
+
+def _linear(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
+    """A model that is linear in its states: one least-squares solution."""
+    e = evaluate(layout, data, noise, z)
+    columns, r = np.asarray(e.J)[:, layout.weak :], np.asarray(e.r)
+    if not (np.isfinite(columns).all() and np.isfinite(r).all()):
+        return z, False
+    step, *_ = np.linalg.lstsq(columns, -r, rcond=1e-10)
+    return z.at[layout.weak :].add(jnp.asarray(step, z.dtype)), True
+
+
+def _damped(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
+    """The fit's own Levenberg-Marquardt, with all that the flights share held."""
+    held = np.arange(layout.size) < layout.weak
+    best = optimise(layout, data, noise, z, _STEPS, held=held)
+    if not (np.isfinite(best.cost) and bool(jnp.all(jnp.isfinite(best.z)))):
+        return z, False
+    return best.z, bool(best.converged)
+
+
+def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
+    """The same without windows: each flight from the initial state of its first."""
+    kept, at, k = [np.arange(layout.weak)], layout.weak, len(layout.states)
+    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        constants = layout.constants(outputs)
+        kept += [at + np.arange(k), at + count * k + np.arange(constants)]
+        at += count * k + constants
+    # As long as one window that holds them all.
+    windows = tuple((1, count * m) for count, m in layout.windows)
+    return replace(layout, windows=windows, continuity=None), z[np.concatenate(kept)]
+
+
+def _notes(held: tuple[Flight, ...], e: Evaluation, arrived: bool) -> list[str]:
+    notes = []
+    for label, simulated in zip(labels(held), e.simulated, strict=True):
+        if not all(np.isfinite(v).all() for v in simulated.values()):
+            notes.append(
+                f"{label}, held out: with the estimates the model's simulation of it is not "
+                "finite, so no agreement is given."
+            )
+    if not arrived and not notes:
+        notes.append(
+            "Held out: the initial states, biases and offsets that suit the flights best were not "
+            f"found (after {_STEPS} steps at most), so the agreement given is a lower bound."
+        )
+    return notes

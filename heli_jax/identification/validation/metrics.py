@@ -1,0 +1,144 @@
+"""How well a simulated signal agrees with a measured one, and whether what is left is white."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+
+class Metrics(NamedTuple):
+    """Agreement of one output; NaN where a signal never moves."""
+
+    vaf: float
+    """variance accounted for, 1 - var(residual)/var(measured)"""
+    nrmse_fit_percent: float
+    """100 (1 - |residual| / |measured - mean|)"""
+    rmse: float
+    """in the output's SI unit"""
+    tic: float
+    """Theil inequality coefficient, 0 (equal) to 1"""
+    bias: float
+    """part of the mean squared error that a wrong mean makes (Theil's bias proportion)"""
+    variance: float
+    """part that a wrong size of the motion makes (his variance proportion)"""
+    covariance: float
+    """the rest: what does not move together; the three make 1"""
+
+
+NO_METRICS = Metrics(*[float("nan")] * 7)
+
+
+def diverges(m: Metrics) -> bool:
+    """Whether a simulation left what was measured: it is not finite, or its error has ten times the
+    variance of the signal."""
+    return not np.isfinite(m.rmse) or m.vaf < -9.0
+
+
+def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
+    """Agreement of two signals (N,) where something is measured (not NaN)."""
+    seen = ~np.isnan(measured)
+    measured, simulated = measured[seen], simulated[seen]
+    residual = measured - simulated
+    spread = np.linalg.norm(measured - measured.mean())
+    rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
+    mse = float(np.mean(residual**2))
+    rmse = mse**0.5
+    bias = (measured.mean() - simulated.mean()) ** 2 / mse if mse > 0 else float("nan")
+    variance = (measured.std() - simulated.std()) ** 2 / mse if mse > 0 else float("nan")
+    return Metrics(
+        vaf=float(1.0 - np.var(residual) / np.var(measured)) if spread > 0 else float("nan"),
+        nrmse_fit_percent=(
+            float(100.0 * (1.0 - np.linalg.norm(residual) / spread)) if spread > 0 else float("nan")
+        ),
+        rmse=rmse,
+        tic=float(rmse / rms) if rms > 0 else float("nan"),
+        bias=float(bias),
+        variance=float(variance),
+        covariance=float(1.0 - bias - variance),
+    )
+
+
+class Whiteness(NamedTuple):
+    """Whether residuals look like white noise over all their lags."""
+
+    white: bool
+    p_value: float
+    """of the Ljung-Box test over `lags` lags, for all signals that were judged together"""
+    lags: int
+    outside: float
+    """share of the lags outside the 99 % band"""
+    lag1: float
+    """autocorrelation at one sample, or at the shortest lag of which enough pairs are seen"""
+
+
+def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
+    """Autocorrelation (lags + 1,) from lag 0, by the biased estimate; NaN counts as the mean."""
+    r = _centred(residual)
+    n = r.size
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft(r, size)) ** 2
+    c = np.fft.irfft(spectrum, size)[: lags + 1] / n
+    return c / c[0] if c[0] > 0 else np.concatenate([[1.0], np.zeros(lags)])
+
+
+def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
+    """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags."""
+    a, b = _centred(u), _centred(residual)
+    n = a.size
+    size = 1 << (2 * n - 1).bit_length()
+    c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
+    both = np.concatenate([c[-lags:], c[: lags + 1]])
+    scale = a.std() * b.std()
+    return both / scale if scale > 0 else np.zeros(2 * lags + 1)
+
+
+def _centred(signal: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
+
+
+def lags_for(n: int) -> int:
+    """How many lags a record of n samples bears: a quarter of it, at most 500."""
+    return max(1, min(n // 4, 500))
+
+
+def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
+    """The Ljung-Box test at 1 % on residuals (N,); NaN where nothing is measured.
+
+    `together` is how many signals are judged side by side: the p value is multiplied by it
+    (Bonferroni), so that one in a hundred white records fails, not one in a hundred signals.
+    """
+    n = int(np.count_nonzero(~np.isnan(residual)))
+    r, pairs, whole = _seen_autocorrelation(residual)
+    lags = r.size
+    # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
+    q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
+    # Few lags see a short memory that many lags would drown; both must agree with white noise.
+    short = min(lags, 20)
+    p = min(
+        1.0,
+        2.0
+        * together
+        * min(scipy.special.chdtrc(lags, q[-1]), scipy.special.chdtrc(short, q[short - 1])),
+    )
+    outside = float(np.mean(np.abs(r) * whole > 2.5758 * np.sqrt(whole / pairs)))
+    return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
+
+
+def _seen_autocorrelation(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Autocorrelation over the pairs of samples that are seen, the number of these, and the part of
+    the record that a lag leaves, each (lags,), at the shortest lags at which enough are seen; at
+    all of them where nothing is missing."""
+    seen = ~np.isnan(residual)
+    r = _centred(residual)
+    n, count = r.size, int(seen.sum())
+    size = 1 << (2 * n - 1).bit_length()
+
+    def products(x: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)
+
+    pairs, c = np.round(products(seen.astype(float))), products(r)
+    at = np.arange(1, max(n // 4, 1) + 1)
+    at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
+    if at.size == 0 or not c[0] > 0:
+        return np.zeros(1), np.ones(1), np.ones(1)
+    return c[at] / c[0] * count / pairs[at], pairs[at], 1.0 - at / n

@@ -1,0 +1,160 @@
+"""How many elements a device computes side by side: measured once where it pays, and remembered."""
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from heli_jax import naming
+from heli_jax.regular_file import in_the_way, read_regular
+from heli_jax.sweeps.program import Program, arguments, shapes
+from heli_jax.sweeps.spec import Job
+from heli_jax.sweeps.worker import BLOCKS, Split
+
+_CPU, _GPU = 64, 1 << 17
+_CANDIDATES = {"cpu": (32, 64, 128, 256), "gpu": (1 << 13, 1 << 15, 1 << 17)}
+_WORTH_S = 60.0
+"""A sweep that takes less [s] is not worth measuring for: every candidate is compiled."""
+_CHUNK_S = 2.0
+"""What a chunk should take [s], about: a kill costs as much, and writing is to be little of it."""
+_CHUNK_BYTES = 64e6
+_CHUNKS = 4
+"""about, where there are enough elements, to see how it goes; twice as many for each of several
+processes, to share the work evenly"""
+_RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
+_ROOM = {"cpu": 1 << 16, "gpu": 1 << 18}
+
+
+def split_for(
+    job: Job,
+    *,
+    devices: Sequence[Any] | None = None,
+    chunk: int | None = None,
+    lanes: int | None = None,
+    shares: int = 1,
+    memory: Path | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Split:
+    """How to cut a sweep: into chunks that are written at once, and those into what a device
+    computes side by side.
+
+    `shares` is how many processes take chunks side by side; each shall have several.
+    `memory` is a file that keeps what was measured. Given numbers are taken as they are.
+    """
+    devices = tuple(jax.local_devices() if devices is None else devices)
+    kind = "cpu" if devices[0].platform == "cpu" else "gpu"
+    share = math.ceil(job.design.size / len(devices))
+    if lanes is None:
+        lanes = min(_default(job, kind), _power(share / BLOCKS))
+        if share > 8 * max(_CANDIDATES[kind]):
+            lanes = _measured(job, devices, kind, lanes, memory, say)
+    if chunk is None:
+        step = BLOCKS * lanes * len(devices)
+        wanted = _power(_CHUNK_S * len(devices) / _guess(job))
+        heaviest = max(_bytes(shapes(job, i)) for i in range(len(job.flights)))
+        room = min(_ROOM[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
+        if kind == "gpu":
+            wanted = room
+        pieces = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
+        each = _power(job.design.size / pieces)
+        chunk = max(step, math.ceil(min(wanted, room, each) / step) * step)
+        chunk = min(chunk, math.ceil(job.design.size / step) * step)
+    return Split(chunk, lanes)
+
+
+def _power(n: float) -> int:
+    """The power of two at or above n."""
+    return 1 << max(0, math.ceil(math.log2(max(1, n))))
+
+
+def _bytes(found: Any) -> int:
+    return sum(v.size * v.dtype.itemsize for v in jax.tree.leaves(found))
+
+
+def _guess(job: Job) -> float:
+    """Seconds an element takes on a core, within a factor of five: a nanosecond for each state,
+    sample and stage. Not measured, so that a sweep is cut in the same way each time."""
+    samples = sum(f.n_samples for f in job.flights) if job.simulated else 1
+    stages = 1 if job.solver == "exact" else 4 * job.substeps
+    return 1e-9 * samples * stages * len(naming.names(job.model.State))
+
+
+def _default(job: Job, kind: str) -> int:
+    most = _CPU if kind == "cpu" else _GPU
+    if job.streamed:
+        return most
+    # Whole runs are held, a block of them at a time on each device.
+    model = job.model
+    kept = sum(len(naming.names(c)) for c in (model.State, model.Outputs, model.Inputs))
+    run = 8 * kept * max(f.n_samples for f in job.flights)
+    return min(most, 1 << max(0, int(math.log2(max(1.0, _RUN_BYTES[kind] / run)))))
+
+
+def _measured(
+    job: Job,
+    devices: tuple[Any, ...],
+    kind: str,
+    default: int,
+    memory: Path | None,
+    say: Callable[[str], None],
+) -> int:
+    """The fastest of some numbers, or the default where the whole sweep is over sooner."""
+    key = "|".join(
+        [
+            devices[0].device_kind,
+            job.model.name,
+            f"{job.solver}x{job.substeps}",
+            job.precision,
+            "streamed" if job.streamed else "whole",
+            ",".join(sorted(str(r.how) for r in job.reduce.values() if isinstance(r.how, str))),
+        ]
+    )
+    known = _remembered(memory)
+    if isinstance(known.get(key), int) and known[key] >= 1:
+        return known[key]
+    first = _time(job, devices, default)
+    if first * job.design.size < _WORTH_S:
+        return default
+    say("measuring how many elements to compute side by side")
+    limit = max(default, max(_CANDIDATES[kind])) if job.streamed else default
+    found = {default: first}
+    for lanes in _CANDIDATES[kind]:
+        if lanes not in found and lanes <= limit:
+            found[lanes] = _time(job, devices, lanes)
+    best = min(found, key=lambda lanes: found[lanes])
+    if memory is not None and in_the_way(memory) is None:
+        with contextlib.suppress(OSError):
+            memory.parent.mkdir(parents=True, exist_ok=True)
+            memory.write_text(json.dumps({**known, key: best}, indent=1), encoding="utf-8")
+    return best
+
+
+def _remembered(memory: Path | None) -> dict[str, Any]:
+    if memory is None:
+        return {}
+    try:
+        found = json.loads(read_regular(memory, "what was measured", 10**6))
+    except ValueError:  # InputError is one
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _time(job: Job, devices: tuple[Any, ...], lanes: int) -> float:
+    """Seconds an element takes, the best of three runs of as few blocks as a device has."""
+    program = Program(job, 0, devices, lanes)
+    count = min(BLOCKS * lanes * len(devices), job.design.size)
+    values = arguments(job, job.design.values(0, count))
+    jax.block_until_ready(program(values, count))
+    best = math.inf
+    for _ in range(3):
+        begin = time.perf_counter()
+        jax.block_until_ready(program(values, count))
+        best = min(best, time.perf_counter() - begin)
+        if best > 5.0:
+            break
+    return best / count
