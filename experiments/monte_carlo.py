@@ -24,7 +24,6 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.equation_error.baseline import baseline
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.noise_covariance import levelled
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from heli_jax.naming import asdict, names, replace
@@ -109,7 +108,7 @@ def fisher(params: Any, records: int = 5) -> dict[str, float]:
         z = start_vector(layout, data, problem)
         dtype = z.dtype
         noise = Noise(({"roll": np.asarray(NOISE, dtype)},), np.zeros((), dtype))
-        noise = levelled(data, evaluate(layout, data, noise, z), noise)
+        noise = layout.estimator.with_level(data, evaluate(layout, data, noise, z), noise)
         found.append(deviations(evaluate(layout, data, noise, z).J)[: len(FREE)])
     mean = np.sqrt(np.mean(np.square(found), axis=0))
     return dict(zip(FREE, (float(v) for v in mean), strict=True))

@@ -34,7 +34,7 @@ _CHECKED = (
     "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
     "analysis.linear identification.unknowns.transforms identification.equation_error.baseline "
     "identification.validation.metrics "
-    "identification.estimation.residual"
+    "identification.estimation.residual identification.estimation.simulated_flights"
 )
 jaxtyping.install_import_hook([f"heli_jax.{p}" for p in _CHECKED.split()], "beartype.beartype")
 

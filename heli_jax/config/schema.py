@@ -4,7 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
-from heli_jax.identification.problem import Method, Sign
+from heli_jax.identification.methods import METHODS
+from heli_jax.identification.problem import Sign
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -104,7 +105,7 @@ class ShootingConfig(_Strict):
 
 
 class FitConfig(_Strict):
-    method: Method = "output-error"
+    method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     free: dict[str, FreeConfig]
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None

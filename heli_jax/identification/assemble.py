@@ -12,14 +12,11 @@ from jaxtyping import Array
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum, residuals_count
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import (
     NO_DISTURBANCE,
     Settled,
-    innovation_sums,
-    log_likelihood,
-    noise_unknowns,
 )
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Z95, Verdict
@@ -38,7 +35,7 @@ from heli_jax.identification.uncertainty.estimates import (
     prior_notes,
     stated_noise_notes,
 )
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, unpack
+from heli_jax.identification.unknowns.layout import Layout, Noise, Reached, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Record, assess
@@ -80,12 +77,12 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     e = evaluate(layout, data, noise, best.z)
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e) if usable else ran.before
-    n = residuals_count(data)
+    n = measured_count(data)
     quantile = float(scipy.special.stdtrit(max(n - layout.determined, 1), 0.975))
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
     together = correlated_residuals(signals)
-    coloured = usable and not layout.filtered
+    coloured = usable and layout.estimator.rows_are_samples
     coloured = coloured and (bool(together) or not all(w.white for w in white.values()))
     wider, quantiles = np.ones(layout.size), np.full(layout.size, quantile)
     if coloured:
@@ -106,14 +103,17 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
     validation = signals_of(checked.e, held) if checked else ()
     free_run = _free_run(held, checked.free_run) if checked else ()
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
-    ill = _ill_conditioned(problem, e, sds)
+    ill = layout.estimator.ill_conditioned(problem, e, sds)
     dtype = jnp.result_type(float)
     values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
+    # A disturbance that does not show is not among what was estimated.
+    unknowns = layout.determined + layout.estimator.noise_unknowns(layout)
+    unknowns -= len(layout.noise) if none else 0
     reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
     params = naming.replace(problem.vehicle, **values)
     against = None
-    if layout.filtered and not none:
-        against = _against_disturbance(layout, data, noise, e, best.z)
+    if not none:
+        against = layout.estimator.against_expected(layout, data, noise, e, best.z)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = [
         *_stopped_notes(layout, best, settled),
@@ -121,7 +121,7 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         *_disturbance_notes(settled.ratio if none else None),
         *([] if none else extreme_noise_notes(layout, data, best.z)),
         *settled.notes,
-        *_filter_notes(layout, noise, e, n, ill),
+        *layout.estimator.notes(layout, data, noise, e, ill),
         *stated_noise_notes(problem, sds),
         *_correlation_notes(together if coloured else {}),
         *bound_notes(named),
@@ -141,8 +141,8 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         verdict_before=ran.before,
         verdict=verdict,
         noise=sds,
-        log_likelihood=log_likelihood(layout, data, noise, e),
-        unknowns=layout.determined + noise_unknowns(layout) - (len(layout.noise) if none else 0),
+        log_likelihood=layout.estimator.log_likelihood(layout, data, noise, e),
+        unknowns=unknowns,
         signals=(*signals, *validation),
         metrics=_pooled(signals),
         validation=_pooled(validation),
@@ -272,46 +272,6 @@ def _adequacy(
     return assess(problem, params, records, _pooled(signals), white, against, unknowns)
 
 
-_BLIND = 1e4
-"""so many times the signal is a noise from which a filter learns nothing"""
-
-
-def _against_disturbance(
-    layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
-) -> dict[str, float]:
-    """By output, the power of the simulation's error over that which disturbance and noise make.
-
-    A filter whose measurements are all but noise never corrects its state: the variance of its
-    innovations is then that of a simulation's error. The program is the one that is compiled.
-    """
-    sizes = tuple(
-        {n: np.asarray(_BLIND * _moved(y), np.asarray(s[n]).dtype) for n, y in f.outputs.items()}
-        for f, s in zip(data.flights, noise.sd, strict=True)
-    )
-    blind = evaluate(layout, data, noise._replace(sd=sizes), z)
-    scales = unpack(layout, data, z).scales
-    power: dict[str, list[float]] = {}
-    for raw, one, big, sd in zip(e.raw, blind.innovations, sizes, noise.sd, strict=True):
-        for n, s in one.variance.items():
-            factor = float(scales.get(n, 1.0)) ** 2
-            spread = np.maximum(np.asarray(s) - float(big[n]) ** 2 * factor, 0.0)
-            expected = spread + float(sd[n]) ** 2 * factor
-            seen = np.isfinite(raw[n])
-            have = power.setdefault(n, [0.0, 0.0])
-            with np.errstate(all="ignore"):
-                have[0] += float(np.var(raw[n][seen])) * int(seen.sum())
-                have[1] += float(np.nansum(expected))
-    return {
-        n: float(missed / expected) if np.isfinite(expected) and expected > 0 else 0.0
-        for n, (missed, expected) in power.items()
-    }
-
-
-def _moved(y: Any) -> float:
-    y = np.asarray(y)
-    return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
-
-
 def _disturbance_notes(ratio: float | None) -> list[str]:
     if ratio is None:
         return []
@@ -319,12 +279,6 @@ def _disturbance_notes(ratio: float | None) -> list[str]:
         "No disturbance shows in the record (twice the log-likelihood gained by one is "
         f"{ratio:.2g}): output error suffices, and these are its numbers."
     ]
-
-
-_DIGITS = 1e13
-"""Variance of an innovation over that of the measurement beyond which float64 has no digits left
-for what the measurement says of the state."""
-_TOLERANCE = 1e-6
 
 
 def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]:
@@ -342,49 +296,6 @@ def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]
     return [
         f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
         f"Remedy: {remedy}."
-    ]
-
-
-def _ill_conditioned(problem: Problem, e: Evaluation, sds: dict[str, float]) -> bool:
-    """Whether the filter has lost its digits: variances that are none, or beyond all digits."""
-    if problem.method != "filter-error":
-        return False
-    found = np.concatenate(_variances(problem, e, sds))
-    found = found[~np.isnan(found)] if np.isfinite(e.r).all() else found
-    return bool(
-        not found.size
-        or not np.isfinite(found).all()
-        or found.min() < 1.0 - _TOLERANCE
-        or found.max() > _DIGITS
-    )
-
-
-def _filter_notes(layout: Layout, noise: Noise, e: Evaluation, n: int, ill: bool) -> list[str]:
-    """What is wrong with the filter, and the remedy."""
-    if ill:
-        return [
-            "The Kalman filter is ill-conditioned: next to the disturbance the measurement noise "
-            "is too small for the digits of a computer. These numbers are no result. State a "
-            "measurement noise (sd) of at least the log's resolution, or begin with a smaller "
-            "sigma_w."
-        ]
-    if not layout.filtered or layout.concentrated:
-        return []
-    size = float(np.sqrt(innovation_sums(e, noise)[0] / n))
-    if 0.8 < size < 1.25:
-        return []
-    return [
-        f"The innovations are {size:.3g} times as large as the fixed noise lets expect: the "
-        "intervals do not hold. Leave sigma_y or sigma_w free, or correct them."
-    ]
-
-
-def _variances(problem: Problem, e: Evaluation, sds: dict[str, float]) -> list[np.ndarray]:
-    """Of the innovations over the measurement noise's, by flight and output."""
-    return [
-        np.asarray(s) / sds[f"{label}/{n}"] ** 2
-        for label, one in zip(labels(problem.training), e.innovations, strict=True)
-        for n, s in one.variance.items()
     ]
 
 

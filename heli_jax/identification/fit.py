@@ -13,7 +13,6 @@ from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.estimation.noise_covariance import (
     disturbance_or_none,
     first_noise,
-    levelled,
     second_guess,
     settle,
 )
@@ -53,8 +52,9 @@ def _begin(problem: Problem) -> _Begin:
     noise = first_noise(problem, problem.training)
     z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
-    noise = levelled(data, e, noise)
-    if layout.filtered:
+    level = layout.estimator.with_level(data, e, noise)
+    if level is not noise:
+        noise = level
         e = evaluate(layout, data, noise, z)
     return _Begin(layout, data, noise, z, e)
 

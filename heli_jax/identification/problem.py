@@ -14,6 +14,7 @@ from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
 from heli_jax.vehicle import impossible, of_helicopter
 
 
@@ -62,8 +63,6 @@ class Nuisance(NamedTuple):
     input_offset: bool | tuple[str, ...] | None = None
 
 
-Method = Literal["output-error", "filter-error"]
-
 _FIXABLE = ("sigma_w", "tau_w", "sigma_y")
 
 MAX_TIME_SHIFT = 0.5
@@ -91,7 +90,7 @@ class Problem:
     substeps: int = 4
     gain_units: Mapping[str, str] = field(default_factory=dict)
     """the unit that an input's gain carries, where the log's unit is a plain number"""
-    method: Method = "output-error"
+    method: str = "output-error"
     """output-error compares with a simulation; filter-error with one-step predictions of a
     Kalman filter, for models with a disturbance (`with_disturbance`)"""
     fixed_noise: tuple[str, ...] = ()
@@ -130,7 +129,7 @@ class Problem:
     @property
     def noise(self) -> dict[str, Free]:
         """The parameters of the disturbance that filter error estimates, with their starts."""
-        if self.method == "output-error":
+        if not estimator_of(self.method).process_noise:
             return {}
         found = {"sigma_w": Free(self.motion), "tau_w": Free(1.0)}
         for name in found:
@@ -138,6 +137,11 @@ class Problem:
             if math.isfinite(value) and value > 0:
                 found[name] = Free(value)
         return {n: f for n, f in found.items() if n not in self.fixed_noise}
+
+    @property
+    def noise_is_fixed(self) -> bool:
+        """Whether the measurement noise is taken as stated."""
+        return estimator_of(self.method).process_noise and "sigma_y" in self.fixed_noise
 
     @property
     def motion(self) -> float:
@@ -159,19 +163,19 @@ class Problem:
 
 def _check_method(problem: Problem) -> None:
     model = problem.model
-    if problem.method == "output-error":
+    if not estimator_of(problem.method).process_noise:
         return
     have = naming.names(model.Params)
     if model.noise is None or "sigma_w" not in have or "tau_w" not in have:
         raise ValueError(
-            f"method filter-error: model {model.name} has no disturbance, wanted is a model made "
-            "with with_disturbance (in a configuration: a `disturbance`)"
+            f"method {problem.method}: model {model.name} has no disturbance, expected a model "
+            "made with with_disturbance (in a configuration: a `disturbance`)"
         )
     if not all(n in _FIXABLE for n in problem.fixed_noise):
         raise ValueError(f"fixed_noise is {problem.fixed_noise}, wanted are some of {_FIXABLE}")
     for name in ("sigma_w", "tau_w"):
         if name in problem.free:
-            raise ValueError(f"free.{name}: filter-error estimates it by itself, leave it out")
+            raise ValueError(f"free.{name}: {problem.method} estimates it by itself, leave it out")
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
             raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
@@ -199,8 +203,8 @@ def _check_windows(problem: Problem) -> None:
         math.isfinite(problem.continuity) and problem.continuity > 0
     ):
         raise ValueError(f"continuity is {problem.continuity:g}, wanted is above zero")
-    if problem.method != "output-error":
-        raise ValueError("window is for method output-error: a filter needs none")
+    if not estimator_of(problem.method).windows:
+        raise ValueError(f"window is for method output-error: {problem.method} needs none")
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     if problem.nuisance.time_shift:
@@ -313,7 +317,7 @@ def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
                 "wanted is at most half"
             )
         stated = name in flight.sd or flight.hold_out
-        if problem.method == "filter-error" and "sigma_y" in problem.fixed_noise and not stated:
+        if problem.noise_is_fixed and not stated:
             raise ValueError(
                 f"{where}: the noise of output {name!r} is fixed (sigma_y) but not stated, wanted "
                 "is its sd"

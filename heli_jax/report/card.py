@@ -9,6 +9,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
@@ -46,7 +47,8 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     for name, one in fit.estimates.items():
         lines += _of_parameter(name, one)
     lines += _of_relations(fit)
-    filtered = fit.method == "filter-error"
+    estimator = estimator_of(fit.method)
+    filtered = estimator.process_noise
     for name, m in fit.metrics.items():
         lines += _of_agreement(name, m, "simulated", judged=not filtered)
     for name, m in fit.one_step.items():
@@ -60,7 +62,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
             said = "a simulation knows no disturbance: judged against what the estimated one makes"
             of, ratio = f"{one.output}, simulated", one.against_disturbance
             lines.append(_most("error power over expected", of, ratio, "", EXPECTED, said))
-    what = "innovations" if filtered else "residuals"
+    what = estimator.errors
     for name, w in fit.whiteness.items():
         remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
         gate = Gate(

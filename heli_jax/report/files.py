@@ -12,6 +12,7 @@ from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
@@ -132,7 +133,7 @@ def whiteness_note(fit: Fit) -> str:
     if not coloured:
         return ""
     worst = max((fit.whiteness[n] for n in coloured), key=lambda w: abs(w.lag1))
-    what = "innovations" if fit.method == "filter-error" else "residuals"
+    what = estimator_of(fit.method).errors
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "

@@ -10,8 +10,8 @@ import pytest
 from heli_jax import Flight, Free, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.filter_error import _disturbed
 from heli_jax.identification.estimation.noise_covariance import first_noise
-from heli_jax.identification.uncertainty.bootstrap import _disturbed
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Reached, layout_of, unpack
 from heli_jax.identification.validation.metrics import whiteness

@@ -1,38 +1,19 @@
 """Everything that one point tells, for what is not compiled."""
 
-from typing import Any, NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.kalman import Innovations
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import slopes
-from heli_jax.identification.estimation.residual import Shown, predict, shown_of
+from heli_jax.identification.estimation.residual import Shown, shown_of
+from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
 _TAKES_PART = 1e-3
 """part of a unit direction without effect from which on a coordinate is lost with it"""
-
-
-class Evaluation(NamedTuple):
-    """Everything that one point tells, as NumPy arrays."""
-
-    simulated: tuple[dict[str, Any], ...]
-    """with the bias, SI, by flight and output"""
-    raw: tuple[dict[str, Any], ...]
-    """measured - simulated, SI, by flight and output; NaN where nothing is measured"""
-    state_rms: Any
-    """(flights, states) root mean square of each simulated state"""
-    innovations: tuple[Innovations, ...]
-    r: Any
-    J: Any
-    named: Any
-    """values of the named unknowns"""
-    slopes: Any
-    """their derivatives by their own coordinates"""
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:

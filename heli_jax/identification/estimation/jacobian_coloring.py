@@ -26,7 +26,7 @@ class _Columns(NamedTuple):
 
 def seeded(layout: Layout) -> np.ndarray | None:
     """The directions (q, colours) in which to differentiate; None where each is one unknown's."""
-    if layout.filtered or sum(count for count, _ in layout.windows) < 2:
+    if not layout.estimator.rows_are_samples or sum(count for count, _ in layout.windows) < 2:
         return None
     colour = _columns(layout).colour
     seeds = np.zeros((layout.size, int(colour.max()) + 1))

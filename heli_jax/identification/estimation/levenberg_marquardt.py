@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from heli_jax.identification.estimation.estimator import measured_count
 from heli_jax.identification.estimation.residual import Slopes, differentiate
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached
 
@@ -266,17 +267,9 @@ def _at_once(
     return _End(_point(terms, end.state.xi), end.units.level, end.state, end.last)
 
 
-def _whole(layout: Layout) -> bool:
-    """Whether a run is one program.
-
-    Linear models without a filter take no longer to evaluate than a step takes to be called for.
-    """
-    return layout.model.linear and not layout.filtered
-
-
 def slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
     """`differentiate` by the program that the optimiser compiles as well."""
-    if _whole(layout):
+    if layout.estimator.one_program(layout):
         return _at_once(layout, data, noise, z, np.asarray(1)).last
     return differentiate(layout, data, noise, z)
 
@@ -299,8 +292,8 @@ def optimise(
     held: np.ndarray | None = None,
 ) -> Optimum:
     """The least-squares optimum from z0; unknowns that are `held` (q,) stay there."""
-    count = residuals_count(data)
-    if _whole(layout) and held is None:
+    count = measured_count(data)
+    if layout.estimator.one_program(layout) and held is None:
         end = _at_once(layout, data, noise, z0, np.asarray(max_steps))
         return _optimum(end.level, end.state, end.z, count)
 
@@ -358,7 +351,7 @@ def optimise_many(
         def at(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _slopes(layout, numbers, noise, z)
 
-        count = residuals_count(numbers) // batch
+        count = measured_count(numbers) // batch
         ends = _descend(at, terms, at(z0), count, max_steps, _many)
         found.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
@@ -378,12 +371,3 @@ def _terms(layout: Layout, z0: Array, units: _Scaling) -> _Terms:
         norms = _COLUMN * units.level / jnp.where(usable, units.unit, 1.0)
         ties = jnp.where(linear, jnp.where(usable, norms / _LINEAR_ANCHOR, 0.0), ties)
     return _Terms(z0, units, ties, jnp.asarray(watched))
-
-
-def residuals_count(data: Data) -> int:
-    """How many measured numbers there are."""
-    return sum(
-        int(np.isfinite(np.asarray(y)).sum())
-        for flight in data.flights
-        for y in flight.outputs.values()
-    )

@@ -11,11 +11,12 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
+    measured_count,
     optimise,
-    residuals_count,
     slopes,
 )
-from heli_jax.identification.estimation.residual import predict, rows_of
+from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of, unpack
@@ -195,7 +196,7 @@ class Search:
         for i in range(points.shape[0]):
             found = optimise(layout, self.data, noise, points[i], self.max_steps)
             run = jax.device_get(found)._replace(z=found.z)
-            if not bool(run.converged) and not layout.filtered:
+            if not bool(run.converged) and layout.estimator.least_squares:
                 near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
                 run = run._replace(converged=np.asarray(near))
             runs.append(run)
@@ -216,7 +217,7 @@ class Search:
 
     def _worth(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
-        nothing = self.misfit_of_nothing(noise) / residuals_count(self.data)
+        nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
 
     def misfit_of_nothing(self, noise: Noise) -> float:

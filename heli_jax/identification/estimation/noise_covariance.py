@@ -1,7 +1,7 @@
 """How large the noise is, and whether there is a disturbance: what surrounds the optimiser."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations, evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import Optimum, residuals_count
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain, noise_guess_at
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, noise_limits
 
@@ -54,11 +55,11 @@ class Settled(NamedTuple):
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
     """The noise to begin with, by flight and output: as stated, else guessed.
 
-    Filter error has one noise an output: what is not stated is guessed from all flights.
+    Where an output has one noise in all flights, what is not stated is guessed from all of them.
     """
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
-    if problem.method == "filter-error":
+    if estimator_of(problem.method).shared_noise:
         outputs = {n for guess in guesses for n in guess}
         pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
         guesses = [{n: pooled[n] for n in guess} for guess in guesses]
@@ -69,21 +70,13 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
     return Noise(sd, np.zeros((), dtype))
 
 
-def levelled(data: Data, e: Evaluation, noise: Noise) -> Noise:
-    """The noise with the level that the innovations of filter error show."""
-    if not e.innovations:
-        return noise
-    level = innovation_sums(e, noise)[1] / residuals_count(data)
-    fine = level if np.isfinite(level) else 0.0
-    return noise._replace(level=np.asarray(fine, noise.level.dtype))
-
-
 def settle(search: Search, noise: Noise, best: Optimum) -> Settled:
     """Alternate between the optimum and the noise until both stay (relaxation of R)."""
+    estimator = search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(8):
         e = evaluate(search.layout, search.data, noise, best.z)
-        z, new = _updated(search.layout, search.data, e, noise, best.z)
+        z, new = estimator.relax(search.layout, search.data, e, noise, best.z)
         fall = float(noise.level - new.level)
         change = abs(fall) + max(
             abs(float(np.log(n[k] / s[k])))
@@ -93,25 +86,13 @@ def settle(search: Search, noise: Noise, best: Optimum) -> Settled:
         if not np.isfinite(change):
             break
         best, noise = best._replace(z=z), new
-        if change < 1e-3 or not bool(best.converged) or not _noise_matters(search, fall):
+        if change < 1e-3 or not bool(best.converged):
+            break
+        if not estimator.noise_matters(search.problem, search.layout, fall):
             break
         [best] = search.run(noise, best.z[None, :])
         trace.append((int(best.steps), float(best.cost)))
     return Settled(best, noise, tuple(trace))
-
-
-def _noise_matters(search: Search, fall: float) -> bool:
-    """Whether the optimum moves with the noise.
-
-    With filter error only where priors are weighed against a scale that is concentrated out, or
-    where the noise fell (in the log of the variance) past what the likelihood's row can show.
-    """
-    layout = search.layout
-    if not layout.filtered:
-        return True
-    if layout.concentrated:
-        return any(f.prior for f in search.problem.free.values())
-    return fall > 0.9
 
 
 _EXPLAINED = 2.0
@@ -135,7 +116,7 @@ def second_guess(
     layout, data = search.layout, search.data
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
     several = sum(len(o) for o in layout.outputs) > 1
-    if layout.filtered or not several or _explained(found.noise, guesses):
+    if not layout.estimator.least_squares or not several or _explained(found.noise, guesses):
         return found
     dtype = found.noise.level.dtype
     sd = tuple(
@@ -180,7 +161,7 @@ def _worth(layout: Layout, data: Data, found: Settled) -> float:
         for n, r in by_name.items()
     )
     beside = float(np.sum(np.square(np.asarray(e.r, np.float64)))) - measured
-    return log_likelihood(layout, data, found.noise, e) - 0.5 * beside
+    return layout.estimator.log_likelihood(layout, data, found.noise, e) - 0.5 * beside
 
 
 def disturbance_or_none(search: Search, found: Settled) -> Settled:
@@ -197,8 +178,8 @@ def disturbance_or_none(search: Search, found: Settled) -> Settled:
     none = without_disturbance(search, found)
     alone = evaluate(layout, data, none.noise, none.best.z)
     if bool(np.isfinite(alone.r).all()) and not _corrects(alone, none.noise):
-        without = log_likelihood(layout, data, none.noise, alone)
-        ratio = 2.0 * (log_likelihood(layout, data, found.noise, e) - without)
+        without = layout.estimator.log_likelihood(layout, data, none.noise, alone)
+        ratio = 2.0 * (layout.estimator.log_likelihood(layout, data, found.noise, e) - without)
         if not ratio > NO_DISTURBANCE:
             found, ratio = _from_nested(search, found, ratio, none, without)
         if bool(none.best.converged) and not ratio > NO_DISTURBANCE:
@@ -224,13 +205,13 @@ def _off_the_limit(search: Search, found: Settled) -> Settled:
     if low < float(found.best.z[layout.noise_at("tau_w")]) < high:
         return found
     z = with_noise_guess(search, found)
-    noise = levelled(data, evaluate(layout, data, found.noise, z), found.noise)
+    noise = layout.estimator.with_level(data, evaluate(layout, data, found.noise, z), found.noise)
     [best] = search.run(noise, z[None, :])
     again = settle(search, noise, best)
-    before = log_likelihood(
+    before = layout.estimator.log_likelihood(
         layout, data, found.noise, evaluate(layout, data, found.noise, found.best.z)
     )
-    after = log_likelihood(
+    after = layout.estimator.log_likelihood(
         layout, data, again.noise, evaluate(layout, data, again.noise, again.best.z)
     )
     if not (bool(again.best.converged) and after > before):
@@ -260,10 +241,10 @@ def _far_better(search: Search, found: Settled, e: Evaluation) -> bool:
         return False
     before = float(np.sum(np.square(np.asarray(alone.r, np.float64))))
     after = max(before - gained, 1e-300)
-    n = residuals_count(data)
+    n = measured_count(data)
     gain = 0.5 * (n * np.log(before / after) if layout.concentrated else before - after)
-    without = log_likelihood(layout, data, noise, alone) + gain
-    return bool(log_likelihood(layout, data, noise, e) - without > n)
+    without = layout.estimator.log_likelihood(layout, data, noise, alone) + gain
+    return bool(layout.estimator.log_likelihood(layout, data, noise, e) - without > n)
 
 
 def _from_nested(
@@ -273,14 +254,16 @@ def _from_nested(
     layout, data = search.layout, search.data
     z = with_noise_guess(search, none)
     guess = evaluate(layout, data, none.noise, z)
-    noise = levelled(data, guess, none.noise)
-    promising = log_likelihood(layout, data, noise, guess) > without + NO_DISTURBANCE
+    noise = layout.estimator.with_level(data, guess, none.noise)
+    promising = (
+        layout.estimator.log_likelihood(layout, data, noise, guess) > without + NO_DISTURBANCE
+    )
     if not (promising or ratio < -NO_DISTURBANCE or not np.isfinite(ratio)):
         return found, ratio
     [best] = search.run(noise, z[None, :])
     again = settle(search, noise, best)
     e = evaluate(layout, data, again.noise, again.best.z)
-    other = 2.0 * (log_likelihood(layout, data, again.noise, e) - without)
+    other = 2.0 * (layout.estimator.log_likelihood(layout, data, again.noise, e) - without)
     if not np.isfinite(other) or other <= ratio:
         return found, ratio
     said = ()
@@ -322,76 +305,3 @@ def _silenced(search: Search, found: Settled) -> Array:
     at = search.layout.noise_at("sigma_w")
     smallest = min(float(s) for one in found.noise.sd for s in one.values())
     return found.best.z.at[at].set(np.log(smallest) - _NONE)
-
-
-def _updated(
-    layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Array
-) -> tuple[Array, Noise]:
-    """The noise that the residuals show, degrees of freedom taken off in proportion.
-
-    With filter error all noise changes by one factor, that of the disturbance in z included, so
-    that the optimum stays where it is.
-    """
-    n = residuals_count(data)
-    freedom = n / max(n - layout.determined, 1)
-    if not layout.filtered:
-        new = tuple(
-            {k: _residual_sd(r, flight.outputs[k], freedom) for k, r in by_name.items()}
-            for by_name, flight in zip(e.raw, data.flights, strict=True)
-        )
-        return z, Noise(new, noise.level)
-    squares, logs = innovation_sums(e, noise)
-    level = np.asarray(logs / n, noise.level.dtype)
-    if not layout.concentrated:
-        return z, noise._replace(level=level)
-    factor = np.sqrt(squares / n * freedom)
-    if "sigma_w" in layout.noise:
-        at = layout.noise_at("sigma_w")
-        z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
-    sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
-    return z, Noise(sd, level)
-
-
-def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
-    """Sums over all measurements of e^2/s and of log(s/sd^2)."""
-    squares, logs = 0.0, 0.0
-    with np.errstate(all="ignore"):  # an unstable start gives what it gives, and is judged later
-        for one, sd in zip(e.innovations, noise.sd, strict=True):
-            for n, s in one.variance.items():
-                squares += float(np.nansum(one.error[n] ** 2 / s))
-                logs += float(np.nansum(np.log(s / sd[n] ** 2)))
-    return squares, logs
-
-
-def _residual_sd(r: np.ndarray, y: Any, freedom: float) -> np.ndarray:
-    y = np.asarray(y)
-    r, y = r[np.isfinite(y)], y[np.isfinite(y)]
-    floor = 1e-12 * np.sqrt(np.mean(np.square(y))) + 1e-300
-    return np.asarray(max(np.sqrt(np.mean(np.square(r)) * freedom), floor), r.dtype)
-
-
-def log_likelihood(layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-    """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that is
-    not given."""
-    if not layout.filtered:
-        found = [
-            r[np.isfinite(np.asarray(flight.outputs[k]))]
-            for by_name, flight in zip(e.raw, data.flights, strict=True)
-            for k, r in by_name.items()
-        ]
-        return sum(-0.5 * r.size * float(np.log(2.0 * np.pi * np.mean(r**2)) + 1.0) for r in found)
-    n = residuals_count(data)
-    squares, logs = innovation_sums(e, noise)
-    for flight, sd in zip(data.flights, noise.sd, strict=True):
-        for k, y in flight.outputs.items():
-            logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
-    if layout.concentrated:
-        return float(-0.5 * (n * (1.0 + np.log(2.0 * np.pi * squares / n)) + logs))
-    return float(-0.5 * (squares + n * np.log(2.0 * np.pi) + logs))
-
-
-def noise_unknowns(layout: Layout) -> int:
-    """How many standard deviations of measurement noise are estimated beside z."""
-    if layout.filtered:
-        return int(layout.concentrated)
-    return sum(len(o) for o in layout.outputs)

@@ -16,6 +16,7 @@ from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
@@ -61,7 +62,7 @@ def by_windows(
 
 def _applies(problem: Problem) -> bool:
     return (
-        problem.method == "output-error"
+        estimator_of(problem.method).windows
         and problem.window is None
         and problem.nuisance.initial_state
         and not problem.nuisance.time_shift

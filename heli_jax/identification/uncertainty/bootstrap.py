@@ -2,19 +2,14 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax import naming
-from heli_jax.dynamics.model import correlation_of, spread_of
 from heli_jax.identification.estimation.levenberg_marquardt import optimise_many
-from heli_jax.identification.estimation.residual import driven, predict
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Reached, unpack, value_of
-from heli_jax.simulation.simulate import simulate
 
 _BATCH = 8
 
@@ -76,14 +71,10 @@ def _records(
 ) -> tuple[dict[str, Array], ...]:
     """By flight and output (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)
-    clean = None if at.layout.filtered else predict(at.layout, at.data, u)
+    noise_free = at.layout.estimator.records(at, u, runs, seed)
     records = []
-    for i, (flight, sds) in enumerate(zip(at.data.flights, at.noise.sd, strict=True)):
-        if clean is None:
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
-            moved = _disturbed(at, u, i, keys)
-        else:
-            moved = dict(zip(at.layout.outputs[i], clean[i].outputs, strict=True))
+    each = zip(at.data.flights, at.noise.sd, noise_free, strict=True)
+    for i, (flight, sds, outputs) in enumerate(each):
         if fit.coloured:
             residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
             coloured = drawn(np.stack(residuals), runs, rng)
@@ -93,39 +84,7 @@ def _records(
             noise = sd * rng.standard_normal((runs, y.shape[0]))
             if fit.coloured:
                 noise = coloured[:, at.layout.outputs[i].index(n)]
-            made = np.asarray(moved[n]) + float(u.biases[i][n]) + noise
+            made = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
             one[n] = jnp.asarray(np.where(np.isnan(np.asarray(y)), np.nan, made), at.z.dtype)
         records.append(one)
     return tuple(records)
-
-
-def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
-    """By name the outputs (runs, N) with a disturbance drawn for each key."""
-    flight, layout = at.data.flights[i], at.layout
-    params, inputs = driven(layout, at.data, u, i)
-    start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
-    names, random = naming.names(layout.model.State), layout.model.spread_names
-    sds = spread_of(layout.model, params, at.z.dtype)
-    # Factored without the sds, which may be zero.
-    correlation = correlation_of(layout.model, params, at.z.dtype)
-    factor = sds[:, None] * jnp.linalg.cholesky(correlation)
-
-    @jax.jit
-    def run(key: Array) -> Any:
-        first, second = jax.random.split(key)
-        drawn = jnp.sum(factor * jax.random.normal(first, (1, len(names)), at.z.dtype), axis=1)
-        values = {n: getattr(start, n) + drawn[names.index(n)] for n in random}
-        begin = naming.replace(start, **values)
-        return simulate(
-            layout.model,
-            params,
-            inputs,
-            dt=flight.dt,
-            initial_state=begin,
-            solver=layout.solver,
-            substeps=layout.substeps,
-            key=second,
-            hold=layout.hold(i),
-        ).outputs
-
-    return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))

@@ -136,18 +136,5 @@ def log_posterior(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
     """
     rows = rows_of(layout, data, noise, z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
-    rows = rows[: rows.shape[0] - rest.shape[0]]
-    beside = -0.5 * jnp.sum(rest**2)
-    if layout.filtered and not layout.concentrated:
-        return beside - 0.5 * jnp.sum(rows**2)
-    if layout.filtered:
-        counted = [jnp.isfinite(y) for f in data.flights for y in f.outputs.values()]
-        n = jnp.sum(jnp.concatenate(counted).astype(z.dtype))
-        return beside - 0.5 * n * jnp.log(jnp.sum(rows**2))
-    at = 0
-    for flight in data.flights:
-        for y in flight.outputs.values():
-            n = jnp.sum(jnp.isfinite(y).astype(z.dtype))
-            beside -= 0.5 * n * jnp.log(jnp.sum(rows[at : at + y.shape[0]] ** 2))
-            at += y.shape[0]
-    return beside
+    measured = layout.estimator.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
+    return measured - 0.5 * jnp.sum(rest**2)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import optimise_many, residuals_count
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count, optimise_many
 from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Reached, value_of
@@ -52,7 +52,7 @@ def _profile(at: Reached, name: str, points: int) -> Profile:
     inverse = np.linalg.pinv(np.asarray(e.J, np.float64), rcond=1e-10)
     along = inverse @ inverse[i]
     sd = float(np.sqrt(along[i]))
-    first = float(np.sum(np.asarray(e.r) ** 2)) / residuals_count(at.data)
+    first = float(np.sum(np.asarray(e.r) ** 2)) / measured_count(at.data)
     found = Profile(np.array([]), np.array([]), np.nan, np.nan)
     for reach in _WIDER:
         t = np.linspace(-reach, reach, points)
@@ -61,8 +61,8 @@ def _profile(at: Reached, name: str, points: int) -> Profile:
             at, lambda _: at.data, jnp.asarray(starts, at.z.dtype), jnp.zeros(points), hold=i
         )
         cost = np.where(ends.converged, ends.cost, np.nan)
-        n = residuals_count(at.data)
-        lost = n * (np.log(cost / first) if at.layout.concentrated else cost - first)
+        n = measured_count(at.data)
+        lost = at.layout.estimator.log_likelihood_lost(at.layout, cost, first, n)
         deviance = np.maximum(lost - min(0.0, np.nanmin(lost, initial=0.0)), 0.0)
         root = np.sign(t) * np.sqrt(deviance)
         low, high = (_crossing(root, starts[:, i], side * Z95) for side in (-1, 1))

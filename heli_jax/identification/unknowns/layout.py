@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
@@ -76,8 +77,8 @@ class Layout(eqx.Module):
     """parameters of the disturbance, estimated beside the others by filter error"""
     scaled: tuple[str, ...] = eqx.field(static=True)
     """filter error: outputs whose noise has an unknown factor of its own"""
-    filtered: bool = eqx.field(static=True)
-    """whether the residuals are a Kalman filter's innovations"""
+    estimator: Any = eqx.field(static=True)
+    """the method's `Estimator`, whose class stands above this module"""
     concentrated: bool = eqx.field(static=True)
     """filter error: whether a common factor of all noise is taken out of the likelihood"""
     solver: str | None = eqx.field(static=True)
@@ -179,13 +180,11 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
 
     `bounded` keeps the free parameters within their bounds by logit coordinates.
     """
-    filtering = problem.method == "filter-error"
+    estimator = estimator_of(problem.method)
+    scaled, concentrated = estimator.scaled_outputs(problem)
     how = coordinates.kind if bounded else coordinates.plain_kind
     nuisance = problem.nuisance
     exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
-    measured = tuple(sorted({n for f in problem.training for n in f.outputs}))
-    unknown = filtering and "sigma_y" not in problem.fixed_noise
-    concentrated = unknown and "sigma_w" not in problem.fixed_noise
     return Layout(
         model=problem.model,
         free=tuple(problem.free),
@@ -197,8 +196,8 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         offsets=offset_inputs(problem),
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
         noise=tuple(problem.noise),
-        scaled=measured[concentrated:] if unknown else (),
-        filtered=filtering,
+        scaled=scaled,
+        estimator=estimator,
         concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,

@@ -25,6 +25,7 @@ from heli_jax.analysis.linear import modes
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.validation.metrics import (
     Metrics,
@@ -326,7 +327,7 @@ def _advice(
     inputs, which all outputs share.
     """
     name, ways = one.output, []
-    plain = problem.method == "output-error"
+    plain = not estimator_of(problem.method).process_noise
     i = max(
         (i for i, r in enumerate(records) if name in r.measured),
         key=lambda i: records[i].measured[name].size,

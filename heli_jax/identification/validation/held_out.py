@@ -48,7 +48,7 @@ def validate(
         begin = start_vector(other, data, problem)[layout.weak :]
     full = jnp.concatenate([z[: layout.weak], begin])
     theirs = first_noise(problem, held)
-    if layout.filtered:
+    if layout.estimator.shared_noise:
         known = {n: s for one in noise.sd for n, s in one.items()}
         sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
         theirs = theirs._replace(sd=sd)

@@ -1,0 +1,66 @@
+"""Output error: the simulation against what was measured, (measured - bias - simulated) / sd.
+
+Maximum likelihood where the measurement noise is white and nothing disturbs the machine (Maine and
+Iliff, 1985; Jategaonkar, 2006, chapter 4). With windows (multiple shooting; Bock, 1983) also the
+defects between them.
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from heli_jax.identification.estimation.estimator import (
+    Estimator,
+    Residuals,
+    joined_biases,
+    measured_signals,
+    signal_numbers,
+)
+from heli_jax.identification.estimation.simulated_flights import Run, predict
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, Unknowns
+
+
+class OutputError(Estimator):
+    """The simulation, driven by the logged inputs alone, against the measured outputs."""
+
+    windows = True
+
+    def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
+        """Signal after signal; with windows what the states jump between them follows."""
+        runs = predict(layout, data, u)
+        y, sd = measured_signals(layout, data, noise)
+        simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
+        error = y - joined_biases(u)[signal_numbers(layout, data)] - simulated
+        # A missing sample says nothing: its row is zero, and so is its derivative.
+        rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd
+        return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
+
+    def records(self, reached: Reached, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
+        """The simulated flights: with no disturbance all runs are the same."""
+        layout = reached.layout
+        simulated = predict(layout, reached.data, u)
+        return [
+            dict(zip(names, run.outputs, strict=True))
+            for names, run in zip(layout.outputs, simulated, strict=True)
+        ]
+
+
+def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> list[Array]:
+    """By flight the defects of multiple shooting: the jumps of the states between windows over
+    their sd, window by window."""
+    rows = []
+    for flight, run, begun in zip(data.flights, runs, u.states, strict=True):
+        if layout.continuity is None or run.ends is None:
+            continue
+        # The scale is ten times what the state does.
+        jumps = [
+            (getattr(run.ends, n)[:-1] - getattr(begun, n)[1:])
+            / (0.1 * layout.continuity * flight.state_scale[n])
+            for n in layout.states
+        ]
+        rows.append(jnp.stack(jumps, axis=1).reshape(-1))
+    return rows
+
+
+ESTIMATOR = OutputError()

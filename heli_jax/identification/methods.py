@@ -1,0 +1,44 @@
+"""The methods of estimation by name: the one place where a new one is entered.
+
+A method is an `Estimator` (`estimation/estimator.py`) in a file of its own. Entries name it by
+module and object, so that a problem can be stated before anything that solves it is imported.
+"""
+
+import importlib
+from typing import Any, NamedTuple
+
+from heli_jax.errors import nearest
+
+
+class Method(NamedTuple):
+    """One way to estimate."""
+
+    home: str
+    """`module:object` of its Estimator"""
+    label: str
+    """as reports call it"""
+
+
+_ESTIMATION = "heli_jax.identification.estimation"
+
+METHODS = {
+    "output-error": Method(f"{_ESTIMATION}.output_error:ESTIMATOR", "output error"),
+    "filter-error": Method(f"{_ESTIMATION}.filter_error:ESTIMATOR", "filter error"),
+}
+
+
+def estimator_of(method: str) -> Any:
+    """The Estimator of a method.
+
+    Typed Any since its class stands above this module in the order of imports.
+
+    Raises:
+        ValueError: there is no such method.
+    """
+    if method not in METHODS:
+        raise ValueError(
+            f"method: expected one of {', '.join(METHODS)}, got {method!r:.60}"
+            f"{nearest(str(method)[:60], METHODS)}"
+        )
+    module, _, name = METHODS[method].home.partition(":")
+    return getattr(importlib.import_module(module), name)
