@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
@@ -71,87 +70,120 @@ def noise_by_name(
     }
 
 
+class _Uncertainty(NamedTuple):
+    """How sure the numbers at the optimum are."""
+
+    verdict: Verdict
+    wider: np.ndarray
+    """(q,) by how much autocorrelated residuals widen the standard deviations of the unknowns"""
+    quantiles: np.ndarray
+    """(q,) standard deviations that a 95 % interval reaches to either side"""
+    coloured: bool
+    """whether the intervals allow for residuals that are not white"""
+
+
+def _uncertainty(
+    problem: Problem, search: Search, settled: Settled, e: Evaluation, ran: Ran, white: bool
+) -> _Uncertainty:
+    """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
+    estimated, the sandwich.
+
+    Args:
+        e: at the optimum.
+        white: whether the residuals are white and independent between outputs.
+    """
+    layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
+    usable = bool(np.all(np.isfinite(e.J)))
+    verdict = verdict_of(problem, layout, e) if usable else ran.before
+    freedom = max(measured_count(data) - layout.determined, 1)
+    quantile = float(scipy.special.stdtrit(freedom, 0.975))
+    quantiles = np.full(layout.size, quantile)
+    estimator = layout.estimator
+    white = white and estimator.rows_are_white
+    if white or not (usable and estimator.rows_are_samples):
+        return _Uncertainty(verdict, np.ones(layout.size), quantiles, False)
+    errors = sandwich(layout, data, e, residual_curvature(layout, data, noise, best.z))
+    quantiles = np.maximum(errors.quantile(), quantile)
+    # The rule of the factor of ten has to see the intervals that are reported.
+    verdict = verdict_of(problem, layout, e, _reported(errors, layout, e, quantiles))
+    verdict = _widened(verdict, errors, _along(verdict, layout, e))
+    return _Uncertainty(verdict, errors.inflation(), quantiles, True)
+
+
+class _HeldOut(NamedTuple):
+    """The flights held out, predicted."""
+
+    signals: tuple[Signals, ...] = ()
+    free_run: tuple[Signals, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def _held_out(problem: Problem, search: Search, settled: Settled) -> _HeldOut:
+    flights = tuple(f for f in problem.flights if f.hold_out)
+    if not flights:
+        return _HeldOut()
+    checked = validate(problem, search.layout, settled.best.z, settled.noise, flights)
+    free_run = _free_run(flights, checked.free_run)
+    return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
+
+
 def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fit:
     """All that a fit says, from where the optimiser ended."""
     layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
     e = evaluate(layout, data, noise, best.z)
-    usable = bool(np.all(np.isfinite(e.J)))
-    verdict = verdict_of(problem, layout, e) if usable else ran.before
-    n = measured_count(data)
-    quantile = float(scipy.special.stdtrit(max(n - layout.determined, 1), 0.975))
     signals = signals_of(e, problem.training)
     white = _whiteness(signals, e)
     together = correlated_residuals(signals)
-    coloured = usable and layout.estimator.rows_are_samples
-    coloured = coloured and (bool(together) or not all(w.white for w in white.values()))
-    wider, quantiles = np.ones(layout.size), np.full(layout.size, quantile)
-    if coloured:
-        curvature = residual_curvature(layout, data, noise, best.z)
-        errors = sandwich(layout, data, e, curvature)
-        wider, quantiles = errors.inflation(), np.maximum(errors.quantile(), quantile)
-        verdict = verdict_of(problem, layout, e, _reported(errors, layout, e, quantiles))
-        verdict = _widened(verdict, errors, _along(verdict, layout, e))
-    named = estimates_of(problem, layout, e, verdict, quantiles, wider)
+    all_white = not together and all(w.white for w in white.values())
+    sure = _uncertainty(problem, search, settled, e, ran, all_white)
+    named = estimates_of(problem, layout, e, sure.verdict, sure.quantiles, sure.wider)
     estimates = {k: named[k] for k in layout.free}
     nuisance = {k: v for k, v in named.items() if k not in layout.free}
-    nuisance |= flight_nuisances(problem, layout, data, best.z, e, quantiles, wider)
+    nuisance |= flight_nuisances(problem, layout, data, best.z, e, sure.quantiles, sure.wider)
     none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
     if none:
         nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
-    held = tuple(f for f in problem.flights if f.hold_out)
-    checked = validate(problem, layout, best.z, noise, held) if held else None
-    validation = signals_of(checked.e, held) if checked else ()
-    free_run = _free_run(held, checked.free_run) if checked else ()
+    held = _held_out(problem, search, settled)
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
-    dtype = jnp.result_type(float)
-    values = jax.device_put({k: np.asarray(v.value, dtype) for k, v in estimates.items()})
-    # A disturbance that does not show is not among what was estimated.
-    unknowns = layout.determined + layout.estimator.noise_unknowns(layout)
-    unknowns -= len(layout.noise) if none else 0
-    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
     params = naming.replace(problem.vehicle, **values)
     against = None
     if not none:
         against = layout.estimator.against_expected(layout, data, noise, e, best.z)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = [
-        *_stopped_notes(layout, best, settled),
-        *excitation.sampling(problem, reached),
-        *_disturbance_notes(settled.ratio if none else None),
-        *([] if none else extreme_noise_notes(layout, data, best.z)),
-        *settled.notes,
-        *layout.estimator.notes(layout, data, noise, e, ill),
+        *_notes(problem, search, settled, e, none=none, ill=ill),
         *stated_noise_notes(problem, sds),
-        *_correlation_notes(together if coloured else {}),
+        *_correlation_notes(together if sure.coloured else {}),
         *bound_notes(named),
         *prior_notes(problem, estimates),
         *_hold_notes(problem, search, settled, e, named),
         *adequacy.sentences,
-        *(checked.notes if checked else ()),
+        *held.notes,
     ]
     return Fit(
         model=problem.model.name,
         method=problem.method,
-        status=_status(best, usable and not ill, verdict),
-        n_samples=n,
+        status=_status(best, bool(np.all(np.isfinite(e.J))) and not ill, sure.verdict),
+        n_samples=measured_count(data),
         estimates=estimates,
         nuisance=nuisance,
         params=params,
         verdict_before=ran.before,
-        verdict=verdict,
+        verdict=sure.verdict,
         noise=sds,
         log_likelihood=layout.estimator.log_likelihood(layout, data, noise, e),
-        unknowns=unknowns,
-        signals=(*signals, *validation),
+        unknowns=_unknowns(layout, none=none),
+        signals=(*signals, *held.signals),
         metrics=_pooled(signals),
-        validation=_pooled(validation),
-        validation_free_run=_pooled(free_run),
+        validation=_pooled(held.signals),
+        validation_free_run=_pooled(held.free_run),
         one_step=_pooled(signals, one_step=True),
-        one_step_validation=_pooled(validation, one_step=True),
+        one_step_validation=_pooled(held.signals, one_step=True),
         whiteness=white,
         adequacy=adequacy,
-        coloured=coloured,
+        coloured=sure.coloured,
         starts=table(layout, data, ran.points, ran.runs),
         steps=sum(s for s, _ in settled.trace),
         trace=settled.trace,
@@ -160,6 +192,34 @@ def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fi
         seed=ran.seed,
         timing=ran.timing,
     )
+
+
+def _unknowns(layout: Layout, *, none: bool) -> int:
+    """All that was estimated; a disturbance that does not show is not among it."""
+    estimated = layout.determined + layout.estimator.noise_unknowns(layout)
+    return estimated - (len(layout.noise) if none else 0)
+
+
+def _notes(
+    problem: Problem, search: Search, settled: Settled, e: Evaluation, *, none: bool, ill: bool
+) -> list[str]:
+    """Of the optimum and of what the method takes for granted.
+
+    Args:
+        e: at the optimum.
+        none: whether no disturbance shows.
+        ill: whether the numbers are rounding.
+    """
+    layout, data, best = search.layout, search.data, settled.best
+    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    return [
+        *_stopped_notes(layout, best, settled),
+        *excitation.sampling(problem, reached),
+        *_disturbance_notes(settled.ratio if none else None),
+        *([] if none else extreme_noise_notes(layout, data, best.z)),
+        *settled.notes,
+        *layout.estimator.notes(layout, data, settled.noise, e, ill),
+    ]
 
 
 def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.methods import METHODS
 from heli_jax.identification.unknowns.layout import Reached
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
@@ -116,6 +117,11 @@ class Fit:
     """whether `sd` and the intervals allow for residuals with a memory (output error)"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def method_label(self) -> str:
+        """The method as reports call it."""
+        return METHODS[self.method].label
 
     @property
     def lost(self) -> tuple[str, ...]:

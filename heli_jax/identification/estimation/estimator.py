@@ -63,6 +63,8 @@ class Estimator(abc.ABC):
     rows_are_samples: ClassVar[bool] = True
     """whether the first rows are the samples in time of every signal, flight after flight and
     output after output: then their autocorrelation can be allowed for"""
+    rows_are_white: ClassVar[bool] = True
+    """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
 
