@@ -10,12 +10,12 @@ from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import (
-    NO_DISTURBANCE,
-    Settled,
+    RelaxedOptimum,
 )
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Z95, Verdict
@@ -83,7 +83,7 @@ class _Uncertainty(NamedTuple):
 
 
 def _uncertainty(
-    problem: Problem, search: Search, settled: Settled, e: Evaluation, ran: Ran, white: bool
+    problem: Problem, search: Search, settled: RelaxedOptimum, e: Evaluation, ran: Ran, white: bool
 ) -> _Uncertainty:
     """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
     estimated, the sandwich.
@@ -118,7 +118,7 @@ class _HeldOut(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def _held_out(problem: Problem, search: Search, settled: Settled) -> _HeldOut:
+def _held_out(problem: Problem, search: Search, settled: RelaxedOptimum) -> _HeldOut:
     flights = tuple(f for f in problem.flights if f.hold_out)
     if not flights:
         return _HeldOut()
@@ -127,7 +127,7 @@ def _held_out(problem: Problem, search: Search, settled: Settled) -> _HeldOut:
     return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
 
 
-def assemble(problem: Problem, search: Search, settled: Settled, ran: Ran) -> Fit:
+def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran) -> Fit:
     """All that a fit says, from where the optimiser ended."""
     layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
     e = evaluate(layout, data, noise, best.z)
@@ -201,7 +201,13 @@ def _unknowns(layout: Layout, *, none: bool) -> int:
 
 
 def _notes(
-    problem: Problem, search: Search, settled: Settled, e: Evaluation, *, none: bool, ill: bool
+    problem: Problem,
+    search: Search,
+    settled: RelaxedOptimum,
+    e: Evaluation,
+    *,
+    none: bool,
+    ill: bool,
 ) -> list[str]:
     """Of the optimum and of what the method takes for granted.
 
@@ -274,7 +280,11 @@ def _absent(name: str, one: Estimate) -> Estimate:
 
 
 def _hold_notes(
-    problem: Problem, search: Search, settled: Settled, e: Evaluation, named: dict[str, Estimate]
+    problem: Problem,
+    search: Search,
+    settled: RelaxedOptimum,
+    e: Evaluation,
+    named: dict[str, Estimate],
 ) -> list[str]:
     """Where the log let inputs be taken as linear between samples, and it matters."""
     if not bool(settled.best.converged):
@@ -341,7 +351,7 @@ def _disturbance_notes(ratio: float | None) -> list[str]:
     ]
 
 
-def _stopped_notes(layout: Layout, best: Optimum, settled: Settled) -> list[str]:
+def _stopped_notes(layout: Layout, best: Optimum, settled: RelaxedOptimum) -> list[str]:
     """What to do where the optimiser has not arrived."""
     if bool(best.converged):
         return []

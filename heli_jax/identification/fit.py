@@ -8,13 +8,13 @@ from jaxtyping import Array
 from heli_jax.identification.assemble import Ran, assemble, noise_by_name, signals_of
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.estimation.noise_covariance import (
-    disturbance_or_none,
+    better_of_two_guesses,
     first_noise,
-    second_guess,
-    settle,
+    relax_noise_covariance,
 )
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.identifiability.sensitivity import verdict_of
@@ -119,9 +119,9 @@ def fit(
     other = by_windows(problem, search, begin.noise, begin.e, begin.z, best)
     if other is not None:
         best, said = other, (SAID,)
-    settled = settle(search, begin.noise, best)
+    settled = relax_noise_covariance(search, begin.noise, best)
     settled = settled._replace(notes=(*said, *settled.notes))
-    settled = second_guess(search, points, settled, problem.training)
+    settled = better_of_two_guesses(search, points, settled, problem.training)
     search.max_steps = max_steps
     if asked:
         settled = disturbance_or_none(search, settled)

@@ -9,7 +9,7 @@ from heli_jax import Flight, Free, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.noise_covariance import first_noise, levelled
+from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.problem import Nuisance
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
@@ -96,7 +96,7 @@ def test_the_rows_hold_fishers_information(bench30, fixed):
         )
         layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
         noise, z = first_noise(problem, problem.training), start_vector(layout, data, problem)
-        noise = levelled(data, evaluate(layout, data, noise, z), noise)
+        noise = layout.estimator.with_level(data, evaluate(layout, data, noise, z), noise)
         J = evaluate(layout, data, noise, z).J
         found.append(J.T @ J)
     wanted = information(u, truth, "sigma_y" not in fixed)

@@ -7,14 +7,13 @@ import pytest
 from heli_jax import Free, Problem, fit, models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import (
-    Settled,
-    disturbance_or_none,
+    RelaxedOptimum,
     first_noise,
-    log_likelihood,
 )
 from heli_jax.identification.uncertainty.estimates import extreme_noise_notes
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -90,11 +89,11 @@ def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
     z = start_vector(layout, data, one)
     z = z.at[0].add(2.0).at[layout.noise_at("sigma_w")].set(-25.0)
     z = z.at[layout.noise_at("tau_w")].set(-7.0)
-    found = Settled(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
+    found = RelaxedOptimum(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
     search = Search(one, layout, data, 200)
     settled = disturbance_or_none(search, found)
     e = evaluate(layout, data, settled.noise, settled.best.z)
     best = fit(one)
-    reached = log_likelihood(layout, data, settled.noise, e)
+    reached = layout.estimator.log_likelihood(layout, data, settled.noise, e)
     assert reached == pytest.approx(best.log_likelihood, abs=2.0)
     assert any("begun anew" in note for note in settled.notes)

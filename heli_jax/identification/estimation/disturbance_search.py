@@ -1,0 +1,161 @@
+"""Whether there is a disturbance, and the optimum with or without it."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.estimator import Evaluation, measured_count
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain, noise_guess_at
+from heli_jax.identification.estimation.noise_covariance import (
+    RelaxedOptimum,
+    log_likelihood_of,
+    relaxed_from,
+)
+from heli_jax.identification.unknowns.layout import Layout, Noise, noise_limits
+
+NO_DISTURBANCE = 2.71
+"""twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
+a boundary, where half of the chi-squared with one degree of freedom holds (Self and Liang, 1987)"""
+_SURE = 0.4
+"""sd of log sigma_w below which nobody need ask whether there is a disturbance"""
+_NONE = 30.0
+"""so far below the log of the smallest noise there is no disturbance"""
+
+
+def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
+    """The optimum with the disturbance where it is significant, else without one.
+
+    Where sigma_w goes to zero, tau_w means nothing and the optimiser has no end to come to; the
+    same residuals with sigma_w all but zero are those of output error. That model is nested in the
+    one with a disturbance: a search that ends below its likelihood is begun anew from its optimum.
+    """
+    layout, data = search.layout, search.data
+    e = evaluate(layout, data, optimum.noise, optimum.best.z)
+    if _sure(layout, optimum, e) and _far_better(search, optimum, e):
+        return optimum
+    none = without_disturbance(search, optimum)
+    alone = evaluate(layout, data, none.noise, none.best.z)
+    if bool(np.isfinite(alone.r).all()) and not _corrects(alone, none.noise):
+        without = log_likelihood_of(search, none)
+        ratio = 2.0 * (log_likelihood_of(search, optimum) - without)
+        if not ratio > NO_DISTURBANCE:
+            optimum, ratio = _from_nested(search, optimum, ratio, none, without)
+        if bool(none.best.converged) and not ratio > NO_DISTURBANCE:
+            return none._replace(trace=optimum.trace, ratio=ratio)
+        optimum = optimum._replace(ratio=ratio)
+    if not bool(optimum.best.converged):
+        # The search was cut short before it was known that there is something to find.
+        optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
+    return _off_the_limit(search, optimum)
+
+
+def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
+    """Where the correlation time ran to an end of what a record can show, the better of that and of
+    a search begun anew with the disturbance at its start: white noise is a local optimum of short
+    records."""
+    layout, data = search.layout, search.data
+    if "tau_w" not in layout.noise:
+        return optimum
+    low, high = (float(v) for v in noise_limits(data)["tau_w"])
+    if low < float(optimum.best.z[layout.noise_at("tau_w")]) < high:
+        return optimum
+    z = with_noise_guess(search, optimum)
+    at_guess = evaluate(layout, data, optimum.noise, z)
+    noise = layout.estimator.with_level(data, at_guess, optimum.noise)
+    again = relaxed_from(search, noise, z)
+    gained = log_likelihood_of(search, again) > log_likelihood_of(search, optimum)
+    return again.after(optimum) if bool(again.best.converged) and gained else optimum
+
+
+def _sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation) -> bool:
+    """Whether a disturbance was found and all of it is determined."""
+    if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
+        return False
+    at = len(layout.named)
+    sds = deviations(e.J)
+    known = np.isfinite(sds[at : at + len(layout.noise)]).all()
+    return bool(known and sds[layout.noise_at("sigma_w")] < _SURE)
+
+
+def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
+    """Whether nobody need optimise without a disturbance to see that it would fit worse.
+
+    One evaluation at the same parameters, and the gain of the Gauss-Newton step from there.
+
+    Args:
+        e: at the optimum.
+    """
+    layout, data, noise = search.layout, search.data, optimum.noise
+    alone = evaluate(layout, data, noise, _silenced(search, optimum))
+    gained = gauss_newton_gain(alone.r, alone.J)
+    if not np.isfinite(gained):
+        return False
+    n = measured_count(data)
+    before = float(np.sum(np.square(np.asarray(alone.r, np.float64))))
+    after = max(before - gained, 1e-300)
+    gain = 0.5 * float(layout.estimator.log_likelihood_lost(layout, before / n, after / n, n))
+    without = layout.estimator.log_likelihood(layout, data, noise, alone) + gain
+    return bool(layout.estimator.log_likelihood(layout, data, noise, e) - without > n)
+
+
+def _from_nested(
+    search: Search, optimum: RelaxedOptimum, ratio: float, none: RelaxedOptimum, without: float
+) -> tuple[RelaxedOptimum, float]:
+    """The better of an optimum and of a search from that without disturbance, and its ratio.
+
+    Args:
+        ratio: twice the log-likelihood that `optimum` gains over `none`.
+        without: the log-likelihood of `none`.
+    """
+    layout, data = search.layout, search.data
+    z = with_noise_guess(search, none)
+    guess = evaluate(layout, data, none.noise, z)
+    noise = layout.estimator.with_level(data, guess, none.noise)
+    with_guess = layout.estimator.log_likelihood(layout, data, noise, guess)
+    promising = with_guess > without + NO_DISTURBANCE
+    if not (promising or ratio < -NO_DISTURBANCE or not np.isfinite(ratio)):
+        return optimum, ratio
+    again = relaxed_from(search, noise, z)
+    other = 2.0 * (log_likelihood_of(search, again) - without)
+    if not np.isfinite(other) or other <= ratio:
+        return optimum, ratio
+    notes = ()
+    if other > NO_DISTURBANCE:
+        notes = (
+            "The first search ended in a worse optimum, below what the model without a disturbance "
+            "reaches: this fit was begun anew from that model's parameters.",
+        )
+    return again._replace(trace=(*optimum.trace, *again.trace), notes=notes), other
+
+
+def with_noise_guess(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
+    """z at the parameters of an optimum, the disturbance from a coarse search."""
+    layout, at = search.layout, len(search.layout.named)
+    starts = [np.log(search.problem.noise[n].start) for n in layout.noise]
+    z = optimum.best.z
+    z = z.at[at : at + len(starts)].set(jnp.asarray(starts, z.dtype))
+    return noise_guess_at(layout, search.data, optimum.noise, z)
+
+
+def _corrects(e: Evaluation, noise: Noise) -> bool:
+    """Whether the filter corrects its state even where there is no disturbance.
+
+    It does in an unstable model, whose error grows from nothing: that is no output error.
+    """
+    return any(
+        float(np.nanmax(s / sd[n] ** 2)) > 1.01
+        for one, sd in zip(e.innovations, noise.sd, strict=True)
+        for n, s in one.variance.items()
+    )
+
+
+def without_disturbance(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
+    """The optimum with a sigma_w that is all but zero."""
+    return relaxed_from(search, optimum.noise, _silenced(search, optimum))
+
+
+def _silenced(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
+    at = search.layout.noise_at("sigma_w")
+    smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
+    return optimum.best.z.at[at].set(np.log(smallest) - _NONE)
