@@ -104,7 +104,7 @@ def test_imports_point_one_way(name):
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
     "methods", "problem", "unknowns", "estimation", "identifiability", "validation",
-    "equation_error", "result", "uncertainty", "assemble", "fit", "model_selection",
+    "equation_error", "result", "uncertainty", "agreement", "assemble", "fit", "model_selection",
 )  # fmt: skip
 
 

@@ -9,7 +9,13 @@ import scipy.special
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.flights.flight import Flight
+from heli_jax.identification.agreement import (
+    correlated_residuals,
+    free_runs,
+    pooled_metrics,
+    signals_of,
+    whiteness_of,
+)
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
@@ -37,14 +43,11 @@ from heli_jax.identification.uncertainty.estimates import (
 from heli_jax.identification.unknowns.layout import Layout, Noise, Reached, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
-from heli_jax.identification.validation.adequacy import Adequacy, Record, assess
+from heli_jax.identification.validation.adequacy import Adequacy, assess
+from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import (
-    NO_METRICS,
-    Metrics,
     Whiteness,
-    metrics,
-    whiteness,
 )
 from heli_jax.identification.validation.other_hold import other_hold
 
@@ -123,7 +126,7 @@ def _held_out(problem: Problem, search: Search, settled: RelaxedOptimum) -> _Hel
     if not flights:
         return _HeldOut()
     checked = validate(problem, search.layout, settled.best.z, settled.noise, flights)
-    free_run = _free_run(flights, checked.free_run)
+    free_run = free_runs(flights, checked.free_run)
     return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
 
 
@@ -132,7 +135,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
     layout, data, best, noise = search.layout, search.data, settled.best, settled.noise
     e = evaluate(layout, data, noise, best.z)
     signals = signals_of(e, problem.training)
-    white = _whiteness(signals, e)
+    white = whiteness_of(signals, e)
     together = correlated_residuals(signals)
     all_white = not together and all(w.white for w in white.values())
     sure = _uncertainty(problem, search, settled, e, ran, all_white)
@@ -176,11 +179,11 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
         log_likelihood=layout.estimator.log_likelihood(layout, data, noise, e),
         unknowns=_unknowns(layout, none=none),
         signals=(*signals, *held.signals),
-        metrics=_pooled(signals),
-        validation=_pooled(held.signals),
-        validation_free_run=_pooled(held.free_run),
-        one_step=_pooled(signals, one_step=True),
-        one_step_validation=_pooled(held.signals, one_step=True),
+        metrics=pooled_metrics(signals),
+        validation=pooled_metrics(held.signals),
+        validation_free_run=pooled_metrics(held.free_run),
+        one_step=pooled_metrics(signals, one_step=True),
+        one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=white,
         adequacy=adequacy,
         coloured=sure.coloured,
@@ -294,32 +297,6 @@ def _hold_notes(
     return other_hold(problem, *at, e, sd, in_doubt=True)
 
 
-_SURELY_CORRELATED = 4.5
-"""standard deviations from zero at which two residuals are taken for correlated"""
-_WORTH_IT = 0.1
-
-
-def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
-    """By 'output and output, flight' the correlation of residuals that are not independent.
-
-    White residuals of two outputs that go together count one piece of news twice.
-    """
-    found = {}
-    for s in signals:
-        names = list(s.measured)
-        for i, a in enumerate(names):
-            for b in names[:i]:
-                x, y = s.residual(a), s.residual(b)
-                seen = np.isfinite(x) & np.isfinite(y)
-                n = int(seen.sum())
-                if n < 8 or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
-                    continue
-                rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
-                if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
-                    found[f"{b} and {a}, {s.flight}"] = rho
-    return found
-
-
 def _correlation_notes(together: dict[str, float]) -> list[str]:
     if not together:
         return []
@@ -339,7 +316,7 @@ def _adequacy(
         Record(s.flight, flight.dt, s.measured, s.simulated)
         for s, flight in zip(signals, problem.training, strict=True)
     )
-    return assess(problem, params, records, _pooled(signals), white, against, unknowns)
+    return assess(problem, params, records, pooled_metrics(signals), white, against, unknowns)
 
 
 def _disturbance_notes(ratio: float | None) -> list[str]:
@@ -367,61 +344,3 @@ def _stopped_notes(layout: Layout, best: Optimum, settled: RelaxedOptimum) -> li
         f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
         f"Remedy: {remedy}."
     ]
-
-
-def _whiteness(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
-    """Of the innovations where there are some, else of the residuals."""
-    if e.innovations:
-        errors = {
-            f"{s.flight}/{n}": error / np.sqrt(one.variance[n])
-            for s, one in zip(signals, e.innovations, strict=True)
-            for n, error in one.error.items()
-        }
-    else:
-        errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
-    return {name: whiteness(error, len(errors)) for name, error in errors.items()}
-
-
-def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
-    """Measured and simulated signals; what is simulated carries the bias."""
-    errors = [one.error for one in e.innovations] or [None] * len(flights)
-    return tuple(
-        Signals(
-            label,
-            f.hold_out,
-            f.times,
-            dict(f.inputs),
-            dict(f.outputs),
-            {n: np.asarray(v) for n, v in by_name.items()},
-            error,
-        )
-        for label, f, by_name, error in zip(
-            labels(flights), flights, e.simulated, errors, strict=True
-        )
-    )
-
-
-def _free_run(
-    flights: tuple[Flight, ...], runs: tuple[dict[str, np.ndarray], ...] | None
-) -> tuple[Signals, ...]:
-    """The flights held out as simulated in one piece."""
-    return tuple(
-        Signals(label, f.hold_out, f.times, dict(f.inputs), dict(f.outputs), run)
-        for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
-    )
-
-
-def _pooled(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
-    """Metrics by output over all the flights that have it; of one-step predictions none without
-    innovations."""
-    if one_step:
-        signals = tuple(s for s in signals if s.innovations is not None)
-    outputs = sorted({n for s in signals for n in s.measured})
-    pooled = {}
-    for n in outputs:
-        have = [s for s in signals if n in s.measured]
-        measured = np.concatenate([s.measured[n] for s in have])
-        model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
-        finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
-        pooled[n] = metrics(measured, model) if finite else NO_METRICS
-    return pooled

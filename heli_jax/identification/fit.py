@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
-from heli_jax.identification.assemble import Ran, assemble, noise_by_name, signals_of
+from heli_jax.identification.agreement import signals_of
+from heli_jax.identification.assemble import Ran, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none

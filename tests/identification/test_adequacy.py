@@ -9,7 +9,8 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, cli, fit, models
-from heli_jax.identification.validation.adequacy import Record, assess
+from heli_jax.identification.validation.adequacy import assess
+from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.metrics import metrics, whiteness
 from tests.identification.bench import BENCH, vehicle
 from tests.identification.test_filter_error import FREE, made

@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.simulated_flights import simulated_at
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -16,7 +16,6 @@ from heli_jax.identification.unknowns.layout import (
     Data,
     FlightData,
     Layout,
-    Noise,
     layout_of,
 )
 
@@ -82,11 +81,14 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     The run is brought to the size of the measured outputs first, since a gain may be unknown.
     """
     z = start_vector(layout, data, problem)
-    one = np.ones((), z.dtype)
-    sd = tuple(dict.fromkeys(flight.outputs, one) for flight in data.flights)
-    e = evaluate(layout, data, Noise(sd, np.zeros((), z.dtype)), z)
+    at_start = jax.device_get(simulated_at(layout, data, z))
+    bias = iter(at_start.biases)
+    simulated = [
+        {n: y + next(bias) for n, y in zip(names, run, strict=True)}
+        for run, names in zip(at_start.outputs, layout.outputs, strict=True)
+    ]
     scaled, names = [], naming.names(layout.model.State)
-    for flight, runs, rms in zip(data.flights, e.simulated, e.state_rms, strict=True):
+    for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
         y = {n: v[np.isfinite(v)] for n, v in y.items()}
         ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))

@@ -196,11 +196,6 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
     return y, sd[signal_numbers(layout, data)]
 
 
-def joined_biases(u: Unknowns) -> Array:
-    """The biases, flight after flight and output after output."""
-    return jnp.stack([b for bias in u.biases for b in bias.values()])
-
-
 def measured_count(data: Data) -> int:
     """How many measured numbers there are."""
     return sum(

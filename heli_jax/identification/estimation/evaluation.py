@@ -8,8 +8,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import slopes
-from heli_jax.identification.estimation.residual import Shown, shown_of
-from heli_jax.identification.estimation.simulated_flights import predict
+from heli_jax.identification.estimation.simulated_flights import simulated_at
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
 _TAKES_PART = 1e-3
@@ -19,7 +18,7 @@ _TAKES_PART = 1e-3
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
     """The slopes, the simulation, and the named unknowns."""
     at = slopes(layout, data, noise, z)
-    shown = _shown(layout, data, z) if at.shown is None else at.shown
+    shown = simulated_at(layout, data, z) if at.shown is None else at.shown
     found = jax.device_get((shown, at.innovations, at.r, at.J, *_named(layout, data, z)))
     (outputs, biases, rms), *rest = found
     bias = iter(biases)
@@ -38,18 +37,12 @@ def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
     """By flight and output the simulation (N,) with the bias, SI."""
-    outputs, biases, _ = jax.device_get(_shown(layout, data, z))
+    outputs, biases, _ = jax.device_get(simulated_at(layout, data, z))
     bias = iter(biases)
     return tuple(
         {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
         for run, names in zip(outputs, layout.outputs, strict=True)
     )
-
-
-@eqx.filter_jit
-def _shown(layout: Layout, data: Data, z: Array) -> Shown:
-    u = unpack(layout, data, z)
-    return shown_of(u, predict(layout, data, u))
 
 
 @eqx.filter_jit

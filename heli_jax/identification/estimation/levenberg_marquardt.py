@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.estimation.estimator import measured_count
-from heli_jax.identification.estimation.residual import Slopes, differentiate
+from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached
 
 
@@ -225,7 +225,7 @@ class _Loop(NamedTuple):
     k: Array
     units: _Scaling
     state: _State
-    last: Slopes
+    last: ResidualAndJacobian
     """of the last point that was tried"""
 
 
@@ -235,7 +235,7 @@ class _End(NamedTuple):
     z: Float[Array, " q"]
     level: Float[Array, ""]
     state: _State
-    last: Slopes
+    last: ResidualAndJacobian
 
 
 @eqx.filter_jit
@@ -267,7 +267,7 @@ def _at_once(
     return _End(_point(terms, end.state.xi), end.units.level, end.state, end.last)
 
 
-def slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
+def slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> ResidualAndJacobian:
     """`differentiate` by the program that the optimiser compiles as well."""
     if layout.estimator.one_program(layout):
         return _at_once(layout, data, noise, z, np.asarray(1)).last

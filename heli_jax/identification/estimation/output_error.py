@@ -13,11 +13,10 @@ from jaxtyping import Array
 from heli_jax.identification.estimation.estimator import (
     Estimator,
     Residuals,
-    joined_biases,
     measured_signals,
     signal_numbers,
 )
-from heli_jax.identification.estimation.simulated_flights import Run, predict
+from heli_jax.identification.estimation.simulated_flights import Run, joined_biases, predict
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, Unknowns
 
 

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.estimator import Residuals, joined_biases
+from heli_jax.identification.estimation.estimator import Residuals
 from heli_jax.identification.estimation.jacobian_coloring import seeded, spread_out
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.simulated_flights import Run
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
+from heli_jax.identification.estimation.simulated_flights import SimulatedOutputs, shown_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
 
 def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array, " r"]:
@@ -42,18 +42,7 @@ def rows_of(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> 
     return _all_rows(layout, data, noise, z)[0]
 
 
-class Shown(NamedTuple):
-    """What is simulated."""
-
-    outputs: tuple[Float[Array, "p N"], ...]
-    """by flight, SI, as `Layout.outputs` orders them, without the bias"""
-    biases: Float[Array, " s"]
-    """flight after flight and output after output"""
-    state_rms: Float[Array, "f n"]
-    """root mean square of each simulated state, by flight"""
-
-
-class Slopes(NamedTuple):
+class ResidualAndJacobian(NamedTuple):
     """Residuals and their derivative at one point."""
 
     r: Any
@@ -62,12 +51,14 @@ class Slopes(NamedTuple):
     """(n, q) derivative of r by z"""
     innovations: tuple[Innovations, ...]
     """by flight; none with output error"""
-    shown: Shown | None
+    shown: SimulatedOutputs | None
     """what output error simulates on its way"""
 
 
 @eqx.filter_jit
-def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Slopes:
+def differentiate(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> ResidualAndJacobian:
     """Residuals and their Jacobian in forward mode, in one pass."""
 
     def rows(z: Array) -> tuple[Array, Any]:
@@ -86,10 +77,4 @@ def differentiate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"
         r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
         J = spread_out(layout, data, J)
     shown = None if runs is None else shown_of(unpack(layout, data, z), runs)
-    return Slopes(r, J, innovations, shown)
-
-
-def shown_of(u: Unknowns, runs: tuple[Run, ...]) -> Shown:
-    """Of the simulated flights what is shown."""
-    rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
-    return Shown(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
+    return ResidualAndJacobian(r, J, innovations, shown)

@@ -3,13 +3,14 @@
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns
+from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 
@@ -21,6 +22,17 @@ def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> tuple[Any, Any]:
     inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
     return params, layout.model.Inputs(**inputs)
+
+
+class SimulatedOutputs(NamedTuple):
+    """What is simulated."""
+
+    outputs: tuple[Float[Array, "p N"], ...]
+    """by flight, SI, as `Layout.outputs` orders them, without the bias"""
+    biases: Float[Array, " s"]
+    """flight after flight and output after output"""
+    state_rms: Float[Array, "f n"]
+    """root mean square of each simulated state, by flight"""
 
 
 class Run(NamedTuple):
@@ -118,3 +130,21 @@ def _together(
         found[i] = Run(joined(x), joined(y[rows]), ends)
         first += count
     return found
+
+
+def joined_biases(u: Unknowns) -> Array:
+    """The biases, flight after flight and output after output."""
+    return jnp.stack([b for bias in u.biases for b in bias.values()])
+
+
+def shown_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
+    """Of the simulated flights what is shown."""
+    rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
+    return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
+
+
+@eqx.filter_jit
+def simulated_at(layout: Layout, data: Data, z: Array) -> SimulatedOutputs:
+    """What is simulated at z, without any derivative."""
+    u = unpack(layout, data, z)
+    return shown_of(u, predict(layout, data, u))

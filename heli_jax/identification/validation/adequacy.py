@@ -16,30 +16,26 @@ disturbance lets expect.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from heli_jax import naming
-from heli_jax.analysis.linear import modes
-from heli_jax.dynamics.disturbance import disturbable
-from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.noise_covariance import noise_guess
-from heli_jax.identification.methods import estimator_of
-from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.advice import (
+    FAR_FROM_WHITE,
+    Judged,
+    Record,
+    advice_for,
+    is_unstable,
+)
 from heli_jax.identification.validation.metrics import (
     Metrics,
     Whiteness,
     autocorrelation,
-    cross_correlation,
 )
-from heli_jax.identification.validation.operating_point import operating_point
-from heli_jax.simulation.simulate import simulate
 
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
-GATE = 0.9
-"""VAF that the acceptance card asks for: below it, with residuals not white, there is doubt"""
 NEARLY_WHITE = 0.1
 """share of the residual's variance that may be other than white noise where nothing else is left"""
 WORSE = -0.1
@@ -48,42 +44,10 @@ chance makes it a few hundredths negative"""
 EXPECTED = 9.0
 """power of the simulation's error over that which the disturbance lets expect: its square root is
 three standard deviations where the disturbance is so slow that the record holds one swing of it"""
-FAR_FROM_WHITE = 0.5
-"""autocorrelation of innovations at one sample beyond which the filter predicts badly; a
-disturbance with one pole too few leaves 0.1 to 0.3"""
-AGAINST = -0.3
-"""correlation below which a simulated output moves against the measured one"""
 _TURNED = -3.0
 """slope of the measured on the simulated output that no disturbance makes"""
 _FIVE_PERCENT = -1.645
 """of a standard normal distribution, to one side"""
-_DIVERGED = 10.0
-"""a simulation that leaves the measured range by this factor"""
-_GROWTH = 3.0
-"""an unstable mode that grows by e to this over the record"""
-
-
-class Judged(NamedTuple):
-    """One output: what was judged, and the numbers."""
-
-    output: str
-    adequate: bool
-    vaf: float
-    """of the simulation, over all fitted flights"""
-    explained: float
-    """share explained of what is not white noise"""
-    white: bool
-    """whether residuals (innovations) of all flights are white"""
-    lag1: float
-    """their largest autocorrelation at one sample"""
-    against_disturbance: float | None = None
-    """filter error: power of the simulation's error over that which disturbance and noise make"""
-
-    @property
-    def doubtful(self) -> bool:
-        """Adequate, but with residuals that are not white below the card's gate."""
-        simulated = self.against_disturbance is None
-        return self.adequate and simulated and not self.white and self.vaf < GATE
 
 
 class Adequacy(NamedTuple):
@@ -128,15 +92,6 @@ UNJUDGED = Adequacy(True, False, ())
 """what a Fit has that nobody judged"""
 
 
-class Record(NamedTuple):
-    """What is compared, by flight: SI, NaN where nothing is measured."""
-
-    label: str
-    dt: float
-    measured: Mapping[str, np.ndarray]
-    simulated: Mapping[str, np.ndarray]
-
-
 def assess(
     problem: Problem,
     params: Any,
@@ -158,7 +113,7 @@ def assess(
         unknowns: how many were estimated; a response that explains no more than as many unknowns
             explain of noise by chance shows nothing.
     """
-    unstable = against is not None and _unstable(problem, params)
+    unstable = against is not None and is_unstable(problem, params)
     judged = tuple(
         _judged(name, m, records, whiteness, None if against is None else against[name], unstable)
         for name, m in agreement.items()
@@ -168,9 +123,11 @@ def assess(
     if judged and not bad and against is None and not _stands_out(judged, records, unknowns):
         return _nothing_shown(judged)
     doubted = [*bad, *(one for one in judged if one.doubtful)]
-    unstable = unstable or (bool(bad) and _unstable(problem, params))
+    unstable = unstable or (bool(bad) and is_unstable(problem, params))
     apart = len(doubted) < len(judged)
-    advice = [text for one in doubted for text in _advice(problem, one, records, unstable, apart)]
+    advice = [
+        text for one in doubted for text in advice_for(problem, one, records, unstable, apart)
+    ]
     remarks = [
         f"Driven by the inputs alone, the model follows {one.output} worse than its mean does (VAF "
         f"{one.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
@@ -316,128 +273,3 @@ def _reason(one: Judged) -> str:
         f"The model explains {one.explained:.0%} of what in {one.output} is not white noise (VAF "
         f"{one.vaf:.3g}), wanted is half at least; the acceptance card asks for a VAF of 0.9."
     )
-
-
-def _advice(
-    problem: Problem, one: Judged, records: tuple[Record, ...], unstable: bool, apart: bool
-) -> list[str]:
-    """What fits the case, most telling first; only what this problem can do.
-
-    `apart` says that other outputs are followed well: then this one's sensor is at fault, not the
-    inputs, which all outputs share.
-    """
-    name, ways = one.output, []
-    plain = not estimator_of(problem.method).process_noise
-    i = max(
-        (i for i, r in enumerate(records) if name in r.measured),
-        key=lambda i: records[i].measured[name].size,
-    )
-    measured, dt = records[i].measured[name], records[i].dt
-    correlation, lag = _alignment(measured, records[i].simulated[name], dt)
-    # A parameter that keeps its sign shrinks until nothing moves: the start still tells.
-    begun = _alignment(measured, _at_start(problem, problem.training[i], name), dt)[0]
-    wrong = min(correlation, begun) < AGAINST
-    if wrong:
-        inputs = " and ".join(naming.names(problem.model.Inputs))
-        where = "" if correlation < AGAINST else "At the start values the"
-        ways.append(
-            f"{where or 'The'} simulated {name} moves against the measured one: check the signs "
-            f"and columns of {name} and {inputs}, and the signs of the start values."
-        )
-    elif abs(lag) > 0 and correlation > -AGAINST and not problem.nuisance.time_shift:
-        late = "later" if lag > 0 else "earlier"
-        ways.append(
-            f"The simulated {name} agrees better {abs(lag):.3g} s {late}: check the time stamps"
-            + (
-                "."
-                if apart or problem.window is not None
-                else ", or set nuisance.time_shift: true."
-            )
-        )
-    diverged = _diverges(name, records)
-    if (diverged or unstable) and plain and problem.window is None:
-        why = "diverges" if diverged else "is of an unstable model, in which any error grows"
-        needs = "" if problem.nuisance.initial_state else ", nuisance.initial_state on"
-        needs += ", nuisance.time_shift off" if problem.nuisance.time_shift else ""
-        ways.append(
-            f"The simulation {why}: simulate in windows with initial states of their own "
-            f"(multiple shooting; fit.shooting: {{window: 2.0}}{needs})."
-        )
-    elif diverged and problem.window is not None:
-        ways.append("The simulation diverges within its windows: make them shorter.")
-    if one.lag1 > FAR_FROM_WHITE and plain and not wrong:
-        axes = disturbable(problem.model)
-        said = f"What is left of {name} is slow (autocorrelation {one.lag1:+.2f} at one sample): "
-        if axes:
-            said += (
-                "a disturbance, or dynamics that the model lacks. For the first, method: "
-                f"filter-error with disturbance: {{axis: {axes[0]}, poles: 1}}."
-            )
-        else:
-            said += (
-                "dynamics, inputs or a disturbance that the model lacks; it has no axis to "
-                "disturb, so the remedy is a model that has them."
-            )
-        ways.append(said)
-    if not ways and one.vaf >= 0:
-        ways.append(
-            "Are the columns, signs and units the right ones, and the start values near? Several "
-            "starts (fit.starts) tell a poor optimum from a poor model."
-        )
-    return ways
-
-
-def _at_start(problem: Problem, flight: Flight, name: str) -> np.ndarray:
-    """The output (N,) simulated at the start values from the model's own initial state."""
-    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    params = naming.replace(problem.start_params(), **known)
-    run = simulate(problem.model, params, flight, substeps=problem.substeps)
-    return np.asarray(getattr(run.outputs, name))
-
-
-def _alignment(measured: np.ndarray, simulated: np.ndarray, dt: float) -> tuple[float, float]:
-    """Correlation of measured and simulated at the lag [s] where it is largest in size.
-
-    The lag is 0 unless the correlation there is clearly better; (0, 0) where nothing moves.
-    """
-    if not np.isfinite(simulated).all() or np.std(simulated) == 0:
-        return 0.0, 0.0
-    lags = max(1, min(round(MAX_TIME_SHIFT / dt), measured.size // 4))
-    with np.errstate(all="ignore"):
-        c = cross_correlation(simulated, measured, lags)
-    if not np.isfinite(c).all():
-        return 0.0, 0.0
-    middle, best = float(c[lags]), int(np.argmax(np.abs(c)))
-    if abs(c[best]) < abs(middle) + 0.1:
-        return middle, 0.0
-    return float(c[best]), (best - lags) * dt
-
-
-def _diverges(name: str, records: tuple[Record, ...]) -> bool:
-    for r in records:
-        if name not in r.measured:
-            continue
-        simulated = r.simulated[name]
-        if not np.isfinite(simulated).all():
-            return True
-        if np.max(np.abs(simulated)) > _DIVERGED * np.nanmax(np.abs(r.measured[name])):
-            return True
-    return False
-
-
-def _unstable(problem: Problem, params: Any) -> bool:
-    """Whether a mode of the linearised model grows noticeably over the longest window."""
-    longest = max(f.duration for f in problem.training)
-    longest = longest if problem.window is None else min(longest, problem.window)
-    for flight in problem.training:
-        here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
-        at = operating_point(
-            problem.model, here, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
-        )
-        try:
-            found = modes(problem.model, here, at.state, at.inputs)
-        except np.linalg.LinAlgError:  # no finite matrices there: nothing is known of the modes
-            continue
-        if np.max(np.real(found)) * longest > _GROWTH:
-            return True
-    return False

@@ -1,0 +1,98 @@
+"""Measured and simulated signals of a fit, and how well they agree."""
+
+import numpy as np
+
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.result import Signals
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.metrics import (
+    NO_METRICS,
+    Metrics,
+    Whiteness,
+    metrics,
+    whiteness,
+)
+
+_SURELY_CORRELATED = 4.5
+"""standard deviations from zero at which two residuals are taken for correlated"""
+_WORTH_IT = 0.1
+
+
+def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
+    """By 'output and output, flight' the correlation of residuals that are not independent.
+
+    White residuals of two outputs that go together count one piece of news twice.
+    """
+    found = {}
+    for s in signals:
+        names = list(s.measured)
+        for i, a in enumerate(names):
+            for b in names[:i]:
+                x, y = s.residual(a), s.residual(b)
+                seen = np.isfinite(x) & np.isfinite(y)
+                n = int(seen.sum())
+                if n < 8 or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
+                    continue
+                rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
+                if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
+                    found[f"{b} and {a}, {s.flight}"] = rho
+    return found
+
+
+def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
+    """Of the innovations where there are some, else of the residuals."""
+    if e.innovations:
+        errors = {
+            f"{s.flight}/{n}": error / np.sqrt(one.variance[n])
+            for s, one in zip(signals, e.innovations, strict=True)
+            for n, error in one.error.items()
+        }
+    else:
+        errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+    return {name: whiteness(error, len(errors)) for name, error in errors.items()}
+
+
+def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
+    """Measured and simulated signals; what is simulated carries the bias."""
+    errors = [one.error for one in e.innovations] or [None] * len(flights)
+    return tuple(
+        Signals(
+            label,
+            f.hold_out,
+            f.times,
+            dict(f.inputs),
+            dict(f.outputs),
+            {n: np.asarray(v) for n, v in by_name.items()},
+            error,
+        )
+        for label, f, by_name, error in zip(
+            labels(flights), flights, e.simulated, errors, strict=True
+        )
+    )
+
+
+def free_runs(
+    flights: tuple[Flight, ...], runs: tuple[dict[str, np.ndarray], ...] | None
+) -> tuple[Signals, ...]:
+    """The flights held out as simulated in one piece."""
+    return tuple(
+        Signals(label, f.hold_out, f.times, dict(f.inputs), dict(f.outputs), run)
+        for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
+    )
+
+
+def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
+    """Metrics by output over all the flights that have it; of one-step predictions none without
+    innovations."""
+    if one_step:
+        signals = tuple(s for s in signals if s.innovations is not None)
+    outputs = sorted({n for s in signals for n in s.measured})
+    pooled = {}
+    for n in outputs:
+        have = [s for s in signals if n in s.measured]
+        measured = np.concatenate([s.measured[n] for s in have])
+        model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
+        finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
+        pooled[n] = metrics(measured, model) if finite else NO_METRICS
+    return pooled
