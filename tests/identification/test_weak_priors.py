@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, models
-from heli_jax.identification.identifiability.analysis import Held, judge, projected
+from heli_jax.identification.identifiability.analysis import judge
+from heli_jax.identification.identifiability.directions import Held, projected
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle

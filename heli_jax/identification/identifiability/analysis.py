@@ -16,6 +16,13 @@ from heli_jax.identification.identifiability.combinations import (
     row_reduced,
     unit_vector,
 )
+from heli_jax.identification.identifiability.directions import (
+    Directions,
+    Exchange,
+    Held,
+    covariance_of,
+    directions,
+)
 from heli_jax.identification.identifiability.sentences import Facts, Open, Weakest, sentences
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Pair, Unknown, Verdict
 
@@ -25,58 +32,81 @@ ILL_CONDITIONED = 1e4
 STRONG = 0.99
 _PART = 1e-3
 """of a unit direction that is not determined: less leaves an unknown determined"""
-_HELD = 3.0
-"""weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
 
 
 _FAR = math.log(FACTOR) / Z95
 """sd in relative coordinates of an interval that reaches just as far as the factor"""
 
 
-class Held(NamedTuple):
-    """What is left of the data where the nuisances' weak priors are taken away.
+class _Known(NamedTuple):
+    """What is known of the unknowns, and along which directions nothing is."""
 
-    Initial states, biases and input offsets carry priors of ten times the signal, so that one that
-    no output shows does no harm. What only these hold up of a parameter the data do not determine.
-    """
-
-    sensitivity: np.ndarray
-    """(any, q) with the nuisances free: no prior of any kind"""
-    compensation: np.ndarray
-    """(k, q) by how much the nuisances move, in sds of their weak priors, to make up for a unit of
-    each unknown"""
-    nuisances: tuple[str, ...]
-    """(k,) in words, as 'the bias of p'"""
-    labels: tuple[str, ...]
-    """(k,) as the fit names them, as 'flight 1/bias p'"""
-    switched_off: dict[str, np.ndarray]
-    """by the nuisance's switch, as 'nuisance.bias', the sensitivity (any, q) without it"""
+    null: list[np.ndarray]
+    """unit directions (q,) that are not determined"""
+    covariance: np.ndarray
+    """(q, q) of what is determined"""
+    without_weak: np.ndarray
+    """(q, q) the same with the nuisances' weak priors taken away"""
+    total: Directions
+    """of the data and the priors of the unknowns"""
+    rank: int
 
 
-def projected(J: np.ndarray, nuisances: np.ndarray, smallest: float | None = None) -> np.ndarray:
-    """What J (n, q) says once the nuisance columns (n, k) are free, as few rows (any, q).
-
-    By orthogonal factors, never by normal equations: singular values keep their full precision.
+def _known(
+    sensitivity: np.ndarray,
+    bare: np.ndarray,
+    prior: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    null_below: float,
+    reported: np.ndarray | None,
+) -> _Known:
+    """Directions without effect, then those whose interval reaches too far.
 
     Args:
-        smallest: the nuisances may be dependent: of their directions, with columns of equal size,
-            those below this part of the largest have no effect of their own and are left out.
-            Without it they have to be independent.
+        sensitivity, bare: (any, q) with and without the nuisances' weak priors.
+        prior: (q, q) rows of the unknowns' own priors.
     """
-    q, k = J.shape[1], nuisances.shape[1]
-    both = np.hstack([nuisances, J])
-    if both.shape[0] < q + k:
-        both = np.vstack([both, np.zeros((q + k - both.shape[0], q + k))])
-    R = np.linalg.qr(both, mode="r")
-    if smallest is None or k == 0:
-        return R[k : k + q, k:]
-    N, S = R[:, :k], R[:, k:]
-    norms = np.linalg.norm(N, axis=0)
-    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
-    shown = left[:, singular > smallest * max(singular[0], 1e-300)]
-    for _ in range(2):  # the second time takes off what rounding left the first time
-        S = S - shown @ (shown.T @ S)
-    return S
+    scale = np.array([u.scale for u in unknowns])
+    total = directions(np.vstack([bare, prior]), scale)
+    with_weak = directions(np.vstack([sensitivity, prior]), scale)
+    kept = total.singular > null_below * max(total.singular[0], 1e-300)
+    without_weak = covariance_of(total, kept, scale)
+    covariance = without_weak
+    null = [unit_vector(scale * v) for v in total.right[~kept]]
+    if not null:
+        covariance = covariance_of(with_weak, with_weak.singular > 0, scale)
+        null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
+    # What one direction leaves open says nothing of the parameters that take no part in it.
+    null += _further(_weakly_held(without_weak, covariance, unknowns), null)
+    null += _further(_single_too_wide(without_weak, unknowns), null)
+    if reported is not None:
+        wide = (
+            _single_too_wide(reported, unknowns) if null else _reported_too_wide(reported, unknowns)
+        )
+        null += _further(wide, null)
+    return _Known(null, covariance, without_weak, total, int(kept.sum()))
+
+
+class _ByData(NamedTuple):
+    """The same by the data alone, where priors make everything determined."""
+
+    null: list[np.ndarray]
+    covariance: np.ndarray
+    rank: int
+
+
+def _by_data(
+    bare: np.ndarray, known: _Known, unknowns: tuple[Unknown, ...], null_below: float
+) -> _ByData:
+    scale = np.array([u.scale for u in unknowns])
+    data = directions(bare, scale)
+    kept = data.singular > null_below * max(data.singular[0], 1e-300)
+    covariance = covariance_of(data, kept, scale)
+    null = []
+    if not known.null and any(u.prior for u in unknowns):
+        null = [unit_vector(scale * v) for v in data.right[~kept]]
+        null = null or _too_wide(bare, covariance, unknowns)
+    return _ByData(null, covariance, int(kept.sum()))
 
 
 def judge(
@@ -101,52 +131,28 @@ def judge(
             either.
     """
     names = tuple(u.name for u in unknowns)
-    scale = np.array([u.scale for u in unknowns])
-    prior = np.diag([u.prior for u in unknowns])
     bare = sensitivity if held is None else held.sensitivity
-    data, total = _directions(bare, scale), _directions(np.vstack([bare, prior]), scale)
-    with_weak = _directions(np.vstack([sensitivity, prior]), scale)
+    prior = np.diag([u.prior for u in unknowns])
+    known = _known(sensitivity, bare, prior, unknowns, null_below, reported)
+    data = _by_data(bare, known, unknowns, null_below)
+    null, covariance, total = known.null, known.covariance, known.total
+    dead = _dead(sensitivity, unknowns)
     least = null_below * max(total.singular[0], 1e-300)
-    kept = total.singular > least
-    without_weak = _covariance(total, kept, scale)
-    covariance = without_weak
-    null = [unit_vector(scale * v) for v in total.right[~kept]]
-    if not null:
-        covariance = _covariance(with_weak, with_weak.singular > 0, scale)
-        null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
-    # What one direction leaves open says nothing of the parameters that take no part in it.
-    null += _further(_weakly_held(without_weak, covariance, unknowns), null)
-    null += _further(_single_too_wide(without_weak, unknowns), null)
-    if reported is not None:
-        wide = (
-            _single_too_wide(reported, unknowns) if null else _reported_too_wide(reported, unknowns)
-        )
-        null += _further(wide, null)
-    data_kept = data.singular > null_below * max(data.singular[0], 1e-300)
-    of_data = _covariance(data, data_kept, scale)
-    data_null = []
-    if not null and prior.any():
-        data_null = [unit_vector(scale * v) for v in data.right[~data_kept]]
-        data_null = data_null or _too_wide(bare, of_data, unknowns)
-    sizes = np.linalg.norm(sensitivity, axis=0) * scale
-    dead = tuple(
-        n for n, s in zip(names, sizes, strict=True) if not s > 1e-12 * max(sizes.max(), 1e-300)
-    )
-    exchanged = _Exchange(sensitivity, held, least)
+    exchanged = Exchange(sensitivity, held, least)
     groups = _groups(null, covariance, unknowns, dead, exchanged)
     # What the data alone say, so that no prior is in it.
-    resting = _groups(data_null, of_data, unknowns, (), exchanged)
+    resting = _groups(data.null, data.covariance, unknowns, (), exchanged)
     undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > _PART for v in null))
     correlation = _correlation(covariance)
     pairs = _pairs(correlation, names, undetermined)
     smallest = total.singular[-1]
     condition = float(total.singular[0] / smallest) if smallest > 0 else math.inf
-    own, weak, share = _shares(covariance, without_weak, unknowns)
+    own, weak, share = _shares(covariance, known.without_weak, unknowns)
     for group in groups:
         if group.nuisances:
             share |= dict.fromkeys(group.names, 1.0)
     weakest = None
-    if not null and condition > ILL_CONDITIONED and not data_null:
+    if not null and condition > ILL_CONDITIONED and not data.null:
         weakest = _weakest(covariance, condition, unknowns)
     facts = Facts(
         unknowns,
@@ -163,8 +169,8 @@ def judge(
     return Verdict(
         names=names,
         identifiable=not null,
-        rank=int(kept.sum()),
-        rank_without_priors=int(data_kept.sum()),
+        rank=known.rank,
+        rank_without_priors=data.rank,
         condition=condition,
         singular_values=total.singular,
         null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in null),
@@ -178,55 +184,16 @@ def judge(
         sentences=sentences(facts),
         resting=tuple(n for group in resting for n in group.names),
         exchangeable=tuple(
-            dict.fromkeys(label for v in (*null, *data_null) for label in exchanged.labels(v))
+            dict.fromkeys(label for v in (*null, *data.null) for label in exchanged.labels(v))
         ),
     )
 
 
-class _Exchange(NamedTuple):
-    """Which nuisances a direction of the unknowns is exchanged with."""
-
-    sensitivity: np.ndarray
-    held: Held | None
-    least: float
-    """singular value that counts as zero"""
-
-    def moves(self, v: np.ndarray) -> np.ndarray:
-        """(k,) whether each nuisance takes part; none where weak priors do not hold v."""
-        if self.held is None or not self.held.nuisances:
-            return np.zeros(0, bool)
-        with_weak = np.linalg.norm(self.sensitivity @ v)
-        without = np.linalg.norm(self.held.sensitivity @ v)
-        size = np.abs(self.held.compensation @ v)
-        if with_weak < max(self.least, _HELD * without):
-            return np.zeros(size.size, bool)
-        return size > TAKES_PART * max(size.max(), 1e-300)
-
-    def labels(self, v: np.ndarray) -> tuple[str, ...]:
-        """As the fit names the nuisances."""
-        moves = self.moves(v)
-        return tuple(self.held.labels[i] for i in np.flatnonzero(moves)) if self.held else ()
-
-    def words(self, rows: list[np.ndarray]) -> tuple[str, ...]:
-        """The nuisances that the directions are exchanged with, each once."""
-        if self.held is None:
-            return ()
-        found = [self.held.nuisances[i] for v in rows for i in np.flatnonzero(self.moves(v))]
-        return tuple(dict.fromkeys(found))
-
-    def switches(self, rows: list[np.ndarray]) -> tuple[str, ...]:
-        """The nuisances without which every direction would be determined."""
-        if self.held is None or not self.words(rows):
-            return ()
-        return tuple(
-            name
-            for name, other in self.held.switched_off.items()
-            if all(
-                np.linalg.norm(other @ v)
-                > max(self.least, _HELD * np.linalg.norm(self.held.sensitivity @ v))
-                for v in rows
-            )
-        )
+def _dead(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
+    """The unknowns without any effect."""
+    sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
+    least = 1e-12 * max(sizes.max(), 1e-300)
+    return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
 
 
 def _weakly_held(
@@ -263,7 +230,7 @@ def _groups(
     covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
     dead: tuple[str, ...],
-    exchanged: _Exchange,
+    exchanged: Exchange,
 ) -> tuple[Open, ...]:
     """The parameters in null directions, those apart that no direction ties together."""
     names = [u.name for u in unknowns]
@@ -296,23 +263,6 @@ def _groups(
     )
 
 
-class _Directions(NamedTuple):
-    singular: np.ndarray
-    right: np.ndarray
-
-
-def _directions(sensitivity: np.ndarray, scale: np.ndarray) -> _Directions:
-    q = scale.size
-    padded = np.vstack([sensitivity * scale, np.zeros((q, q))])
-    _, singular, right = np.linalg.svd(padded, full_matrices=False)
-    return _Directions(singular, right)
-
-
-def _covariance(total: _Directions, kept: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    V = total.right[kept].T / total.singular[kept]
-    return np.outer(scale, scale) * (V @ V.T)
-
-
 def _reaching_too_far(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[int]:
     """The unknowns whose 95 % interval reaches further than the factor."""
     return [
@@ -328,7 +278,7 @@ def _too_wide(
     """Directions of full rank along which a 95 % interval still spans more than the factor."""
     if not _reaching_too_far(covariance, unknowns):
         return []
-    plain = _directions(total, np.ones(len(unknowns)))
+    plain = directions(total, np.ones(len(unknowns)))
     weak = [
         unit_vector(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * _FAR < 1
     ]

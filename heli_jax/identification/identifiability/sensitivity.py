@@ -6,14 +6,8 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.identifiability.analysis import (
-    NULL,
-    Held,
-    Unknown,
-    Verdict,
-    judge,
-    projected,
-)
+from heli_jax.identification.identifiability.analysis import NULL, Unknown, Verdict, judge
+from heli_jax.identification.identifiability.directions import Held, projected
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.layout import Layout
