@@ -59,13 +59,12 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     states = [n for n in naming.names(model.State) if n in _ATTITUDE or "beta" in n]
 
     def rates(x: Array, u: Array) -> Array:
-        state = naming.replace(trimmed.state, **{n: x[i] for i, n in enumerate(states)})
-        inputs = naming.replace(trimmed.inputs, **{n: u[i] for i, n in enumerate(_STICKS)})
-        found = model.vector_field(params, state, inputs)
-        return jnp.stack([getattr(found, n) for n in states])
+        state = naming.replace(trimmed.state, **dict(zip(states, x, strict=True)))
+        inputs = naming.replace(trimmed.inputs, **dict(zip(_STICKS, u, strict=True)))
+        return naming.ravel(model.vector_field(params, state, inputs), only=states)
 
-    x = jnp.stack([jnp.asarray(getattr(trimmed.state, n)) for n in states])
-    u = jnp.stack([jnp.asarray(getattr(trimmed.inputs, n)) for n in _STICKS])
+    x = naming.ravel(trimmed.state, only=states)
+    u = naming.ravel(trimmed.inputs, only=_STICKS)
     A, B = (np.asarray(m) for m in jax.jit(jax.jacfwd(rates, argnums=(0, 1)))(x, u))
     size = np.linalg.norm(B, axis=0)
     if not np.all(size > 0):

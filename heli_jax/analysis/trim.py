@@ -141,8 +141,7 @@ def _equilibrium(
 
     def fn(xi: Array, parameters: Any) -> Array:
         state, inputs = point(scales * xi)
-        found = model.vector_field(parameters, state, inputs)
-        return jnp.stack([getattr(found, n) for n in rates])
+        return naming.ravel(model.vector_field(parameters, state, inputs), only=rates)
 
     solution = optx.root_find(
         fn,

@@ -69,8 +69,9 @@ def zeros(record: type, dtype: Any = None) -> Any:
 def spread_of(model: Model, params: Any, dtype: Any) -> Array:
     """The standard deviations (n,) of all states at the first sample; zero where not random."""
     given = model.spread(params) if model.spread is not None else {}
-    values = [given.get(n, 0.0) for n in naming.names(model.State)]
-    return jnp.stack([jnp.asarray(v, dtype) for v in values])
+    return naming.ravel(
+        model.State(**{n: given.get(n, 0.0) for n in naming.names(model.State)}), dtype
+    )
 
 
 def correlation_of(model: Model, params: Any, dtype: Any) -> Array:

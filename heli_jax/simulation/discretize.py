@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 
@@ -245,7 +246,7 @@ def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
     A = jacobians(model, params).A
     if model.noise is None:
         return jnp.zeros(A.shape, A.dtype)
-    g = jnp.stack([jnp.asarray(g, A.dtype) for g in jax.tree.leaves(model.noise(params))])
+    g = naming.ravel(model.noise(params), A.dtype)
     return moved(A, jnp.zeros_like(g), g, jnp.asarray(dt, A.dtype)).Q
 
 

@@ -298,20 +298,16 @@ def _kick(
     """The state after a sample with the noise of that sample, of the model linearised there."""
     if feedback is not None:
         inputs = feedback(state, inputs)
-    names = naming.names(model.State)
-    x = jnp.stack([getattr(state, n) for n in names])
+    x = naming.ravel(state)
 
     def rates(x: Array) -> Array:
-        at = model.State(**{n: x[i] for i, n in enumerate(names)})
-        found = naming.asdict(model.vector_field(params, at, inputs))
-        return jnp.stack([jnp.asarray(found[n], x.dtype) for n in names])
+        derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
+        return naming.ravel(derivatives, x.dtype, naming.names(model.State))
 
     assert model.noise is not None
-    given = naming.asdict(model.noise(params))
-    g = jnp.stack([jnp.asarray(given[n], x.dtype) for n in names])
+    g = naming.ravel(model.noise(params), x.dtype, naming.names(model.State))
     L = square_root(moved(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
-    new = x + L @ jnp.stack(draws)
-    return model.State(**{n: new[i] for i, n in enumerate(names)})
+    return naming.unravel(model.State, x + L @ jnp.stack(draws))
 
 
 class _Field(eqx.Module):

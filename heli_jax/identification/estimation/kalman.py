@@ -69,7 +69,7 @@ def innovations(
     linear = linear_inputs(model, inputs, hold)
     x0 = model.initial_state(params) if initial_state is None else initial_state
     dtype = jax.tree.leaves(inputs)[0].dtype
-    x = _vector(x0, dtype)
+    x = naming.ravel(x0, dtype)
     sds = spread_of(model, params, dtype)
     P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
     names = list(measured)
@@ -210,16 +210,17 @@ def _local(
     dtype = jax.tree.leaves(inputs)[0].dtype
     dt = jnp.asarray(dt, dtype)
 
-    g = jnp.zeros(len(names), dtype) if model.noise is None else _vector(model.noise(params), dtype)
-
-    def state(x: Array) -> Any:
-        return model.State(**{n: x[i] for i, n in enumerate(names)})
+    g = (
+        jnp.zeros(len(names), dtype)
+        if model.noise is None
+        else naming.ravel(model.noise(params), dtype)
+    )
 
     def rates(x: Array, u: Any) -> Array:
-        return _vector(model.vector_field(params, state(x), u), dtype)
+        return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u), dtype)
 
     def outputs(x: Array, u: Any) -> Array:
-        return _vector(model.output(params, state(x), u), dtype)[rows]
+        return naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)[rows]
 
     n = jax.tree.leaves(inputs)[0].shape[0]
     parts, held, acting, slopes = (dt,), (inputs,), inputs, None
@@ -282,7 +283,3 @@ def _local(
         return carry
 
     return _Filter((held, acting, slopes), measure, move)
-
-
-def _vector(record: Any, dtype: Any) -> Array:
-    return jnp.stack([jnp.asarray(v, dtype) for v in naming.asdict(record).values()])
