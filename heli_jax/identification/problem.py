@@ -162,7 +162,7 @@ def _check_method(problem: Problem) -> None:
     if problem.method == "output-error":
         return
     have = naming.names(model.Params)
-    if model.noise is None or "sigma_w" not in have or "tau_w" not in have:
+    if model.noise_intensity is None or "sigma_w" not in have or "tau_w" not in have:
         raise ValueError(
             f"method filter-error: model {model.name} has no disturbance, wanted is a model made "
             "with with_disturbance (in a configuration: a `disturbance`)"

@@ -244,9 +244,9 @@ def _once(discrete: Discrete) -> Discrete:
 def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
     """Covariance of the noise that a linear model's white-noise drive adds in one step."""
     A = jacobians(model, params).A
-    if model.noise is None:
+    if model.noise_intensity is None:
         return jnp.zeros(A.shape, A.dtype)
-    g = naming.ravel(model.noise(params), A.dtype)
+    g = naming.ravel(model.noise_intensity(params), A.dtype)
     return moved(A, jnp.zeros_like(g), g, jnp.asarray(dt, A.dtype)).Q
 
 

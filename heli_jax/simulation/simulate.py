@@ -271,7 +271,7 @@ def _require_blocks(method: Any, block: int, events: Any) -> None:
 
 def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tuple[Any, Held]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
-    if model.noise is None:
+    if model.noise_intensity is None:
         raise ValueError(f"model {model.name!r} has no noise to draw: see with_disturbance")
     if held.delay is not None:
         raise ValueError("noise is drawn without a delay only")
@@ -304,8 +304,8 @@ def _kick(
         derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
         return naming.ravel(derivatives, x.dtype, naming.names(model.State))
 
-    assert model.noise is not None
-    g = naming.ravel(model.noise(params), x.dtype, naming.names(model.State))
+    assert model.noise_intensity is not None
+    g = naming.ravel(model.noise_intensity(params), x.dtype, naming.names(model.State))
     L = square_root(moved(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
     return naming.unravel(model.State, x + L @ jnp.stack(draws))
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import Model, correlation_of, spread_of
+from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.simulation.discretize import moved, process_noise, product
 from heli_jax.simulation.hold import Hold, linear_inputs, segments
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
@@ -56,7 +56,7 @@ def innovations(
         inputs: the model's Inputs, arrays (N,).
         measured: outputs (N,); NaN where there is none.
         sd: standard deviation of the white measurement noise, by output, SI.
-        initial_state: the model's State at the first sample; the states that `model.spread`
+        initial_state: the model's State at the first sample; the states that `model.initial_sd`
             names are uncertain about it by that standard deviation (and `model.correlation`), the
             others not at all.
         delay: as in `simulate`.
@@ -70,7 +70,7 @@ def innovations(
     x0 = model.initial_state(params) if initial_state is None else initial_state
     dtype = jax.tree.leaves(inputs)[0].dtype
     x = naming.ravel(x0, dtype)
-    sds = spread_of(model, params, dtype)
+    sds = initial_sd_of(model, params, dtype)
     P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
@@ -212,8 +212,8 @@ def _local(
 
     g = (
         jnp.zeros(len(names), dtype)
-        if model.noise is None
-        else naming.ravel(model.noise(params), dtype)
+        if model.noise_intensity is None
+        else naming.ravel(model.noise_intensity(params), dtype)
     )
 
     def rates(x: Array, u: Any) -> Array:

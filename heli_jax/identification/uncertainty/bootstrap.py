@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.dynamics.model import correlation_of, spread_of
+from heli_jax.dynamics.model import correlation_of, initial_sd_of
 from heli_jax.identification.estimation.levenberg_marquardt import optimise_many
 from heli_jax.identification.estimation.residual import driven, predict
 from heli_jax.identification.result import Fit
@@ -104,8 +104,8 @@ def _disturbed(at: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
     flight, layout = at.data.flights[i], at.layout
     params, inputs = driven(layout, at.data, u, i)
     start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
-    names, random = naming.names(layout.model.State), layout.model.spread_names
-    sds = spread_of(layout.model, params, at.z.dtype)
+    names, random = naming.names(layout.model.State), layout.model.random_states
+    sds = initial_sd_of(layout.model, params, at.z.dtype)
     # Factored without the sds, which may be zero.
     correlation = correlation_of(layout.model, params, at.z.dtype)
     factor = sds[:, None] * jnp.linalg.cholesky(correlation)
