@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
-from heli_jax.dynamics.angles import sincos
 from heli_jax.dynamics.inflow import vortex_ring
 from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
 from heli_jax.naming import Scalar
+from heli_jax.numerics.sincos import sincos
 from heli_jax.vehicle import Helicopter
 
 

@@ -131,7 +131,7 @@ BROKEN = {
     ),
     "start with a list": ({"start": lambda p: [0.0, 0.0]}, ["start", "State", "a list of 2"]),
     "noise without a state": ({"noise_intensity": lambda p: p.Lp}, ["noise_intensity", "State"]),
-    "spread of a stranger": ({"initial_sd": lambda p: {"q": p.Lp}}, ["initial_sd", "'q'", "phi, p"]),
+    "sd of a stranger": ({"initial_sd": lambda p: {"q": p.Lp}}, ["initial_sd", "'q'", "phi, p"]),
     "limits that are none": ({"limits": lambda p, s, u: s.p > 1.0}, ["limits", "dictionary"]),
     "parameters that are no class": ({"Params": {"Lp": 1.0}}, ["Params", "NamedTuple", "a dict"]),
     "states that are an object": ({"State": State(0.0, 0.0)}, ["State", "NamedTuple"]),

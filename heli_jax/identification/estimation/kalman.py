@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
-from heli_jax.simulation.discretize import moved, process_noise, product
+from heli_jax.numerics.matrix_exponential import product, van_loan
+from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import Hold, linear_inputs, segments
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
@@ -241,7 +242,7 @@ def _local(
 
     def along(carry: tuple[Array, Array], h: Array, u: Any) -> tuple[Array, Array]:
         x, P = carry
-        step = moved(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
+        step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
         return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
 
     def ramped(carry: tuple[Array, Array], h: Array, u: Any, slope: Any) -> tuple[Array, Array]:
@@ -252,7 +253,7 @@ def _local(
         _, b = jax.jvp(lambda u: rates(x, u), (u,), (slope,))
         one, none = jnp.ones(1, dtype), jnp.zeros(1, dtype)
         A = jnp.zeros((m + 1, m + 1), dtype).at[:m, :m].set(jax.jacfwd(rates)(x, u))
-        step = moved(
+        step = van_loan(
             A.at[:m, m].set(b), jnp.concatenate([rates(x, u), one]), jnp.concatenate([g, none]), h
         )
         Phi = step.Phi[:m, :m]
