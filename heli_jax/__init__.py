@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from heli_jax.identification.problem import Prior as Prior
     from heli_jax.identification.problem import Problem as Problem
     from heli_jax.simulation.accumulate import accumulate as accumulate
+    from heli_jax.simulation.options import SimulationOptions as SimulationOptions
     from heli_jax.simulation.simulate import simulate as simulate
     from heli_jax.sweeps.run import sweep as sweep
     from heli_jax.vehicle import Helicopter as Helicopter
@@ -39,6 +40,7 @@ _HOMES = {
     "Signal": "flights",
     "read_flight": "flights",
     "simulate": "simulation.simulate",
+    "SimulationOptions": "simulation.options",
     "accumulate": "simulation.accumulate",
     "sweep": "sweeps.run",
     "Problem": "identification.problem",

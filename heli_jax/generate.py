@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.analysis.pilot import Pilot, attitude_hold
-from heli_jax.analysis.trim import STICKS, Condition, Trim, is_whole, trim
+from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, trim
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
@@ -46,7 +46,7 @@ class Simulated(NamedTuple):
     @property
     def whole(self) -> bool:
         """Whether it was a whole helicopter that flew."""
-        return is_whole(self.model)
+        return is_full_nonlinear(self.model)
 
 
 def generate(experiment: Experiment) -> Simulated:
@@ -118,7 +118,7 @@ def drive(experiment: Experiment) -> Made:
     plain = in_wind(experiment) if wanted.wind is not None else experiment
     inputs = _inputs(plain, wanted, n, rng, where)
     flight = Flight(dt=1.0 / wanted.rate, inputs=inputs, outputs={}, name="simulate")
-    if not is_whole(plain.model):
+    if not is_full_nonlinear(plain.model):
         return Made(plain, flight, None, None)
     begin = Condition(**wanted.start.model_dump()) if wanted.start else Condition()
     trimmed = Trimmed(begin, wanted.wind or (0.0, 0.0, 0.0), of=plain.model)
@@ -154,7 +154,7 @@ def _run(
         )
     model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
-    if is_whole(experiment.model):
+    if is_full_nonlinear(experiment.model):
         begin = _begin(experiment, wanted, where)
         given = {n: jnp.asarray(v) for n, v in experiment.config.initial_state.items()}
         start = _extended(model, naming.replace(begin.state, **given))
@@ -186,7 +186,7 @@ def _run(
 
 
 def _check_whole(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
-    if is_whole(experiment.model):
+    if is_full_nonlinear(experiment.model):
         return
     given = {
         "start": wanted.start is not None,
@@ -225,7 +225,7 @@ def _extended(model: Model, state: Any) -> Any:
 
 
 def _diverged(experiment: Experiment, run: Trajectory) -> str:
-    if not is_whole(experiment.model):
+    if not is_full_nonlinear(experiment.model):
         first = {k: float(np.asarray(v)[0]) for k, v in naming.asdict(run.inputs).items()}
         wrong = cannot_start(experiment.model, experiment.vehicle.params, first)
         return wrong or "the run is not finite: the model is unstable with this vehicle"
@@ -261,7 +261,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
                 f"({100 * share:.2g} % of the samples)"
             )
     for name, (low, high) in STICKS.items():
-        if not is_whole(experiment.model):
+        if not is_full_nonlinear(experiment.model):
             break
         stick = np.asarray(getattr(run.inputs, name))[flown]
         beyond = (stick < low) | (stick > high)
@@ -312,7 +312,7 @@ def follow(experiment: Experiment) -> Simulated:
         if not run.finite:
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             params = naming.replace(experiment.vehicle.params, **known)
-            wrong = "" if is_whole(model) else cannot_start(model, params, first)
+            wrong = "" if is_full_nonlinear(model) else cannot_start(model, params, first)
             notes.append(
                 f"{flight.name}: {wrong or f'the run is not finite from {_lost(run):g} s on'}"
             )

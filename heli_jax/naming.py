@@ -8,9 +8,11 @@ A record class is any class built by keyword with one scalar a field: an `eqx.Mo
 
 import functools
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
+import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 type Scalar = Float[Array, ""] | float
@@ -59,6 +61,29 @@ def asdict(record: Any) -> dict[str, Any]:
 def replace(record: Any, **changes: Any) -> Any:
     """A new record of the same class with some fields changed."""
     return type(record)(**{**asdict(record), **changes})
+
+
+def ravel(
+    record: Any, dtype: DTypeLike | None = None, only: Sequence[str] | None = None
+) -> Float[Array, " n"]:
+    """A record as a vector, in the order of its class's fields.
+
+    Args:
+        record: one scalar a field.
+        dtype: of the vector; that of the fields unless given.
+        only: the fields to take, in this order; all of them unless given.
+    """
+    taken = names(type(record)) if only is None else only
+    return jnp.stack([jnp.asarray(getattr(record, name), dtype) for name in taken])
+
+
+def unravel(record: type, vector: Float[Array, " n"]) -> Any:
+    """The record of a class from a vector in the order of its fields: what `ravel` makes, back.
+
+    Raises:
+        ValueError: the vector has more or fewer numbers than the class has fields.
+    """
+    return record(**dict(zip(names(record), vector, strict=True)))
 
 
 def fields(record: type) -> dict[str, Any]:

@@ -32,6 +32,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # axes name no argument) and analysis.lti (its own errors for wrong arguments are tested).
 _CHECKED = (
     "vehicle naming dynamics.model dynamics.jacobians dynamics.disturbance simulation "
+    "numerics.hoist numerics.matrix_exponential "
     "analysis.linear identification.unknowns.transforms identification.equation_error.baseline "
     "identification.validation.metrics "
     "identification.estimation.residual identification.estimation.simulated_flights"

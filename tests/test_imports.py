@@ -17,7 +17,8 @@ ROOT = Path(heli_jax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 
 BASE = {
-    "errors", "import_path", "regular_file", "units", "naming", "yaml_file", "vehicle", "versions",
+    "errors", "import_path", "regular_file", "units", "naming", "numerics", "yaml_file", "vehicle",
+    "versions",
 }  # fmt: skip
 # What each part may import of heli_jax, beside itself.
 ALLOWED = {
@@ -26,11 +27,12 @@ ALLOWED = {
     "import_path": {"errors", "regular_file"},
     "units": {"errors"},
     "naming": set(),
+    "numerics": {"naming"},
     "versions": set(),
     "yaml_file": {"errors", "regular_file"},
     "vehicle": {"naming", "units", "errors", "yaml_file"},
     "flights": {"errors", "regular_file", "units"},
-    "dynamics": {"vehicle", "naming"},
+    "dynamics": {"vehicle", "naming", "numerics"},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", *BASE},
     "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},

@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 from heli_jax import naming
 from heli_jax.analysis.lti import siso_polynomials
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, axes_of
 
 
 class Linearization(NamedTuple):
@@ -70,13 +70,10 @@ class Mode(NamedTuple):
     """of each state in the mode; they add up to 1"""
 
 
-# Which motion a state belongs to; others stand for themselves.
+# Which motion a state that belongs to no axis is of; others stand for themselves.
 _MOTIONS = {
-    "phi": "roll", "dphi": "roll", "theta": "pitch", "dtheta": "pitch", "psi": "yaw",
-    "dpsi": "yaw", "x": "surge", "dx": "surge", "y": "sway", "dy": "sway", "z": "heave",
-    "dz": "heave", "Omega": "rotor speed", "vi": "inflow",
-    "beta_roll": "flybar roll", "dbeta_roll": "flybar roll",
-    "beta_pitch": "flybar pitch", "dbeta_pitch": "flybar pitch",
+    "x": "surge", "dx": "surge", "y": "sway", "dy": "sway", "z": "heave", "dz": "heave",
+    "Omega": "rotor speed", "vi": "inflow",
 }  # fmt: skip
 _TAKES_PART = 0.2
 _STILL = 1e-9
@@ -94,7 +91,7 @@ def eigenmodes(
     A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
     values, left, right = scipy.linalg.eig(A, left=True)
     largest = max(float(np.max(np.abs(values), initial=0.0)), 1.0)
-    names, found = naming.names(model.State), []
+    names, motions, found = naming.names(model.State), _motions(model), []
     for i in np.argsort(np.abs(values), kind="stable"):
         value = complex(values[i])
         if value.imag < 0:
@@ -105,17 +102,26 @@ def eigenmodes(
         shares = dict(zip(names, (float(p) for p in part), strict=True))
         size = abs(value)
         damping = 1.0 if still else -value.real / size
-        found.append(Mode(value, _mode_name(shares), size, damping, shares))
+        found.append(Mode(value, _mode_name(shares, motions), size, damping, shares))
     return tuple(found)
 
 
-def _mode_name(shares: dict[str, float]) -> str:
-    motions: dict[str, float] = {}
+def _motions(model: Model) -> dict[str, str]:
+    """The motion that each state belongs to."""
+    motions = dict(_MOTIONS)
+    for axis in axes_of(model):
+        motions |= {n: axis.name for n in (axis.angle, axis.rate) if n is not None}
+        motions |= dict.fromkeys(axis.flybar, f"flybar {axis.name}")
+    return motions
+
+
+def _mode_name(shares: dict[str, float], motions: dict[str, str]) -> str:
+    by_motion: dict[str, float] = {}
     for name, share in shares.items():
-        motion = _MOTIONS.get(name, name)
-        motions[motion] = motions.get(motion, 0.0) + share
-    ordered = sorted(motions, key=lambda m: -motions[m])
-    part = [m for m in ordered if motions[m] >= _TAKES_PART]
+        motion = motions.get(name, name)
+        by_motion[motion] = by_motion.get(motion, 0.0) + share
+    ordered = sorted(by_motion, key=lambda m: -by_motion[m])
+    part = [m for m in ordered if by_motion[m] >= _TAKES_PART]
     # The body before what moves with it.
     part = sorted(part or ordered[:1], key=lambda m: m.startswith(("flybar", "rotor", "inflow")))
     return " with ".join(part)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.analysis.trim import Trim
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, axes_of
 
 PACE = 1.0
 """how fast the attitude comes back at least [1/s]; what would drift comes back at twice that.
@@ -27,9 +27,6 @@ The X-Cell 60 in hover then has 3 mm of cyclic stick for a radian, and 0.19 of y
 radian and for a rad/s. A minute of random steps of 0.5 mm, 0.1 yaw and 3 % throttle, in which it
 turns over without the pilot, stays within 0.17 rad of roll and pitch; with the paper's equations,
 where 0.01 mm does the same, within 0.25."""
-
-_STICKS = ("x_roll", "x_pitch", "x_yaw")
-_ATTITUDE = ("phi", "theta", "psi", "dphi", "dtheta", "dpsi")
 
 
 class Pilot(NamedTuple):
@@ -56,16 +53,18 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     Raises:
         ValueError: the sticks do not move all of the attitude.
     """
-    states = [n for n in naming.names(model.State) if n in _ATTITUDE or "beta" in n]
+    axes = axes_of(model)
+    sticks = [axis.stick for axis in axes if axis.stick is not None]
+    of_attitude = {n for axis in axes for n in (axis.angle, axis.rate, *axis.flybar)}
+    states = [n for n in naming.names(model.State) if n in of_attitude]
 
     def rates(x: Array, u: Array) -> Array:
-        state = naming.replace(trimmed.state, **{n: x[i] for i, n in enumerate(states)})
-        inputs = naming.replace(trimmed.inputs, **{n: u[i] for i, n in enumerate(_STICKS)})
-        found = model.vector_field(params, state, inputs)
-        return jnp.stack([getattr(found, n) for n in states])
+        state = naming.replace(trimmed.state, **dict(zip(states, x, strict=True)))
+        inputs = naming.replace(trimmed.inputs, **dict(zip(sticks, u, strict=True)))
+        return naming.ravel(model.vector_field(params, state, inputs), only=states)
 
-    x = jnp.stack([jnp.asarray(getattr(trimmed.state, n)) for n in states])
-    u = jnp.stack([jnp.asarray(getattr(trimmed.inputs, n)) for n in _STICKS])
+    x = naming.ravel(trimmed.state, only=states)
+    u = naming.ravel(trimmed.inputs, only=sticks)
     A, B = (np.asarray(m) for m in jax.jit(jax.jacfwd(rates, argnums=(0, 1)))(x, u))
     size = np.linalg.norm(B, axis=0)
     if not np.all(size > 0):
@@ -74,7 +73,7 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     K = _least_energy(A, B / size, pace) / size[:, None]
     gains = {
         stick: {name: jnp.asarray(K[i, j]) for j, name in enumerate(states)}
-        for i, stick in enumerate(_STICKS)
+        for i, stick in enumerate(sticks)
     }
     return Pilot(gains, trimmed.state)
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, needed_but_missing, zeros
+from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing, zeros
 from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
@@ -21,7 +21,6 @@ STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
 _TOLERANCE = 1e-10
 _POLISH = 3
 _TRIES = 12
-_SCALE = {"phi": 0.1, "theta": 0.1, "beta_roll": 0.1, "beta_pitch": 0.1, "vi": 1.0}
 
 
 class Condition(NamedTuple):
@@ -70,7 +69,7 @@ def trim(
         ValueError: no such flight exists (the residual is named), it needs more than a stick
             gives, or it is outside the model's range.
     """
-    _check_model(model)
+    steady = _require(model)
     missing = needed_but_missing(model, params)
     if missing:
         raise ValueError(f"trim: {', '.join(missing)} missing, model {model.name} needs it")
@@ -80,7 +79,7 @@ def trim(
         lambda v: jnp.asarray(v, jnp.result_type(float)), (params, condition, tuple(wind))
     )
     rng = np.random.default_rng(0)
-    spread = np.zeros(len(_unknowns(model)))
+    spread = np.zeros(len(steady.unknowns))
     for _ in range(_TRIES):
         found = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(spread)))
         sound = plausible(found) and np.isfinite(found.residual)
@@ -105,15 +104,15 @@ def equilibrium(
 
     Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
     """
-    _check_model(model)
-    return _equilibrium(model, params, condition, wind, jnp.zeros(len(_unknowns(model))))
+    steady = _require(model)
+    return _equilibrium(model, params, condition, wind, jnp.zeros(len(steady.unknowns)))
 
 
 @eqx.filter_jit
 def _equilibrium(
     model: Model, params: Any, condition: Condition, wind: Any, spread: Float[Array, " k"]
 ) -> Trim:
-    names, rates = _unknowns(model), _equations(model)
+    names, rates = _require(model)
     dtype = spread.dtype
     guess, scale = _guess(params, condition)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
@@ -141,8 +140,7 @@ def _equilibrium(
 
     def fn(xi: Array, parameters: Any) -> Array:
         state, inputs = point(scales * xi)
-        found = model.vector_field(parameters, state, inputs)
-        return jnp.stack([getattr(found, n) for n in rates])
+        return naming.ravel(model.vector_field(parameters, state, inputs), only=rates)
 
     solution = optx.root_find(
         fn,
@@ -163,37 +161,44 @@ def _equilibrium(
     return Trim(state, inputs, jnp.max(jnp.abs(fn(xi, params))))
 
 
-def _unknowns(model: Model) -> tuple[str, ...]:
-    """What trim has to find: attitude, flybar, rotor speed, inflow, and all sticks."""
-    names = [n for n in naming.names(model.State) if n in ("phi", "theta", "Omega", "vi")]
-    names += [n for n in naming.names(model.State) if n.startswith("beta")]
-    return (*names, *(n for n in naming.names(model.Inputs) if not n.startswith("wind")))
-
-
-def _equations(model: Model) -> tuple[str, ...]:
-    """The states whose derivatives have to vanish and do not do so by themselves."""
-    names = naming.names(model.State)
+def steady_flight(model: Model) -> SteadyFlight | None:
+    """What trim solves for: as the model states it, or by the names of its states and inputs where
+    these are those of the helicopter models here; None where it cannot be trimmed."""
+    if model.steady_flight is not None:
+        return model.steady_flight
+    states = naming.names(model.State)
+    if not {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"} <= set(states):
+        return None
+    unknowns = [n for n in states if n in ("phi", "theta", "Omega", "vi")]
+    unknowns += [n for n in states if n.startswith("beta")]
+    unknowns += [n for n in naming.names(model.Inputs) if not n.startswith("wind")]
+    # A state whose derivative is another state does not vanish by itself, it is that state.
     given = {"x", "y", "z", "phi", "theta", "psi"}
-    return tuple(n for n in names if n not in given and f"d{n}" not in names)
+    equations = [n for n in states if n not in given and f"d{n}" not in states]
+    if len(unknowns) != len(equations):
+        return None
+    return SteadyFlight(tuple(unknowns), tuple(equations))
 
 
-def is_whole(model: Model) -> bool:
-    """Whether a model is a whole helicopter, so that it can be trimmed."""
-    wanted = {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"}
-    return (
-        wanted <= set(naming.names(model.State))
-        and of_helicopter(model.Params)
-        and len(_unknowns(model)) == len(_equations(model))
-    )
+def is_full_nonlinear(model: Model) -> bool:
+    """Whether a model is the full nonlinear model of a helicopter, so that it can be trimmed."""
+    return of_helicopter(model.Params) and steady_flight(model) is not None
 
 
-def _check_model(model: Model) -> None:
+def _require(model: Model) -> SteadyFlight:
+    """What trim solves for.
+
+    Raises:
+        ValueError: the model is not the full nonlinear model of a helicopter.
+    """
     check_model(model)
-    if not is_whole(model):
+    steady = steady_flight(model)
+    if steady is None or not of_helicopter(model.Params):
         raise ValueError(
-            f"trim: model {model.name} is not a whole helicopter, wanted is one of "
-            "models.helicopter(...)"
+            "trim: expected the full nonlinear model, as models.helicopter(...) gives it, got "
+            f"{model.name}"
         )
+    return steady
 
 
 def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]]:

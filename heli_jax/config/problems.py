@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from heli_jax import models, naming, units
+from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
 from heli_jax.config.schema import FitConfig
@@ -113,9 +113,9 @@ def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
             "one with roll, pitch or yaw"
         )
     axis = wanted.axis if wanted is not None else axes[0]
-    bare = {"roll-on-stand": "roll", "pitch-on-stand": "pitch"}.get(model.name)
-    stand = models.by_name(bare) if bare and "kappa" in fitted.free else None
-    return alternatives(fitted, model, axis, without_stand=stand)
+    # Whether there is a stand is in question only where its stiffness is.
+    bare = model.without_stand if "kappa" in fitted.free else None
+    return alternatives(fitted, model, axis, without_stand=bare)
 
 
 def disturbed(experiment: Experiment) -> tuple[Model, Any]:

@@ -62,8 +62,8 @@ class _Parts(NamedTuple):
     Inputs: Any
     Outputs: Any
     start: Any
-    noise: Any
-    spread: Any
+    noise_intensity: Any
+    initial_sd: Any
     limits: Any
 
 
@@ -100,10 +100,10 @@ def _check(model: _Parts, traceable: bool) -> None:
     of("output", "params", "state", "inputs").returns("Outputs")
     if model.start is not None:
         of("start", "params").returns("State")
-    if model.noise is not None:
-        of("noise", "params").returns("State")
-    if model.spread is not None:
-        of("spread", "params").returns_by_name(naming.names(model.State))
+    if model.noise_intensity is not None:
+        of("noise_intensity", "params").returns("State")
+    if model.initial_sd is not None:
+        of("initial_sd", "params").returns_by_name(naming.names(model.State))
     if model.limits is not None:
         of("limits", "params", "state", "inputs").returns_by_name(None)
 
@@ -234,7 +234,10 @@ def _words(e: Exception) -> str:
     said = " ".join(str(e).split())[:200]
     order = ""
     if isinstance(e, AttributeError | TypeError):
-        order = "; the arguments come as (params, state, inputs), start and noise take params alone"
+        order = (
+            "; the arguments come as (params, state, inputs), start and noise_intensity take "
+            "params alone"
+        )
     return f"expected a return value, got {type(e).__name__}{f' ({said})' if said else ''}{order}"
 
 

@@ -1,19 +1,17 @@
 """A disturbance as part of the model: a random acceleration with a memory."""
 
 import functools
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.naming import Scalar
-
-_RATES = {"roll": "dphi", "pitch": "dtheta", "yaw": "dpsi"}
 
 
 def disturbable(model: Model) -> list[str]:
-    """The axes of a model that can be disturbed."""
-    return [axis for axis, rate in _RATES.items() if rate in naming.names(model.State)]
+    """The axes of a model that can be disturbed, by name."""
+    return [axis.name for axis in axes_of(model)]
 
 
 @functools.cache
@@ -27,16 +25,43 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     the disturbance is what it is at any other: all its states have the standard deviation sigma_w,
     and the two of two poles the correlation 1/sqrt(2).
 
+    Args:
+        model: without a disturbance on that axis.
+        axis: its name, one of `disturbable`.
+        poles: 1 or 2, the order of the filter that colours the noise.
+
     Raises:
         ValueError: the model has no such axis, or `poles` is neither 1 nor 2.
     """
     check_model(model)
-    have = disturbable(model)
-    if axis not in have:
-        raise ValueError(f"model {model.name} has no axis {axis!r} to disturb; it has {have}")
+    rates = {one.name: one.rate for one in axes_of(model)}
+    if axis not in rates:
+        raise ValueError(f"model {model.name} has no axis {axis!r} to disturb; it has {[*rates]}")
     if poles not in (1, 2):
-        raise ValueError(f"poles is {poles}, wanted is 1 or 2")
-    rate, chain = _RATES[axis], [f"w{i + 1}_{axis}" for i in range(poles)]
+        raise ValueError(f"poles must be 1 or 2, got {poles}")
+    lags = tuple(f"w{i + 1}_{axis}" for i in range(poles))
+    Params, State = _records(model, lags)
+    disturbed = _Disturbed(model, rates[axis], lags, State)
+    return Model(
+        f"{model.name}-disturbed",
+        disturbed.vector_field,
+        disturbed.output,
+        Params,
+        State,
+        model.Inputs,
+        model.Outputs,
+        linear=model.linear,
+        start=disturbed.start,
+        noise_intensity=disturbed.noise_intensity,
+        initial_sd=disturbed.initial_sd,
+        correlation=None if poles == 1 else disturbed.correlation,
+        limits=None if model.limits is None else disturbed.limits,
+        axes=model.axes,
+    )
+
+
+def _records(model: Model, lags: tuple[str, ...]) -> tuple[type, type]:
+    """The classes of parameters and states with those of the disturbance."""
     Params = naming.extended(
         model.Params,
         f"{model.Params.__name__}Disturbed",
@@ -48,51 +73,64 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     State = naming.extended(
         model.State,
         f"{model.State.__name__}Disturbed",
-        dict.fromkeys(chain, (Annotated[Scalar, "rad/s^2", "disturbance acceleration"], None)),
+        dict.fromkeys(lags, (Annotated[Scalar, "rad/s^2", "disturbance acceleration"], None)),
     )
-    # Two equal lags halve the variance of the first; the gain brings it back.
-    gain = 2.0**0.5 if poles == 2 else 1.0
-    limits = model.limits
+    return Params, State
 
-    def inner(state: Any) -> Any:
-        return model.State(**{n: getattr(state, n) for n in naming.names(model.State)})
 
-    def vector_field(p: Any, s: Any, u: Any) -> Any:
-        rates = naming.asdict(model.vector_field(p, inner(s), u))
-        rates[rate] = rates[rate] + getattr(s, chain[-1])
+class _Disturbed(NamedTuple):
+    """The functions of a disturbed model, around those of the model itself."""
+
+    model: Model
+    rate: str
+    """the state whose derivative the disturbance adds to"""
+    lags: tuple[str, ...]
+    """the states of the filter, the one that is driven by white noise first"""
+    State: type
+
+    @property
+    def gain(self) -> float:
+        # Two equal lags halve the variance of the first; the gain brings it back.
+        return 2.0**0.5 if len(self.lags) == 2 else 1.0
+
+    def undisturbed(self, state: Any) -> Any:
+        """The State of the model itself."""
+        states = naming.names(self.model.State)
+        return self.model.State(**{n: getattr(state, n) for n in states})
+
+    def vector_field(self, p: Any, s: Any, u: Any) -> Any:
+        rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
+        rates[self.rate] = rates[self.rate] + getattr(s, self.lags[-1])
         before: Scalar | None = None
-        for name in chain:
+        for name in self.lags:
             w = getattr(s, name)
-            pull = -w if before is None else gain * before - w
+            pull = -w if before is None else self.gain * before - w
             rates[name], before = pull / p.tau_w, w
-        return State(**rates)
+        return self.State(**rates)
 
-    def noise(p: Any) -> Any:
+    def output(self, p: Any, s: Any, u: Any) -> Any:
+        return self.model.output(p, self.undisturbed(s), u)
+
+    def limits(self, p: Any, s: Any, u: Any) -> dict[str, Any]:
+        assert self.model.limits is not None
+        return self.model.limits(p, self.undisturbed(s), u)
+
+    def noise_intensity(self, p: Any) -> Any:
+        # Zeros made of a parameter have its type and its batch axis.
         zero = 0.0 * p.sigma_w
-        intensity = dict.fromkeys(naming.names(State), zero)
-        intensity[chain[0]] = p.sigma_w * (2.0 / p.tau_w) ** 0.5
-        return State(**intensity)
+        intensity = dict.fromkeys(naming.names(self.State), zero)
+        intensity[self.lags[0]] = p.sigma_w * (2.0 / p.tau_w) ** 0.5
+        return self.State(**intensity)
 
-    def start(p: Any) -> Any:
+    def start(self, p: Any) -> Any:
         zero = 0.0 * p.sigma_w
-        return State(**{**naming.asdict(model.initial_state(p)), **dict.fromkeys(chain, zero)})
+        start = naming.asdict(self.model.initial_state(p))
+        return self.State(**{**start, **dict.fromkeys(self.lags, zero)})
 
-    def correlation(p: Any) -> Any:
+    def initial_sd(self, p: Any) -> dict[str, Any]:
+        return dict.fromkeys(self.lags, p.sigma_w)
+
+    def correlation(self, p: Any) -> dict[tuple[str, str], Any]:
         # The Lyapunov equation of two equal lags: E[w1 w2] = gain/2 E[w1^2], whatever tau_w is.
-        return {(chain[0], chain[1]): 0.5 * gain + 0.0 * p.sigma_w}
-
-    return Model(
-        f"{model.name}-disturbed",
-        vector_field,
-        lambda p, s, u: model.output(p, inner(s), u),
-        Params,
-        State,
-        model.Inputs,
-        model.Outputs,
-        linear=model.linear,
-        start=start,
-        noise=noise,
-        spread=lambda p: dict.fromkeys(chain, p.sigma_w),
-        correlation=None if poles == 1 else correlation,
-        limits=None if limits is None else lambda p, s, u: limits(p, inner(s), u),
-    )
+        first, second = self.lags
+        return {(first, second): 0.5 * self.gain + 0.0 * p.sigma_w}

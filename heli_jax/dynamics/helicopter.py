@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
-from heli_jax.dynamics.angles import sincos
 from heli_jax.dynamics.inflow import vortex_ring
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
 from heli_jax.naming import Scalar
+from heli_jax.numerics.sincos import sincos
 from heli_jax.vehicle import Helicopter
 
 
@@ -178,6 +178,27 @@ def helicopter(
         HelicopterOutputs,
         start=functools.partial(_start, State),
         limits=functools.partial(_limits, how),
+        axes=_axes(how),
+        steady_flight=_steady_flight(how),
+    )
+
+
+def _axes(how: Corrections) -> tuple[Axis, ...]:
+    """A flybar averaged over a turn has no rate among the states."""
+    if not how.first_order_bar:
+        return (ROLL, PITCH, YAW)
+    return (ROLL._replace(flybar=("beta_roll",)), PITCH._replace(flybar=("beta_pitch",)), YAW)
+
+
+def _steady_flight(how: Corrections) -> SteadyFlight:
+    """Attitude, rotor speed, inflow, flybar and sticks, of which none is chosen in a steady flight;
+    position, heading and velocity are given, and the angles do not turn."""
+    inflow = ("vi",) if how.dynamic_inflow else ()
+    bar = ("beta_roll", "beta_pitch")
+    turning = bar if how.first_order_bar else ("dbeta_roll", "dbeta_pitch")
+    return SteadyFlight(
+        ("phi", "theta", "Omega", *inflow, *bar, *HelicopterInputs._fields),
+        ("dx", "dy", "dz", "dphi", "dtheta", "dpsi", *turning, "Omega", *inflow),
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
-from heli_jax.dynamics.model import Model, zeros
+from heli_jax.dynamics.model import Model, field_and_output, zeros
 
 
 class StateSpace(NamedTuple):
@@ -36,15 +36,11 @@ def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) 
     x = model.initial_state(params) if state is None else state
     u = zeros(model.Inputs, dtype) if inputs is None else inputs
 
-    def stacked(record: Any) -> Array:
-        return jnp.stack([jnp.asarray(v, dtype) for v in naming.asdict(record).values()])
+    def rates_and_outputs(x: Array, u: Array) -> tuple[Array, Array]:
+        state, inputs = naming.unravel(model.State, x), naming.unravel(model.Inputs, u)
+        rates, outputs = field_and_output(model, params, state, inputs)
+        return naming.ravel(rates, dtype), naming.ravel(outputs, dtype)
 
-    def unstacked(record: type, vector: Array) -> Any:
-        return record(**dict(zip(naming.names(record), vector, strict=True)))
-
-    def f(xv: Array, uv: Array) -> tuple[Array, Array]:
-        xr, ur = unstacked(model.State, xv), unstacked(model.Inputs, uv)
-        return stacked(model.vector_field(params, xr, ur)), stacked(model.output(params, xr, ur))
-
-    (A, B), (C, D) = jax.jacfwd(f, argnums=(0, 1))(stacked(x), stacked(u))
+    at_state, at_inputs = naming.ravel(x, dtype), naming.ravel(u, dtype)
+    (A, B), (C, D) = jax.jacfwd(rates_and_outputs, argnums=(0, 1))(at_state, at_inputs)
     return StateSpace(A, B, C, D)

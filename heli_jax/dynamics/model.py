@@ -1,15 +1,45 @@
 """Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
 
+import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from heli_jax import naming
+
+
+class Axis(NamedTuple):
+    """An axis that a machine turns about, by the names of what a model has of it."""
+
+    name: str
+    """such as 'roll'"""
+    rate: str
+    """the state whose derivative is the angular acceleration; a disturbance adds to it"""
+    angle: str | None = None
+    """the state whose derivative is the rate"""
+    inertia: str | None = None
+    """the parameter, kg m^2"""
+    added_inertia: str | None = None
+    """the parameter that is known and added to it, kg m^2"""
+    stick: str | None = None
+    """the input that turns the machine about this axis"""
+    flybar: tuple[str, ...] = ()
+    """the states of the flybar that belong to it"""
+
+
+class SteadyFlight(NamedTuple):
+    """What trim solves for, by name: as many unknowns as equations."""
+
+    unknowns: tuple[str, ...]
+    """states, then inputs"""
+    equations: tuple[str, ...]
+    """states whose derivatives have to be zero"""
 
 
 class Model(eqx.Module):
@@ -22,6 +52,9 @@ class Model(eqx.Module):
     `linear=True` says that `vector_field` and `output` are linear in (state, inputs) and vanish
     where both do; the exact zero-order-hold discretisation may then be used, with matrices taken
     by differentiation.
+
+    `axes`, `steady_flight` and `without_stand` are what a model knows of itself beside its
+    equations. A model that leaves them out has what its names say: see `axes_of`.
     """
 
     name: str = eqx.field(static=True)
@@ -33,25 +66,50 @@ class Model(eqx.Module):
     Outputs: type = eqx.field(static=True)
     linear: bool = eqx.field(static=True, default=False)
     start: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    """noise(params): a State of white-noise intensities, 1 over sqrt(s) times the state's rate"""
-    spread: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
-    """spread(params): standard deviation at the first sample of the states that are random there,
-    by name; the others begin where `start` puts them"""
+    noise_intensity: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    """noise_intensity(params): a State of the square roots of the process noise's spectral
+    densities, in units of the state's rate times sqrt(s)"""
+    initial_sd: Callable[[Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
+    """initial_sd(params): standard deviation at the first sample (the square roots of the diagonal
+    of P0) of the states that are random there, by name; the others begin where `start` puts them"""
     correlation: Callable[[Any], dict[tuple[str, str], Any]] | None = eqx.field(
         static=True, default=None
     )
-    """correlation(params): at the first sample, between two of the states that `spread` names, by
-    pair of names; what is not named is uncorrelated"""
+    """correlation(params): at the first sample, between two of the states that `initial_sd` names,
+    by pair of names; what is not named is uncorrelated"""
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None = eqx.field(static=True, default=None)
     """limits(params, state, inputs): by name, whether the range of validity is left there"""
+    axes: tuple[Axis, ...] | None = eqx.field(static=True, default=None)
+    """the axes it turns about; None: by the names of its states"""
+    steady_flight: SteadyFlight | None = eqx.field(static=True, default=None)
+    """what trim solves for; None: by the names of its states and inputs, where it can fly"""
+    without_stand: "Model | None" = eqx.field(static=True, default=None)
+    """of a machine on a stand, the same machine in free flight"""
+    noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
+    """deprecated: the name that `noise_intensity` had"""
+    spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """deprecated: the name that `initial_sd` had"""
+
+    def __post_init__(self) -> None:
+        # The old keywords are emptied, so that dataclasses.replace does not give them again.
+        for old, new in (("noise", "noise_intensity"), ("spread", "initial_sd")):
+            if (function := getattr(self, old)) is not None:
+                warnings.warn(
+                    f"Model: the keyword {old} is deprecated, expected {new}",
+                    DeprecationWarning,
+                    stacklevel=3,
+                )
+                setattr(self, new, function)
+                setattr(self, old, None)
 
     @property
-    def spread_names(self) -> tuple[str, ...]:
+    def random_states(self) -> tuple[str, ...]:
         """The states that are random at the first sample."""
-        if self.spread is None:
+        if self.initial_sd is None:
             return ()
-        return tuple(self.spread(self.Params(**dict.fromkeys(naming.names(self.Params), 1.0))))
+        return tuple(self.initial_sd(self.Params(**dict.fromkeys(naming.names(self.Params), 1.0))))
 
     def initial_state(self, params: Any) -> Any:
         """The state at the first sample: `start(params)`, or all zeros."""
@@ -66,11 +124,41 @@ def zeros(record: type, dtype: Any = None) -> Any:
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
 
 
-def spread_of(model: Model, params: Any, dtype: Any) -> Array:
-    """The standard deviations (n,) of all states at the first sample; zero where not random."""
-    given = model.spread(params) if model.spread is not None else {}
-    values = [given.get(n, 0.0) for n in naming.names(model.State)]
-    return jnp.stack([jnp.asarray(v, dtype) for v in values])
+ROLL = Axis("roll", "dphi", "phi", "Ixx", "Ixx_added", "x_roll", ("beta_roll", "dbeta_roll"))
+PITCH = Axis(
+    "pitch", "dtheta", "theta", "Iyy", "Iyy_added", "x_pitch", ("beta_pitch", "dbeta_pitch")
+)
+YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
+"""The axes under the names that they have in the models here."""
+
+
+def axes_of(model: Model) -> tuple[Axis, ...]:
+    """The axes that a model turns about: those that it states, else those of roll, pitch and yaw
+    whose rate is among its states under the name that it has in the models here."""
+    if model.axes is not None:
+        return model.axes
+    states = naming.names(model.State)
+    return tuple(
+        axis._replace(
+            angle=axis.angle if axis.angle in states else None,
+            flybar=tuple(n for n in axis.flybar if n in states),
+        )
+        for axis in (ROLL, PITCH, YAW)
+        if axis.rate in states
+    )
+
+
+def initial_sd_of(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, " n"]:
+    """The standard deviations (n,) of all states at the first sample; zero where not random.
+
+    Args:
+        model: with n states.
+        params: the model's Params.
+        dtype: of the result.
+    """
+    random = model.initial_sd(params) if model.initial_sd is not None else {}
+    states = naming.names(model.State)
+    return naming.ravel(model.State(**{n: random.get(n, 0.0) for n in states}), dtype)
 
 
 def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
@@ -79,14 +167,14 @@ def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
     Raises:
         ValueError: the model correlates a state that is not random there.
     """
-    names, random = naming.names(model.State), model.spread_names
+    names, random = naming.names(model.State), model.random_states
     matrix = jnp.eye(len(names), dtype=dtype)
     pairs = model.correlation(params) if model.correlation is not None else {}
     for pair, value in pairs.items():
         if not set(pair) <= set(random):
             raise ValueError(
                 f"model {model.name}: correlation of {' and '.join(pair)}: expected two of the "
-                f"states that spread names ({', '.join(random) or 'none'})"
+                f"states that initial_sd names ({', '.join(random) or 'none'})"
             )
         i, j = (names.index(n) for n in pair)
         value = jnp.asarray(value, dtype)

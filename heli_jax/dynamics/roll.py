@@ -16,7 +16,7 @@ from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.flybar import cyclic_pitch, flapping_acceleration, flapping_rate_gain
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import PITCH, ROLL, Axis, Model, axes_of
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
 
@@ -108,7 +108,15 @@ def _pitch_output(p: Helicopter, s: PitchState, u: PitchInputs) -> PitchOutputs:
 
 
 roll = Model(
-    "roll", _roll_field, _roll_output, Helicopter, RollState, RollInputs, RollOutputs, linear=True
+    "roll",
+    _roll_field,
+    _roll_output,
+    Helicopter,
+    RollState,
+    RollInputs,
+    RollOutputs,
+    linear=True,
+    axes=(ROLL,),
 )
 """Free roll at constant rotor speed: eqs 21-22."""
 
@@ -121,18 +129,9 @@ pitch = Model(
     PitchInputs,
     PitchOutputs,
     linear=True,
+    axes=(PITCH,),
 )
 """Free pitch at constant rotor speed: eqs 21-22 with Iyy."""
-
-
-class _Axis(NamedTuple):
-    angle: str
-    rate: str
-    inertia: str
-    added: str
-
-
-_AXES = (_Axis("phi", "dphi", "Ixx", "Ixx_added"), _Axis("theta", "dtheta", "Iyy", "Iyy_added"))
 
 
 @functools.cache
@@ -145,24 +144,31 @@ def on_stand(model: Model) -> Model:
     stand's stiffness kappa Ixx [N m/rad] and damping zeta Ixx are the same in all runs.
 
     Raises:
-        ValueError: the model has neither phi, dphi nor theta, dtheta among its states.
+        ValueError: the model has no axis with an angle, an inertia and an added inertia.
     """
     check_model(model)
-    have = naming.names(model.State)
-    axes = [axis for axis in _AXES if axis.angle in have and axis.rate in have]
+    # The stand has springs about roll and pitch; yaw, without an added inertia, stays free.
+    axes = [a for a in axes_of(model) if a.angle and a.inertia and a.added_inertia]
     if not axes:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
     def vector_field(p: Any, s: Any, u: Any) -> Any:
         rates = model.vector_field(p, s, u)
         for axis in axes:
-            inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
-            pull = p.kappa * getattr(s, axis.angle) + p.zeta * getattr(s, axis.rate)
+            inertia, added = _inertias(p, axis)
+            pull = p.kappa * getattr(s, str(axis.angle)) + p.zeta * getattr(s, axis.rate)
             slowed = getattr(rates, axis.rate) - (inertia / (inertia + added)) * pull
             rates = naming.replace(rates, **{axis.rate: slowed})
         return rates
 
-    return dataclasses.replace(model, name=f"{model.name}-on-stand", vector_field=vector_field)
+    return dataclasses.replace(
+        model, name=f"{model.name}-on-stand", vector_field=vector_field, without_stand=model
+    )
+
+
+def _inertias(p: Any, axis: Axis) -> tuple[Scalar, Scalar]:
+    """An axis's own inertia and what is added to it [kg m^2]."""
+    return getattr(p, str(axis.inertia)), getattr(p, str(axis.added_inertia))
 
 
 class TransferFunction(NamedTuple):
@@ -210,8 +216,8 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
     k2 follow. Where `a_paddle` is given (concrete), the paddle's lift slope is not `a` and k1 is
     a_paddle/If. What the model says of p2 = c2 + zeta c1 + kappa is left over as a check.
     """
-    axis = {"roll": _AXES[0], "pitch": _AXES[1]}[angle]
-    inertia, added = getattr(p, axis.inertia), getattr(p, axis.added)
+    axis = {"roll": ROLL, "pitch": PITCH}[angle]
+    inertia, added = _inertias(p, axis)
     zeta, c2 = p.zeta * inertia / (inertia + added), p.Omega**2
     _, p1, p2, p3, p4 = den
     kappa, c1 = p4 / c2, p1 - zeta

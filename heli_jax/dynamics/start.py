@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model, field_and_output, plain
@@ -82,14 +83,11 @@ def _not_finite(model: Model, params: Any, x: dict[str, Any], u: Any) -> tuple[s
 
 def _no_slope(model: Model, params: Any, x: dict[str, Any], u: Any) -> tuple[str, ...]:
     """The rates whose derivatives by the states are not finite, such as that of a root at zero."""
-    dtype = jnp.result_type(float)
 
-    def rates(x: Any) -> Any:
-        return model.vector_field(params, model.State(**x), u)
+    def rates(x: Array) -> Array:
+        return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u))
 
-    slopes = jax.jacfwd(rates)({n: jnp.asarray(v, dtype) for n, v in x.items()})
-    return tuple(
-        f"the slope of the rate of {n}"
-        for n, by in naming.asdict(slopes).items()
-        if not np.isfinite([float(v) for v in jax.tree.leaves(by)]).all()
-    )
+    slopes = jax.jacfwd(rates)(naming.ravel(model.State(**x), jnp.result_type(float)))
+    finite = np.isfinite(np.asarray(slopes)).all(axis=1)
+    names = naming.names(model.State)
+    return tuple(f"the slope of the rate of {names[i]}" for i in np.flatnonzero(~finite))

@@ -166,7 +166,7 @@ def _check_method(problem: Problem) -> None:
     if not estimator_of(problem.method).process_noise:
         return
     have = naming.names(model.Params)
-    if model.noise is None or "sigma_w" not in have or "tau_w" not in have:
+    if model.noise_intensity is None or "sigma_w" not in have or "tau_w" not in have:
         raise ValueError(
             f"method {problem.method}: model {model.name} has no disturbance, expected a model "
             "made with with_disturbance (in a configuration: a `disturbance`)"

@@ -137,7 +137,7 @@ class Fit:
     def disturbable(self) -> bool:
         """Whether filter error could be tried: its model has an axis to disturb and none yet."""
         model = self.reached.layout.model
-        return model.noise is None and bool(disturbable(model))
+        return model.noise_intensity is None and bool(disturbable(model))
 
     @property
     def aic(self) -> float:

@@ -11,7 +11,7 @@ import markupsafe
 import numpy as np
 from matplotlib.figure import Figure
 
-from heli_jax.analysis.trim import is_whole
+from heli_jax.analysis.trim import is_full_nonlinear
 from heli_jax.dynamics.model import Model
 from heli_jax.report import manoeuvre, style
 from heli_jax.report.animation import animation, size_of
@@ -56,7 +56,7 @@ def write_view(
     Raises:
         OSError: the place cannot be written to.
     """
-    whole = is_whole(model)
+    whole = is_full_nonlinear(model)
     shown = []
     for name, whole_run in list(runs.items())[:MOST_FLIGHTS]:
         run = _finite(whole_run)

@@ -1,5 +1,6 @@
 """Runs that are reduced to a value while they go on, and never kept: for large batches."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,12 +13,14 @@ from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
+from heli_jax.numerics.hoist import hoisted
+from heli_jax.numerics.matrix_exponential import product
 from heli_jax.simulation.blocks import without_next
-from heli_jax.simulation.discretize import product, scalars
-from heli_jax.simulation.hoist import hoisted
-from heli_jax.simulation.hold import Hold, linear_inputs
+from heli_jax.simulation.discretize import Discrete, scalars
+from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.options import DEFAULT
 from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
-from heli_jax.simulation.solvers import Accumulating, Held, advance, at, dot
+from heli_jax.simulation.solvers import Accumulating, ZeroOrderHoldArgs, advance, at, dot
 
 
 class Accumulated(NamedTuple):
@@ -38,18 +41,27 @@ def accumulate(
     flight: Any,
     update: Callable[[Any, Any, Any], Any],
     start: Any,
-    **options: Any,
+    **keywords: Any,
 ) -> tuple[Any, dfx.RESULTS]:
     """Reduce a run to a value without keeping it: for large batches.
 
-    At every sample value = update(value, outputs, data at that sample), from `start`. Options as
-    `accumulated`.
+    Args:
+        model: of one machine.
+        params: the model's Params, SI.
+        flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
+        update: value = update(value, outputs, data at that sample), at every sample.
+        start: the value before the first sample, a pytree of numbers.
+        **keywords: those of `accumulated`.
 
     Returns:
         The final value and diffrax's result.
     """
-    found = accumulated(model, params, flight, update, start, **options)
-    return found.value, found.result
+    run = accumulated(model, params, flight, update, start, **keywords)
+    return run.value, run.result
+
+
+_NOT_HERE = ("controller", "delay", "max_steps", "key", "feedback", "events")
+"""options of `simulate` that a run which is not kept has not"""
 
 
 def accumulated(
@@ -60,89 +72,135 @@ def accumulated(
     start: Any,
     *,
     data: Any = (),
-    dt: Any = None,
-    initial_state: Any = None,
-    solver: str | dfx.AbstractSolver | None = None,
-    substeps: int = 4,
-    block: int = 1,
-    adjoint: dfx.AbstractAdjoint | None = None,
     limits: bool = False,
-    hold: Hold = None,
+    **keywords: Any,
 ) -> Accumulated:
     """As `accumulate`, with the last state and, if `limits`, whether the model's range was left.
 
-    `data` is a pytree of arrays (N,) such as the measured outputs. `block` is the number of samples
-    a step of solver "exact" (4 is fastest in batches of 64 on a CPU). Other arguments as
-    `simulate`.
+    Args:
+        model: of one machine.
+        params: the model's Params, SI.
+        flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
+        update: value = update(value, outputs, data at that sample), at every sample.
+        start: the value before the first sample, a pytree of numbers.
+        data: a pytree of arrays (N,), such as the measured outputs.
+        limits: whether to look for the ends of the model's range.
+        **keywords: `options`, a SimulationOptions, and single fields of it: dt, initial_state,
+            solver, substeps, block, adjoint and hold.
 
     Raises:
-        ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact.
+        ValueError: as `simulate`; a block below 1, or above 1 for a solver that is not exact; an
+            option that only `simulate` has.
+        TypeError: a keyword that is no option.
     """
-    linear = linear_inputs(model, flight, hold)
-    inputs, dt = held_inputs(model, flight, dt)
-    x0 = start_state(model, params, initial_state, inputs, dt)
-    method, held, term = per_sample(model, params, inputs, dt, solver, substeps, None, None, linear)
-    if block != 1 and (held.discrete is None or block < 1):
-        raise ValueError(f"block is {block}, wanted is 1, or more with solver='exact'")
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    watched = model.limits if limits else None
-
-    def one(carried: Any, state: Any, inputs_now: Any, data_now: Any) -> Any:
-        value, outside = carried
-        if watched is not None:
-            now = watched(params, state, inputs_now)
-            outside = {name: jnp.where(now[name], 1.0, was) for name, was in outside.items()}
-        return update(value, model.output(params, state, inputs_now), data_now), outside
-
-    if block > 1 and watched is None:
-        value, state = _in_blocks(model, held, block, x0, update, start, data)
+    options = keywords.pop("options", DEFAULT).changed(keywords)
+    for name in _NOT_HERE:
+        if getattr(options, name) is not getattr(DEFAULT, name):
+            raise ValueError(f"accumulate: expected no {name}, which only simulate has")
+    linear = linear_inputs(model, flight, options.hold)
+    inputs, dt = held_inputs(model, flight, options.dt)
+    x0 = start_state(model, params, options.initial_state, inputs, dt)
+    run = per_sample(model, params, inputs, options._replace(dt=dt), linear)
+    block = options.block
+    if block != 1 and (run[1].discrete is None or block < 1):
+        raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
+    reducer = _Reducer(model, params, update, model.limits if limits else None)
+    if block > 1 and reducer.limits is None:
+        value, state = _in_blocks(reducer, run[1], block, x0, start, data)
         return Accumulated(value, state, {}, dfx.RESULTS.successful)
-    held = held.in_scalars()
-    if held.discrete is None:
+    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+    return _by_samples(reducer, run, x0, start, data, adjoint)
+
+
+class _Reducer(NamedTuple):
+    """What is done at a sample."""
+
+    model: Model
+    params: Any
+    update: Callable[[Any, Any, Any], Any]
+    limits: Callable[[Any, Any, Any], dict[str, Any]] | None
+
+    def __call__(self, carried: Any, state: Any, inputs: Any, data: Any) -> Any:
+        value, outside = carried
+        if self.limits is not None:
+            left = self.limits(self.params, state, inputs)
+            outside = {name: jnp.where(left[name], 1.0, was) for name, was in outside.items()}
+        return self.update(value, self.model.output(self.params, state, inputs), data), outside
+
+
+def _by_samples(
+    reducer: _Reducer,
+    run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm],
+    x0: Any,
+    start: Any,
+    data: Any,
+    adjoint: dfx.AbstractAdjoint,
+) -> Accumulated:
+    """The run one step a sample."""
+    method, args, term = run
+    model, params, inputs = reducer.model, reducer.params, args.inputs
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    args = args.in_scalars()
+    if args.discrete is None:
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
-        held = held._replace(params=values)
+        args = args._replace(params=values)
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
-    if watched is not None:
+    if reducer.limits is not None:
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
-        outside = dict.fromkeys(watched(params, x0, at(inputs, 0)), jnp.zeros((), dtype))
+        names = reducer.limits(params, x0, at(inputs, 0))
+        outside = dict.fromkeys(names, jnp.zeros((), dtype))
     sol = dfx.diffeqsolve(
         term,
-        Accumulating(method, one),
+        # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
+        Accumulating(method, lambda *now: reducer(*now)),
         t0=jnp.zeros((), dtype),
         t1=jnp.asarray(n - 1, dtype),
         dt0=jnp.ones((), dtype),
         y0=(x0, (start, outside)),
-        args=(held, data),
+        args=(args, data),
         saveat=dfx.SaveAt(t1=True),
         max_steps=n - 1,
-        adjoint=dfx.DirectAdjoint() if adjoint is None else adjoint,
+        adjoint=adjoint,
         throw=False,
     )
     state, carried = jax.tree.map(lambda v: v[0], sol.ys)
-    value, outside = one(carried, state, at(inputs, n - 1), at(data, n - 1))
+    # The solver updates the value before each step, so the last sample is left.
+    value, outside = reducer(carried, state, at(inputs, n - 1), at(data, n - 1))
     return Accumulated(value, state, {n: v > 0 for n, v in outside.items()}, sol.result)
 
 
-def _in_blocks(
-    model: Model, held: Held, m: int, x0: Any, update: Any, start: Any, data: Any
-) -> tuple[Any, Any]:
-    """The exact recurrence m samples a step: x[k+m] = A^m x[k] + ..., and each output between
-    from x[k] directly, C A^j x[k] + ..., with coefficients of the vehicle's own.
+class _Block(NamedTuple):
+    """The exact recurrence over a block of m samples, in nested tuples of scalars.
 
-    Nothing depends on the result before it within a step, so XLA makes one loop over the vehicles
-    of it; written out sample by sample it would compute every sample from x[k] again.
+    Nothing depends on the result before it within a block, so XLA makes one loop over the vehicles
+    of it; written out sample by sample it would compute every sample from the block's first again.
     """
-    assert held.discrete is not None
-    A, B, _, Bn = discrete = held.discrete
-    space = jacobians(model, held.params)
+
+    free: Any
+    """C A^j, row by row, for j = 1 ... m - 1"""
+    forced: Any
+    """what an input of j samples before adds to the outputs, for j = 0 ... m - 1"""
+    onward: Any
+    """A^m"""
+    driven: Any
+    """what each sample's inputs add to the state after the block"""
+    of_next: Any
+    """Bn, for inputs that are linear between samples; else None"""
+
+
+def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Discrete]:
+    """The recurrence over m samples, and that over one."""
+    assert args.discrete is not None
+    A, B, _, Bn = discrete = args.discrete
+    space = jacobians(model, args.params)
     C, D = space.C.astype(A.dtype), space.D.astype(A.dtype)
-    ahead = None if Bn is None else scalars(Bn)
+    of_next = None if Bn is None else scalars(Bn)
     if Bn is not None:
         # Inputs that are linear between samples: another state, x - Bn u, has the recurrence of
         # held ones.
         discrete, D = without_next(discrete), D + product(C, Bn)
-        x0, B = _plus(x0, ahead, at(held.inputs, 0), -1.0), discrete.Bd
+        B = discrete.Bd
     rows, columns, power = [C], [B], A
     for _ in range(m - 1):
         rows.append(product(rows[-1], A))
@@ -151,50 +209,45 @@ def _in_blocks(
     free = [scalars(row) for row in rows[1:]]
     forced = [scalars(D)] + [scalars(product(C, column)) for column in columns[:-1]]
     onward, driven = scalars(power), [scalars(column) for column in reversed(columns)]
-    once = jax.lax.optimization_barrier((free, forced, onward, driven, ahead))
-    free, forced, onward, driven, ahead = once
+    # Behind a barrier the coefficients are computed once, not for every step that reads them.
+    once = jax.lax.optimization_barrier((free, forced, onward, driven, of_next))
+    return _Block(*once), discrete
 
-    names = naming.names(model.Outputs)
-    structure, inputs = jax.tree.structure(x0), jax.tree.structure(held.inputs)
-    U = jax.tree.leaves(held.inputs)
+
+def _in_blocks(
+    reducer: _Reducer, args: ZeroOrderHoldArgs, m: int, x0: Any, start: Any, data: Any
+) -> tuple[Any, Any]:
+    """The exact recurrence m samples a step: x[k+m] = A^m x[k] + ..., and each output between
+    from x[k] directly, C A^j x[k] + ..., with coefficients of the vehicle's own."""
+    block, discrete = _block_of(reducer.model, args, m)
+    x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
+    structure, inputs = jax.tree.structure(x0), jax.tree.structure(args.inputs)
+    U = jax.tree.leaves(args.inputs)
     n = U[0].shape[0]
     steps = (n - 1) // m
-
-    def outputs(x: Any, u: Any, j: int) -> Any:
-        """The outputs of the j-th sample of a step that begins at x with the inputs u[0..j]."""
-        if j == 0:
-            now = jax.tree.unflatten(inputs, u[0])
-            state = _plus(jax.tree.unflatten(structure, x), ahead, now)
-            return model.output(held.params, state, now)
-        found = {}
-        for i, name in enumerate(names):
-            total = dot(free[j - 1][i], x)
-            for back in range(j + 1):
-                total = total + dot(forced[back][i], u[j - back])
-            found[name] = total
-        return model.Outputs(**found)
+    outputs = functools.partial(_outputs_in_block, reducer, block, structure, inputs)
 
     def samples(x: Any, value: Any, u: Any, now: Any, count: int) -> Any:
         for j in range(count):
-            value = update(value, outputs(x, u, j), jax.tree.map(lambda v, j=j: v[j], now))
+            data_now = jax.tree.map(lambda v, j=j: v[j], now)
+            value = reducer.update(value, outputs(x, u, j), data_now)
         return value
 
-    def step(carried: Any, given: Any) -> tuple[Any, None]:
+    def step(carried: Any, slices: Any) -> tuple[Any, None]:
         x, value = carried
-        rows, now = given
+        rows, now = slices
         u = [[v[j] for v in rows] for j in range(m)]
         value = samples(x, value, u, now, m)
-        new = [dot(row, x) for row in onward]
+        new = [dot(row, x) for row in block.onward]
         for j in range(m):
-            new = [v + dot(row, u[j]) for v, row in zip(new, driven[j], strict=True)]
+            new = [v + dot(row, u[j]) for v, row in zip(new, block.driven[j], strict=True)]
         return (new, value), None
 
     def cut(v: Array) -> Array:
         return v[: steps * m].reshape(steps, m, *v.shape[1:])
 
-    first = jax.tree.leaves(x0)
-    given = jax.tree.map(cut, (U, data))
-    (x, value), _ = jax.lax.scan(step, (first, start), given)
+    slices = jax.tree.map(cut, (U, data))
+    (x, value), _ = jax.lax.scan(step, (jax.tree.leaves(x0), start), slices)
     # The samples that are left, at least one, and the state at the last of them.
     rest = n - steps * m
     u = [[v[steps * m + j] for v in U] for j in range(rest)]
@@ -203,7 +256,25 @@ def _in_blocks(
     for j in range(rest - 1):
         last = advance(discrete, last, u[j])
     end = jax.tree.unflatten(structure, last)
-    return value, _plus(end, ahead, jax.tree.unflatten(inputs, u[rest - 1]))
+    return value, _plus(end, block.of_next, jax.tree.unflatten(inputs, u[rest - 1]))
+
+
+def _outputs_in_block(
+    reducer: _Reducer, block: _Block, structure: Any, inputs: Any, x: Any, u: Any, j: int
+) -> Any:
+    """The outputs of the j-th sample of a block that begins at x with the inputs u[0..j]."""
+    model = reducer.model
+    if j == 0:
+        now = jax.tree.unflatten(inputs, u[0])
+        state = _plus(jax.tree.unflatten(structure, x), block.of_next, now)
+        return model.output(reducer.params, state, now)
+    outputs = {}
+    for i, name in enumerate(naming.names(model.Outputs)):
+        total = dot(block.free[j - 1][i], x)
+        for back in range(j + 1):
+            total = total + dot(block.forced[back][i], u[j - back])
+        outputs[name] = total
+    return model.Outputs(**outputs)
 
 
 def _plus(state: Any, rows: Any, inputs: Any, sign: float = 1.0) -> Any:

@@ -10,23 +10,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from heli_jax.simulation.discretize import Discrete, product
-from heli_jax.simulation.solvers import Held, at
+from heli_jax.numerics.matrix_exponential import product
+from heli_jax.simulation.discretize import Discrete
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, at
 
 
-def blockwise(held: Held, m: int, x0: Any) -> Any:
+def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Any) -> Any:
     """The states (N,) of a record from x0, cut into blocks of m samples.
 
     From block to block X[k+1] = A^m X[k] + w[k]; within a block the powers of A take the state at
     its start, and A^j B the inputs, to all its samples at once, one state variable at a time.
     """
-    assert held.discrete is not None
-    if held.discrete.Bn is not None:
-        ahead = _ahead(held, x0)
-        held = held._replace(discrete=without_next(held.discrete))
-        x0 = jax.tree.map(lambda x, a: x - a[0], x0, ahead)
-        return jax.tree.map(jnp.add, blockwise(held, m, x0), ahead)
-    A, (B, U) = held.discrete.Ad, columns(held)
+    assert args.discrete is not None
+    if args.discrete.Bn is not None:
+        of_next = _next_sample(args, x0)
+        args = args._replace(discrete=without_next(args.discrete))
+        x0 = jax.tree.map(lambda x, a: x - a[0], x0, of_next)
+        return jax.tree.map(jnp.add, blockwise(args, m, x0), of_next)
+    A, (B, U) = args.discrete.Ad, columns(args)
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
     U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
@@ -41,25 +42,25 @@ def blockwise(held: Held, m: int, x0: Any) -> Any:
     lag = jnp.arange(m)[:, None] - 1 - jnp.arange(m)[None, :]
     kept = (lag >= 0)[:, :, None]
 
-    def one(i: int) -> Array:
+    def state_variable(i: int) -> Array:
         past = jnp.where(kept, response[jnp.maximum(lag, 0), i], 0.0)
         free = starts @ powers[:, i].T
         forced = U.reshape(count, -1) @ past.reshape(m, -1).T
         return (free + forced).reshape(-1)[:n]
 
-    return jax.tree.unflatten(jax.tree.structure(x0), [one(i) for i in range(size)])
+    return jax.tree.unflatten(jax.tree.structure(x0), [state_variable(i) for i in range(size)])
 
 
-def columns(held: Held) -> tuple[Array, Array]:
+def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
     """B (n, r) and what it multiplies (N, r): the inputs now, those before, and the next ones."""
-    assert held.discrete is not None
-    _, B, before, after = held.discrete
+    assert args.discrete is not None
+    _, B, before, after = args.discrete
     if before is None and after is None:
-        return B, jnp.stack(jax.tree.leaves(held.inputs), axis=1)
-    n = jax.tree.leaves(held.inputs)[0].shape[0]
-    k = jnp.arange(n) if held.delay is None else jnp.arange(n) - held.delay[0]
+        return B, jnp.stack(jax.tree.leaves(args.inputs), axis=1)
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
+    k = jnp.arange(n) if args.delay is None else jnp.arange(n) - args.delay[0]
     taps = [(B, k), *((M, k + i) for M, i in ((before, -1), (after, 1)) if M is not None)]
-    U = [u for _, at_k in taps for u in jax.tree.leaves(at(held.inputs, at_k))]
+    U = [u for _, at_k in taps for u in jax.tree.leaves(at(args.inputs, at_k))]
     return jnp.concatenate([M for M, _ in taps], axis=1), jnp.stack(U, axis=1)
 
 
@@ -73,13 +74,13 @@ def without_next(discrete: Discrete) -> Discrete:
     return Discrete(A, product(A, after) + B, before, None)
 
 
-def _ahead(held: Held, like: Any) -> Any:
+def _next_sample(args: ZeroOrderHoldArgs, like: Any) -> Any:
     """Bn u as a State with arrays (N,), built as `like` is."""
-    assert held.discrete is not None
-    n = jax.tree.leaves(held.inputs)[0].shape[0]
-    k = jnp.arange(n) if held.delay is None else jnp.arange(n) - held.delay[0]
-    U = jnp.stack(jax.tree.leaves(at(held.inputs, k)), axis=1)
-    return jax.tree.unflatten(jax.tree.structure(like), list((U @ held.discrete.Bn.T).T))
+    assert args.discrete is not None
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
+    k = jnp.arange(n) if args.delay is None else jnp.arange(n) - args.delay[0]
+    U = jnp.stack(jax.tree.leaves(at(args.inputs, k)), axis=1)
+    return jax.tree.unflatten(jax.tree.structure(like), list((U @ args.discrete.Bn.T).T))
 
 
 def _powers(A: Array, m: int) -> tuple[Array, Array]:

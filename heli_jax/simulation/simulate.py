@@ -1,9 +1,8 @@
 """simulate: a model, its parameters and inputs in; the trajectory out."""
 
-import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -15,20 +14,22 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model
+from heli_jax.numerics.matrix_exponential import van_loan
 from heli_jax.simulation.blocks import blockwise, columns
-from heli_jax.simulation.discretize import discretize, moved, process_noise, square_root
-from heli_jax.simulation.events import NO_END, Event, any_over, stopped
-from heli_jax.simulation.hold import Hold, delayed, linear_inputs
+from heli_jax.simulation.discretize import discretize, process_noise, square_root
+from heli_jax.simulation.events import NO_END, any_over, stopped
+from heli_jax.simulation.hold import delayed, linear_inputs
+from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import (
     RK4,
     Adaptive,
     Exact,
-    Fed,
-    Held,
-    Moving,
-    Noisy,
     PerSample,
+    RampArgs,
+    StateFeedback,
     Stopping,
+    WithProcessNoise,
+    ZeroOrderHoldArgs,
     at,
 )
 from heli_jax.simulation.trajectory import Trajectory
@@ -53,7 +54,7 @@ def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:
         raise ValueError("inputs given as arrays need dt, the sample time in seconds")
     shapes = {u.shape for u in jax.tree.leaves(inputs)}
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
-        raise ValueError(f"inputs have shapes {sorted(shapes)}, wanted is (N,) for all, N >= 2")
+        raise ValueError(f"inputs have shapes {sorted(shapes)}, expected (N,) for all, N >= 2")
     return inputs, dt
 
 
@@ -71,50 +72,18 @@ def simulate(
     model: Model,
     params: Any,
     flight: Any,
-    *,
-    dt: Any = None,
-    initial_state: Any = None,
-    solver: str | dfx.AbstractSolver | None = None,
-    substeps: int = 4,
-    controller: dfx.AbstractStepSizeController | None = None,
-    delay: Any = None,
-    adjoint: dfx.AbstractAdjoint | None = None,
-    max_steps: int = 4096,
-    key: Any = None,
-    block: int = 1,
-    feedback: Callable[[Any, Any], Any] | None = None,
-    events: Mapping[str, Event] | None = None,
-    hold: Hold = None,
+    options: SimulationOptions = DEFAULT,
+    **keywords: Any,
 ) -> Trajectory:
     """Simulate one machine; each input is held until the next sample, or linear between the two.
 
     Args:
+        model: of one machine; `jax.vmap` over the other arguments simulates many.
+        params: the model's Params, SI.
         flight: a Flight, or the model's Inputs with arrays (N,) and `dt` [s].
-        initial_state: the model's State at the first sample; `model.initial_state` unless given.
-        solver: "exact" (linear models, the default there), "rk4" (the default elsewhere), or any
-            diffrax solver.
-        substeps: steps per sample for fixed-step solvers.
-        controller: a diffrax step-size controller makes the steps adaptive, with Dopri8 unless
-            another solver is given; they end at every sample.
-        delay: the inputs act this much later (+) or earlier (-) than given [s]; differentiable.
-            Before the first sample its value holds, after the last the last one's.
-        adjoint: `diffrax.DirectAdjoint()` unless given: forward and reverse mode both work.
-            `ForwardMode()` compiles faster, `RecursiveCheckpointAdjoint()` saves memory in
-            reverse mode.
-        max_steps: bound on adaptive steps a sample; where it ends a run, `result` says so.
-        key: a JAX random key: the model's own noise is drawn with it, by the discrete process
-            noise of a sample: exact for linear models with solver "exact", of the model linearised
-            at each sample for others with fixed steps; without it there is none.
-        block: samples per step of solver "exact"; 32 is three times as fast as 1 for a single
-            record, 1 is best for large batches.
-        feedback: feedback(state, inputs) -> Inputs that act, once a sample; `inputs` are the given
-            ones at that sample (references, or what is added).
-        events: by name, event(params, state, inputs) -> a number that is above zero while the run
-            goes on (see `heli_jax.simulation.events`). The first to fall to zero or below ends
-            the run: from there on the state stays as it was at that moment.
-        hold: what the inputs do between samples: "zero-order" (each sample stays until the next)
-            or "linear" (straight lines), for all or by input. Unless given, as the Flight says;
-            given as arrays they stay.
+        options: how; all defaults unless given.
+        **keywords: fields of SimulationOptions, in place of those of `options`: `dt`, `solver`,
+            `initial_state`, `delay`, `key`, `hold`, ...
 
     Returns:
         A Trajectory; a failed integration is in its `status`, never an exception.
@@ -123,53 +92,20 @@ def simulate(
         ValueError: "exact" for a model that is not linear, an unknown solver, wrong shapes, a key
             for a model without noise or with adaptive steps, feedback with a delay or with a
             linear hold, or an unknown hold.
+        TypeError: a keyword that is no option.
     """
-    linear = linear_inputs(model, flight, hold)
-    inputs, dt = held_inputs(model, flight, dt)
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    x0 = start_state(model, params, initial_state, inputs, dt)
-    adjoint = dfx.DirectAdjoint() if adjoint is None else adjoint
-    method, held, term = per_sample(
-        model, params, inputs, dt, solver, substeps, delay, controller, linear
-    )
-    if isinstance(method, Adaptive):
-        method = dataclasses.replace(method, adjoint=adjoint, max_steps=max_steps)
-        if key is not None:
-            raise ValueError("noise is drawn with fixed steps only")
-    if feedback is not None:
-        if delay is not None:
-            raise ValueError("feedback is for runs without a delay only")
-        if linear:
-            raise ValueError(
-                "feedback acts once a sample and is held until the next, expected are inputs with "
-                "hold='zero-order'"
-            )
-        method = Fed(method, feedback)
-    if key is not None:
-        method, held = _with_noise(model, held, method, dt, key)
-    if block != 1:
-        _require_blocks(method, block, events)
-        states, result = blockwise(held, block, x0), dfx.RESULTS.successful
-    else:
-        held = held.in_scalars()
-        states, result, dtype = None, None, jax.tree.leaves(x0)[0].dtype
-        if events:
-            over = functools.partial(any_over, events, params)
-            first = 1.0 - over(x0, at(inputs, 0)).astype(dtype)
-            stopping = Stopping(method, over, linear)
-            (states, _), result = _stepwise(stopping, held, term, (x0, first), n, adjoint)
-        else:
-            states, result = _stepwise(method, held, term, x0, n, adjoint)
-    acting = inputs
-    if delay is not None:
-        acting = acting_inputs(inputs, dt, delay, n, linear)
-    if feedback is not None:
-        acting = jax.vmap(feedback)(states, inputs)
-    step = jnp.asarray(dt, jnp.result_type(dt) if hasattr(dt, "dtype") else float)
-    times = jnp.arange(n, dtype=step.dtype) * step
+    options = options.changed(keywords)
+    linear = linear_inputs(model, flight, options.hold)
+    inputs, dt = held_inputs(model, flight, options.dt)
+    options = options._replace(dt=dt)
+    x0 = start_state(model, params, options.initial_state, inputs, dt)
+    run = _method_with_extras(model, params, inputs, options, linear)
+    states, result = _states(run, x0, inputs, options, linear)
+    acting = _acting(inputs, states, options, linear)
+    times = _times(inputs, dt)
     end = NO_END
-    if events:
-        states, end = stopped(model, params, events, times, states, acting, linear)
+    if options.events:
+        states, end = stopped(model, params, options.events, times, states, acting, linear)
     outputs = jax.vmap(lambda x, u: model.output(params, x, u))(states, acting)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(states)]))
     outside = {}
@@ -177,6 +113,73 @@ def simulate(
         limits = model.limits
         outside = jax.vmap(lambda x, u: limits(params, x, u))(states, acting)
     return Trajectory(times, states, outputs, acting, result, finite, outside, *end)
+
+
+def _method_with_extras(
+    model: Model,
+    params: Any,
+    inputs: Any,
+    options: SimulationOptions,
+    linear: tuple[bool, ...],
+) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
+    """The solver of a run with what `simulate` alone has: feedback and process noise."""
+    method, args, term = per_sample(model, params, inputs, options, linear)
+    if isinstance(method, Adaptive) and options.key is not None:
+        # A step of the controller's choice would have noise of another covariance.
+        raise ValueError("noise is drawn with fixed steps only")
+    if options.feedback is not None:
+        if options.delay is not None:
+            raise ValueError("feedback is for runs without a delay only")
+        if linear:
+            raise ValueError(
+                "feedback acts once a sample and is held until the next, expected are inputs with "
+                "hold='zero-order'"
+            )
+        method = StateFeedback(method, options.feedback)
+    if options.key is not None:
+        method, args = _with_noise(model, args, method, options.dt, options.key)
+    return method, args, term
+
+
+def _states(
+    run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm],
+    x0: Any,
+    inputs: Any,
+    options: SimulationOptions,
+    linear: tuple[bool, ...],
+) -> tuple[Any, dfx.RESULTS]:
+    """The states (N,), and what diffrax says of the integration."""
+    method, args, term = run
+    if options.block != 1:
+        _require_blocks(method, options.block, options.events)
+        return blockwise(args, options.block, x0), dfx.RESULTS.successful
+    args = args.in_scalars()
+    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+    if not options.events:
+        return _stepwise(method, args, term, x0, adjoint)
+    over = functools.partial(any_over, options.events, args.params)
+    # A number, since diffrax counts with all that it carries: 1 while the run goes on.
+    going = 1.0 - over(x0, at(inputs, 0)).astype(jax.tree.leaves(x0)[0].dtype)
+    (states, _), result = _stepwise(
+        Stopping(method, over, linear), args, term, (x0, going), adjoint
+    )
+    return states, result
+
+
+def _acting(inputs: Any, states: Any, options: SimulationOptions, linear: tuple[bool, ...]) -> Any:
+    """The inputs (N,) as they acted: late, or with the feedback's part."""
+    if options.feedback is not None:
+        return jax.vmap(options.feedback)(states, inputs)
+    if options.delay is None:
+        return inputs
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    return acting_inputs(inputs, options.dt, options.delay, n, linear)
+
+
+def _times(inputs: Any, dt: Any) -> Float[Array, " N"]:
+    """The samples' times from 0 [s], in the type of dt."""
+    step = jnp.asarray(dt, jnp.result_type(dt) if hasattr(dt, "dtype") else float)
+    return jnp.arange(jax.tree.leaves(inputs)[0].shape[0], dtype=step.dtype) * step
 
 
 def start_state(model: Model, params: Any, initial_state: Any, inputs: Any, dt: Any) -> Any:
@@ -217,32 +220,38 @@ def per_sample(
     model: Model,
     params: Any,
     inputs: Any,
-    dt: Any,
-    solver: Any,
-    substeps: int,
-    delay: Any,
-    controller: dfx.AbstractStepSizeController | None,
+    options: SimulationOptions,
     linear: tuple[bool, ...] = (),
-) -> tuple[dfx.AbstractSolver, Held, dfx.ODETerm]:
-    """The solver, its arguments and the term for time counted in samples."""
+) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
+    """The solver, its arguments and the term for time counted in samples.
+
+    Args:
+        model: of one machine.
+        params: the model's Params, SI.
+        inputs: the model's Inputs, arrays (N,).
+        options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    controller, solver = options.controller, options.solver
     method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
     if controller is not None and isinstance(method, Exact | RK4):
         raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
-    parts = None if delay is None else split_delay(delay, dt)
+    parts = None if options.delay is None else split_delay(options.delay, options.dt)
 
     term = field_term(model, model.vector_field)
-    dt = jnp.asarray(dt, jax.tree.leaves(inputs)[0].dtype)
+    dt = jnp.asarray(options.dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         late = None if parts is None else parts[1] * dt
         discrete = discretize(model, params, dt, late, linear)
-        return method, Held(params, inputs, dt, parts, discrete), term
-    if substeps < 1:
-        raise ValueError(f"substeps is {substeps}, wanted is at least 1")
-    held = Held(params, inputs, dt, parts, None)
-    if controller is not None:
-        adaptive = Adaptive(method, 1, controller, dfx.DirectAdjoint(), 4096, linear=linear)
-        return adaptive, held, term
-    return PerSample(method, substeps, linear=linear), held, term
+        return method, ZeroOrderHoldArgs(params, inputs, dt, parts, discrete), term
+    if options.substeps < 1:
+        raise ValueError(f"substeps must be at least 1, got {options.substeps}")
+    args = ZeroOrderHoldArgs(params, inputs, dt, parts, None)
+    if controller is None:
+        return PerSample(method, options.substeps, linear=linear), args, term
+    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+    adaptive = Adaptive(method, 1, controller, adjoint, options.max_steps, linear=linear)
+    return adaptive, args, term
 
 
 def held_columns(
@@ -253,65 +262,85 @@ def held_columns(
     delay: Any,
     linear: tuple[bool, ...] = (),
 ) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
-    """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k."""
-    _, held, _ = per_sample(model, params, inputs, dt, "exact", 1, delay, None, linear)
-    assert held.discrete is not None
-    B, U = columns(held)
+    """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k.
+
+    Args:
+        model: linear, with n states and m inputs.
+        params: the model's Params, SI.
+        inputs: the model's Inputs, arrays (N,).
+        dt: [s].
+        delay: as in `SimulationOptions`.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    options = SimulationOptions(dt=dt, solver="exact", delay=delay)
+    _, args, _ = per_sample(model, params, inputs, options, linear)
+    assert args.discrete is not None
+    B, U = columns(args)
     n = U.shape[0]
     acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
-    return held.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
+    return args.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
 
 
 def _require_blocks(method: Any, block: int, events: Any) -> None:
     if block < 1:
-        raise ValueError(f"block is {block}, wanted is at least 1")
+        raise ValueError(f"block must be at least 1, got {block}")
     if not isinstance(method, Exact) or events:
         raise ValueError("block is for solver='exact' without feedback and events only")
 
 
-def _with_noise(model: Model, held: Held, method: Any, dt: Any, key: Any) -> tuple[Any, Held]:
+def _with_noise(
+    model: Model, args: ZeroOrderHoldArgs, method: Any, dt: Any, key: Any
+) -> tuple[Any, ZeroOrderHoldArgs]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
-    if model.noise is None:
+    if model.noise_intensity is None:
         raise ValueError(f"model {model.name!r} has no noise to draw: see with_disturbance")
-    if held.delay is not None:
+    if args.delay is not None:
         raise ValueError("noise is drawn without a delay only")
-    n = jax.tree.leaves(held.inputs)[0].shape[0]
-    dtype, states = jax.tree.leaves(held.inputs)[0].dtype, len(naming.names(model.State))
-    if not isinstance(method, Exact) or held.discrete is None:
-        feedback = method.feedback if isinstance(method, Fed) else None
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
+    dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
+    if not isinstance(method, Exact) or args.discrete is None:
+        feedback = method.feedback if isinstance(method, StateFeedback) else None
         draws = jax.random.normal(key, (n, states), dtype)
-        held = held._replace(inputs=(held.inputs, tuple(draws.T)))
-        return Noisy(method, functools.partial(_kick, model, held.params, held.dt, feedback)), held
-    L = square_root(process_noise(model, held.params, dt))
+        args = args._replace(inputs=(args.inputs, tuple(draws.T)))
+        return WithProcessNoise(
+            method, functools.partial(add_process_noise, model, args, feedback)
+        ), args
+    L = square_root(process_noise(model, args.params, dt))
     draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
-    discrete = held.discrete._replace(Bd=jnp.concatenate([held.discrete.Bd, L], axis=1))
+    discrete = args.discrete._replace(Bd=jnp.concatenate([args.discrete.Bd, L], axis=1))
     if discrete.Bn is not None:
         # The draws are no inputs: nothing of them comes from the next sample.
         Bn = jnp.concatenate([discrete.Bn, jnp.zeros_like(L)], axis=1)
         discrete = discrete._replace(Bn=Bn)
-    return method, held._replace(inputs=(held.inputs, tuple(draws.T)), discrete=discrete)
+    return method, args._replace(inputs=(args.inputs, tuple(draws.T)), discrete=discrete)
 
 
-def _kick(
-    model: Model, params: Any, dt: Any, feedback: Any, state: Any, inputs: Any, draws: Any
+def add_process_noise(
+    model: Model, args: ZeroOrderHoldArgs, feedback: Any, state: Any, inputs: Any, draws: Any
 ) -> Any:
-    """The state after a sample with the noise of that sample, of the model linearised there."""
+    """The state after a sample with the noise of that sample, of the model linearised there.
+
+    Args:
+        model: one with a noise intensity, n states.
+        args: of which the parameters and dt count.
+        feedback: None, or what makes the acting inputs of the given ones.
+        state: before the noise is added.
+        inputs: of the sample.
+        draws: n standard normal numbers.
+    """
+    params, dt = args.params, args.dt
     if feedback is not None:
         inputs = feedback(state, inputs)
-    names = naming.names(model.State)
-    x = jnp.stack([getattr(state, n) for n in names])
+    x = naming.ravel(state)
 
     def rates(x: Array) -> Array:
-        at = model.State(**{n: x[i] for i, n in enumerate(names)})
-        found = naming.asdict(model.vector_field(params, at, inputs))
-        return jnp.stack([jnp.asarray(found[n], x.dtype) for n in names])
+        derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
+        return naming.ravel(derivatives, x.dtype, naming.names(model.State))
 
-    assert model.noise is not None
-    given = naming.asdict(model.noise(params))
-    g = jnp.stack([jnp.asarray(given[n], x.dtype) for n in names])
-    L = square_root(moved(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
-    new = x + L @ jnp.stack(draws)
-    return model.State(**{n: new[i] for i, n in enumerate(names)})
+    assert model.noise_intensity is not None
+    g = naming.ravel(model.noise_intensity(params), x.dtype, naming.names(model.State))
+    L = square_root(van_loan(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
+    return naming.unravel(model.State, x + L @ jnp.stack(draws))
 
 
 class _Field(eqx.Module):
@@ -323,15 +352,16 @@ class _Field(eqx.Module):
     def __call__(self, t: Any, x: Any, now: Any) -> Any:
         if not isinstance(x, self.State):
             return jax.tree.map(jnp.zeros_like, x)
-        if isinstance(now, Held):
+        if isinstance(now, ZeroOrderHoldArgs):
             return x  # only the shapes are asked for; the inputs may not be the model's
-        if isinstance(now, Moving):
+        if isinstance(now, RampArgs):
             now = now.after(t)
         return self.vector_field(now.params, x, now.inputs)
 
 
 def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> dfx.ODETerm:
-    """The vector field, per second, within one sample; of its parameters as `Held` has them.
+    """The vector field, per second, within one sample; of its parameters as those of
+    `ZeroOrderHoldArgs`.
 
     diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
     """
@@ -339,8 +369,14 @@ def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> df
 
 
 def _stepwise(
-    method: Any, held: Held, term: dfx.ODETerm, x0: Any, n: int, adjoint: Any
+    method: Any,
+    args: ZeroOrderHoldArgs,
+    term: dfx.ODETerm,
+    x0: Any,
+    adjoint: dfx.AbstractAdjoint,
 ) -> tuple[Any, dfx.RESULTS]:
+    """The states from x0 on, one step a sample: time is counted in samples."""
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype = jax.tree.leaves(x0)[0].dtype
     sol = dfx.diffeqsolve(
         term,
@@ -349,7 +385,7 @@ def _stepwise(
         t1=jnp.asarray(n - 1, dtype),
         dt0=jnp.ones((), dtype),
         y0=x0,
-        args=held,
+        args=args,
         saveat=dfx.SaveAt(t0=True, steps=True),
         max_steps=n - 1,
         adjoint=adjoint,

@@ -18,7 +18,7 @@ from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.hold import at, at_end, segments
 
 
-class Held(NamedTuple):
+class ZeroOrderHoldArgs(NamedTuple):
     """What a step needs to know: the parameters and the inputs, sample by sample.
 
     `inputs` holds arrays (N,). `delay` is None, or the whole samples (integer) and the rest
@@ -32,28 +32,29 @@ class Held(NamedTuple):
     delay: Any
     discrete: Discrete | None
 
-    def in_scalars(self) -> "Held":
+    def in_scalars(self) -> "ZeroOrderHoldArgs":
         """As a solver steps with it."""
         if self.discrete is None:
             return self
         return self._replace(discrete=self.discrete.in_scalars())
 
 
-class Now(NamedTuple):
+class IntervalArgs(NamedTuple):
     """The arguments of a vector field within one interval: parameters and the held inputs."""
 
     params: Any
     inputs: Any
 
 
-class Moving(NamedTuple):
-    """As `Now`, for inputs that move: those at the begin of a step, and their slope per second."""
+class RampArgs(NamedTuple):
+    """As `IntervalArgs`, for inputs that move: those at the begin of a step, and their slope per
+    second."""
 
     params: Any
     inputs: Any
     slope: Any
 
-    def after(self, t: Any) -> "Moving":
+    def after(self, t: Any) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
@@ -75,7 +76,7 @@ class _Stateless(dfx.AbstractSolver):
         return None
 
 
-class _Around(_Stateless):
+class _Wrapper(_Stateless):
     """A solver of whole samples around another."""
 
     solver: dfx.AbstractSolver
@@ -94,10 +95,17 @@ class Exact(_Stateless):
         return None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
+        return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0))))
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: ZeroOrderHoldArgs,
+        solver_state: Any,
+        made_jump: Any,
     ) -> Any:
         assert args.discrete is not None
         k = _sample(t0)
@@ -170,9 +178,9 @@ class RK4(_Stateless):
 
     @staticmethod
     def _rolled(f: Any, along: Any, t0: Any, h: Any, y0: Any) -> Any:
-        def stage(carry: Any, one: Any) -> Any:
+        def stage(carry: Any, node: Any) -> Any:
             total, slope = carry
-            reach, weight = one
+            reach, weight = node
             slope = f(t0 + reach * h, along(y0, slope, reach * h))
             return (along(total, slope, weight * h), slope), None
 
@@ -183,7 +191,7 @@ class RK4(_Stateless):
         return y1
 
 
-class PerSample(_Around):
+class PerSample(_Wrapper):
     """Any solver inside one sample: `substeps` equal steps.
 
     With a delayed input the interval has two parts, before and after the change of the input,
@@ -195,31 +203,40 @@ class PerSample(_Around):
     """of each input whether it is linear between samples; () holds all"""
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return self.solver.func(terms, t0, y0, Now(args.params, at(args.inputs, _sample(t0))))
+        return self.solver.func(
+            terms, t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0)))
+        )
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: ZeroOrderHoldArgs,
+        solver_state: Any,
+        made_jump: Any,
     ) -> Any:
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, _sample(t0)):
-            y, one = self._steps(terms, length / self.substeps, y, now)
-            result = dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)
+            y, part = self._steps(terms, length / self.substeps, y, now)
+            result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
         return y, None, {"y0": y0, "y1": y}, None, result
 
-    def _parts(self, args: Held, k: Any) -> list[tuple[Any, Now | Moving]]:
+    def _parts(self, args: ZeroOrderHoldArgs, k: Any) -> list[tuple[Any, IntervalArgs | RampArgs]]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""
         if self.linear:
             parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
-            return [(p.length, Moving(args.params, p.inputs, p.slope)) for p in parts]
+            return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
         if args.delay is None:
-            return [(args.dt, Now(args.params, at(args.inputs, k)))]
+            return [(args.dt, IntervalArgs(args.params, at(args.inputs, k)))]
         whole, rest = args.delay
         return [
-            (rest * args.dt, Now(args.params, at(args.inputs, k - whole - 1))),
-            ((1.0 - rest) * args.dt, Now(args.params, at(args.inputs, k - whole))),
+            (rest * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole - 1))),
+            ((1.0 - rest) * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole))),
         ]
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: Now | Moving) -> Any:
+    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
         """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
         moves it is counted from the step's begin, so each begins at 0: a step length that is the
         same number in all steps makes the code faster.
@@ -228,13 +245,13 @@ class PerSample(_Around):
 
         def body(carry: Any, j: Any) -> Any:
             y, result = carry
-            here = now.after(j * h) if isinstance(now, Moving) else now
+            here = now.after(j * h) if isinstance(now, RampArgs) else now
             state = self.solver.init(terms, begin, h, y, here)
-            y, _, _, _, one = self.solver.step(terms, begin, h, y, here, state, False)
-            return (y, dfx.RESULTS.where(result == dfx.RESULTS.successful, one, result)), None
+            y, _, _, _, part = self.solver.step(terms, begin, h, y, here, state, False)
+            return (y, dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)), None
 
         carry = (y0, dfx.RESULTS.successful)
-        steps = jnp.arange(self.substeps, dtype=h.dtype) if isinstance(now, Moving) else None
+        steps = jnp.arange(self.substeps, dtype=h.dtype) if isinstance(now, RampArgs) else None
         (y, result), _ = jax.lax.scan(body, carry, steps, length=self.substeps)
         return y, result
 
@@ -246,7 +263,7 @@ class Adaptive(PerSample):
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: Now | Moving) -> Any:
+    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
         sol = dfx.diffeqsolve(
             terms,
             self.solver,
@@ -267,7 +284,7 @@ class Adaptive(PerSample):
         return reached, fine
 
 
-class Fed(_Around):
+class StateFeedback(_Wrapper):
     """A per-sample solver whose inputs are a function of the state at the sample.
 
     feedback(state, given inputs of that sample) gives the inputs that are held.
@@ -276,14 +293,21 @@ class Fed(_Around):
     feedback: Callable[..., Any]
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: ZeroOrderHoldArgs,
+        solver_state: Any,
+        made_jump: Any,
     ) -> Any:
         u = self.feedback(y0, at(args.inputs, _sample(t0)))
         held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
         return self.solver.step(terms, t0, t1, y0, held, solver_state, made_jump)
 
 
-class Stopping(_Around):
+class Stopping(_Wrapper):
     """A per-sample solver that stays where it is after the first sample at which `over` holds.
 
     y = (state, going), where going is 1 until then and 0 from there on.
@@ -293,7 +317,14 @@ class Stopping(_Around):
     linear: tuple[bool, ...] = eqx.field(static=True, default=())
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: ZeroOrderHoldArgs,
+        solver_state: Any,
+        made_jump: Any,
     ) -> Any:
         state, going = y0
         new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
@@ -305,27 +336,34 @@ class Stopping(_Around):
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
-class Noisy(_Around):
-    """A per-sample solver whose state is kicked after every sample.
+class WithProcessNoise(_Wrapper):
+    """A per-sample solver whose state gets its process noise after every sample.
 
-    The inputs are (the model's, standard normal numbers); kick(state, held inputs, numbers of that
-    sample) gives the new state.
+    The inputs are (the model's, standard normal numbers); add_noise(state, held inputs, numbers
+    of that sample) gives the new state.
     """
 
-    kick: Callable[..., Any]
+    add_noise: Callable[..., Any]
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Held, solver_state: Any, made_jump: Any
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        args: ZeroOrderHoldArgs,
+        solver_state: Any,
+        made_jump: Any,
     ) -> Any:
         inputs, draws = args.inputs
         held = args._replace(inputs=inputs)
         y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
         k = _sample(t0)
-        y1 = self.kick(y, at(inputs, k), at(draws, k))
+        y1 = self.add_noise(y, at(inputs, k), at(draws, k))
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
-class Accumulating(_Around):
+class Accumulating(_Wrapper):
     """A per-sample solver that carries a running value beside the state.
 
     y = (state, value); at each sample, before the step, value = update(value, state, held inputs

@@ -10,7 +10,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
-from heli_jax.analysis.trim import Condition, is_whole
+from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
 from heli_jax.errors import InputError, nearest
@@ -177,7 +177,7 @@ def job(
     lacking = [n for n in lacking if not all(n in f.known for f in flights)]
     if lacking:
         raise ValueError(f"vehicle: {', '.join(lacking)} missing, model {model.name} needs it")
-    if trimmed is not None and not is_whole(trimmed.of or model):
+    if trimmed is not None and not is_full_nonlinear(trimmed.of or model):
         raise ValueError(f"model {model.name!r} cannot be trimmed: it is not a whole helicopter")
     most = substeps_for(max(f.dt for f in flights)) if substeps is None else substeps
     if most < 1:
@@ -218,7 +218,7 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
                 f"axes.{name}: model {model.name} has nothing of that name{nearest(name, among)}"
             )
     if "seed" in design.names and "seed" not in params:
-        if model.noise is None:
+        if model.noise_intensity is None:
             raise ValueError(
                 f"axes.seed: model {model.name} draws nothing at random, wanted is a disturbance"
             )
@@ -349,7 +349,7 @@ def unread(one: Job) -> list[str]:
     model = one.model
     params = model.Params(**one.params)
     axes = [n for n in one.design.names if n in naming.names(model.Params)]
-    drawn = model.noise if "seed" in one.design.names else None
+    drawn = model.noise_intensity if "seed" in one.design.names else None
 
     def else_read(name: str) -> bool:
         missing = naming.replace(plain(params), **{name: np.float64(np.nan)})

@@ -130,8 +130,8 @@ BROKEN = {
         {"start": lambda p: State(0.0, 1.0 if p.Lp > 0 else 2.0)}, ["start", "jnp.where"],
     ),
     "start with a list": ({"start": lambda p: [0.0, 0.0]}, ["start", "State", "a list of 2"]),
-    "noise without a state": ({"noise": lambda p: p.Lp}, ["noise", "State"]),
-    "spread of a stranger": ({"spread": lambda p: {"q": p.Lp}}, ["spread", "'q'", "phi, p"]),
+    "noise without a state": ({"noise_intensity": lambda p: p.Lp}, ["noise_intensity", "State"]),
+    "sd of a stranger": ({"initial_sd": lambda p: {"q": p.Lp}}, ["initial_sd", "'q'", "phi, p"]),
     "limits that are none": ({"limits": lambda p, s, u: s.p > 1.0}, ["limits", "dictionary"]),
     "parameters that are no class": ({"Params": {"Lp": 1.0}}, ["Params", "NamedTuple", "a dict"]),
     "states that are an object": ({"State": State(0.0, 0.0)}, ["State", "NamedTuple"]),
@@ -221,10 +221,10 @@ def test_sound_models_pass():
     class Elsewhere(NamedTuple):  # the same fields by another class: for outputs that will do
         roll_rate: float
 
-    check_model(made(start=beginning, noise=lambda p: State(0.0, p.La)))
+    check_model(made(start=beginning, noise_intensity=lambda p: State(0.0, p.La)))
     check_model(made(vector_field=lambda p, s, u: State(phi=0.0, p=1)))
     check_model(made(output=lambda p, s, u: Elsewhere(s.p)))
-    check_model(made(limits=lambda p, s, u: {"fast": s.p > 1.0}, spread=lambda p: {"p": p.La}))
+    check_model(made(limits=lambda p, s, u: {"fast": s.p > 1.0}, initial_sd=lambda p: {"p": p.La}))
     with jax.numpy_dtype_promotion("strict"):
         check_model(made(output=lambda p, s, u: Outputs(2 * s.p)))
 

@@ -10,7 +10,7 @@ import scipy.linalg
 
 from heli_jax import models, naming, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.dynamics.model import correlation_of, spread_of
+from heli_jax.dynamics.model import correlation_of, initial_sd_of
 from heli_jax.dynamics.roll import on_stand
 from heli_jax.simulation.discretize import process_noise
 from tests.dynamics.paper import BENCH, matrices
@@ -65,7 +65,7 @@ def test_at_the_first_sample_the_disturbance_is_stationary(bench30, poles):
     model = with_disturbance(models.roll_on_stand, "roll", poles)
     p = model.Params(**naming.asdict(bench30), sigma_w=jnp.asarray(SIGMA), tau_w=jnp.asarray(TAU))
     dtype = jnp.result_type(float)
-    sds = np.asarray(spread_of(model, p, dtype))
+    sds = np.asarray(initial_sd_of(model, p, dtype))
     covariance = np.outer(sds, sds) * np.asarray(correlation_of(model, p, dtype))
     np.testing.assert_allclose(covariance[4:, 4:], stationary(poles)[4:, 4:], rtol=1e-12)
     np.testing.assert_array_equal(covariance[:4], 0.0)
@@ -134,8 +134,8 @@ def test_pitch_has_its_own_axis(bench30):
         ("yaw", 1, r"no axis 'yaw' to disturb; it has \['roll'\]"),
         ("heave", 1, "no axis 'heave'"),
         ("pitch", 1, "no axis 'pitch'"),
-        ("roll", 0, "poles is 0, wanted is 1 or 2"),
-        ("roll", 3, "poles is 3, wanted is 1 or 2"),
+        ("roll", 0, "poles must be 1 or 2, got 0"),
+        ("roll", 3, "poles must be 1 or 2, got 3"),
     ],
 )
 def test_what_cannot_be_disturbed(axis, poles, said):
@@ -152,4 +152,4 @@ def test_a_stand_keeps_the_disturbance(bench30):
     np.testing.assert_allclose(
         process_noise(one, params, DT), process_noise(other, params, DT), rtol=1e-12
     )
-    assert one.spread_names == other.spread_names == ("w1_roll",)
+    assert one.random_states == other.random_states == ("w1_roll",)

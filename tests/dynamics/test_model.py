@@ -1,5 +1,6 @@
 """Anyone's own model, its linearisation, and how models are named."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,8 +9,11 @@ import pytest
 import scipy.integrate
 
 from heli_jax import Model, linearize, models, simulate
+from heli_jax.analysis.linear import eigenmodes
+from heli_jax.analysis.trim import steady_flight
+from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import linear_misfit
+from heli_jax.dynamics.model import Axis, axes_of, linear_misfit
 from heli_jax.errors import InputError
 
 
@@ -157,3 +161,71 @@ def test_a_module_that_cannot_be_imported_is_an_input_error(tmp_path, name, text
     (tmp_path / f"{name}.py").write_text(text)
     with pytest.raises(InputError, match=f"f.yaml.*{name}"):
         models.by_name(f"{name}:model", "f.yaml", folder=tmp_path)
+
+
+class TurnState(NamedTuple):
+    angle: float
+    p: float
+
+
+class TurnParams(NamedTuple):
+    J: float
+    J_added: float
+    kappa: float = 3.0
+    zeta: float = 0.5
+
+
+def turning(**changes):
+    """A machine on one axis under names of its own."""
+    return Model(
+        "turn",
+        lambda p, s, u: TurnState(s.p, u.x_roll / (p.J + p.J_added)),
+        lambda p, s, u: models.roll.Outputs(s.angle, s.p),
+        TurnParams, TurnState, models.roll.Inputs, models.roll.Outputs, linear=True, **changes,
+    )  # fmt: skip
+
+
+def test_a_model_that_states_its_axes_is_disturbed_and_put_on_a_stand():
+    axis = Axis("bank", "p", "angle", "J", "J_added", "x_roll")
+    model = turning(axes=(axis,))
+    assert disturbable(model) == ["bank"]
+    assert disturbable(turning()) == []
+    assert disturbable(with_disturbance(model, "bank")) == ["bank"]
+    stand = models.on_stand(model)
+    assert stand.without_stand is model
+    x, u = TurnState(0.1, 0.2), models.roll.Inputs(0.0)
+    rates = stand.vector_field(TurnParams(2.0, 2.0), x, u)
+    assert rates.p == pytest.approx(-0.5 * (3.0 * 0.1 + 0.5 * 0.2))
+    shares = eigenmodes(stand, TurnParams(2.0, 2.0, zeta=0.1))
+    assert [mode.name for mode in shares] == ["bank"]
+
+
+@pytest.mark.parametrize("variant", ["paper", "consistent"])
+@pytest.mark.parametrize("more", [{}, {"dynamic_inflow": True}, {"first_order_bar": True}])
+def test_what_the_helicopter_states_is_what_its_names_say(variant, more):
+    model = models.helicopter(variant, wind=True, **more)
+    silent = dataclasses.replace(model, axes=None, steady_flight=None)
+    assert axes_of(silent) == axes_of(model)
+    assert steady_flight(silent) == steady_flight(model)
+    assert len(model.steady_flight.unknowns) == len(model.steady_flight.equations)
+
+
+def test_the_shipped_models_say_what_they_are():
+    assert models.roll_on_stand.without_stand is models.roll
+    assert models.pitch_on_stand.without_stand is models.pitch
+    assert models.roll.without_stand is None
+    for model in (models.roll, models.pitch):
+        assert axes_of(dataclasses.replace(model, axes=None)) == model.axes
+        assert steady_flight(model) is None
+
+
+@pytest.mark.parametrize(("old", "new"), [("noise", "noise_intensity"), ("spread", "initial_sd")])
+def test_the_old_keyword_of_a_model_is_told_its_new_name(old, new):
+    def function(p):
+        return {"p": 1.0}
+
+    with pytest.warns(DeprecationWarning, match=new):
+        model = turning(**{old: function})
+    assert getattr(model, new) is function
+    # Taken over once: what is made of the model says nothing more.
+    assert getattr(dataclasses.replace(model, name="other"), new) is function

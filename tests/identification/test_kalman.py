@@ -37,7 +37,7 @@ def dense(model, params, u, y, x0):
     n = A.shape[0]
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * DT)
     Ad, Bd = held[:n, :n], held[:n, n:]
-    G = np.diag([float(g) for g in asdict(model.noise(params)).values()])
+    G = np.diag([float(g) for g in asdict(model.noise_intensity(params)).values()])
     nodes, weights = np.polynomial.legendre.leggauss(30)
     Q = sum(
         0.5 * DT * w * F @ G @ G @ F.T

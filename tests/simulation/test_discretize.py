@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from heli_jax import Helicopter, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.numerics.matrix_exponential import expm, van_loan
 from heli_jax.simulation.discretize import (
     discretize,
-    expm,
-    moved,
     process_noise,
     square_root,
 )
@@ -52,7 +51,7 @@ def test_stiff_and_stable(rates, seed):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-14 * (10.0 + np.abs(rates).max()))
 
 
-step = jax.jit(moved)
+step = jax.jit(van_loan)
 
 
 @given(st.integers(0, 10**6), st.floats(-6.0, 2.0), st.lists(st.integers(-9, 9), min_size=5))

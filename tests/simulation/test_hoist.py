@@ -7,7 +7,7 @@ import pytest
 
 from heli_jax import models, naming
 from heli_jax.dynamics.model import zeros
-from heli_jax.simulation.hoist import hoisted
+from heli_jax.numerics.hoist import hoisted
 
 
 def operations(function, *arguments):

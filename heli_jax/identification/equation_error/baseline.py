@@ -10,7 +10,7 @@ from scipy.linalg import get_lapack_funcs
 
 from heli_jax import naming
 from heli_jax.analysis.lti import d2c
-from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.model import Model, reads
 from heli_jax.dynamics.roll import ratios_from_denominator
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error.rls import rls, transfer_function
@@ -213,7 +213,8 @@ def _combinations(
         ]
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     p = naming.replace(params, **known)
-    p = p if "stand" in model.name else naming.replace(p, zeta=0.0 * p.zeta)
+    # The vehicle may state a stand that this model does not stand on.
+    p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
     values = {n: float(v) for n, v in ratios.values.items()}
     doubts = []

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.model import correlation_of, spread_of
+from heli_jax.dynamics.model import correlation_of, initial_sd_of
 from heli_jax.identification.estimation.estimator import (
     Estimator,
     Evaluation,
@@ -310,8 +310,8 @@ def _disturbed(reached: Reached, u: Any, i: int, keys: Array) -> dict[str, Array
     flight, layout = reached.data.flights[i], reached.layout
     params, inputs = driven(layout, reached.data, u, i)
     start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
-    names, random = naming.names(layout.model.State), layout.model.spread_names
-    sds = spread_of(layout.model, params, reached.z.dtype)
+    names, random = naming.names(layout.model.State), layout.model.random_states
+    sds = initial_sd_of(layout.model, params, reached.z.dtype)
     # Factored without the sds, which may be zero.
     correlation = correlation_of(layout.model, params, reached.z.dtype)
     factor = sds[:, None] * jnp.linalg.cholesky(correlation)

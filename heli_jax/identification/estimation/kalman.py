@@ -18,8 +18,9 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
-from heli_jax.dynamics.model import Model, correlation_of, spread_of
-from heli_jax.simulation.discretize import moved, process_noise, product
+from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
+from heli_jax.numerics.matrix_exponential import product, van_loan
+from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import Hold, linear_inputs, segments
 from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
@@ -56,7 +57,7 @@ def innovations(
         inputs: the model's Inputs, arrays (N,).
         measured: outputs (N,); NaN where there is none.
         sd: standard deviation of the white measurement noise, by output, SI.
-        initial_state: the model's State at the first sample; the states that `model.spread`
+        initial_state: the model's State at the first sample; the states that `model.initial_sd`
             names are uncertain about it by that standard deviation (and `model.correlation`), the
             others not at all.
         delay: as in `simulate`.
@@ -69,8 +70,8 @@ def innovations(
     linear = linear_inputs(model, inputs, hold)
     x0 = model.initial_state(params) if initial_state is None else initial_state
     dtype = jax.tree.leaves(inputs)[0].dtype
-    x = _vector(x0, dtype)
-    sds = spread_of(model, params, dtype)
+    x = naming.ravel(x0, dtype)
+    sds = initial_sd_of(model, params, dtype)
     P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
@@ -210,16 +211,17 @@ def _local(
     dtype = jax.tree.leaves(inputs)[0].dtype
     dt = jnp.asarray(dt, dtype)
 
-    g = jnp.zeros(len(names), dtype) if model.noise is None else _vector(model.noise(params), dtype)
-
-    def state(x: Array) -> Any:
-        return model.State(**{n: x[i] for i, n in enumerate(names)})
+    g = (
+        jnp.zeros(len(names), dtype)
+        if model.noise_intensity is None
+        else naming.ravel(model.noise_intensity(params), dtype)
+    )
 
     def rates(x: Array, u: Any) -> Array:
-        return _vector(model.vector_field(params, state(x), u), dtype)
+        return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u), dtype)
 
     def outputs(x: Array, u: Any) -> Array:
-        return _vector(model.output(params, state(x), u), dtype)[rows]
+        return naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)[rows]
 
     n = jax.tree.leaves(inputs)[0].shape[0]
     parts, held, acting, slopes = (dt,), (inputs,), inputs, None
@@ -240,7 +242,7 @@ def _local(
 
     def along(carry: tuple[Array, Array], h: Array, u: Any) -> tuple[Array, Array]:
         x, P = carry
-        step = moved(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
+        step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
         return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
 
     def ramped(carry: tuple[Array, Array], h: Array, u: Any, slope: Any) -> tuple[Array, Array]:
@@ -251,7 +253,7 @@ def _local(
         _, b = jax.jvp(lambda u: rates(x, u), (u,), (slope,))
         one, none = jnp.ones(1, dtype), jnp.zeros(1, dtype)
         A = jnp.zeros((m + 1, m + 1), dtype).at[:m, :m].set(jax.jacfwd(rates)(x, u))
-        step = moved(
+        step = van_loan(
             A.at[:m, m].set(b), jnp.concatenate([rates(x, u), one]), jnp.concatenate([g, none]), h
         )
         Phi = step.Phi[:m, :m]
@@ -282,7 +284,3 @@ def _local(
         return carry
 
     return _Filter((held, acting, slopes), measure, move)
-
-
-def _vector(record: Any, dtype: Any) -> Array:
-    return jnp.stack([jnp.asarray(v, dtype) for v in naming.asdict(record).values()])

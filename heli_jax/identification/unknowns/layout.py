@@ -103,7 +103,7 @@ class Layout(eqx.Module):
         """The states whose initial values are unknowns: all that are not random there."""
         if not self.initial_state:
             return ()
-        random = self.model.spread_names
+        random = self.model.random_states
         return tuple(n for n in naming.names(self.model.State) if n not in random)
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from heli_jax import naming
-from heli_jax.analysis.trim import HOVER, Condition, is_whole, trim
+from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.simulate import simulate
 from heli_jax.vehicle import of_helicopter
@@ -64,7 +64,7 @@ def operating_point(
     if model.linear:
         return EVERYWHERE
     quiet = _undisturbed(model)
-    if is_whole(quiet):
+    if is_full_nonlinear(quiet):
         found = _trimmed(quiet, params, _condition(outputs, dt))
         if found is not None:
             return found._replace(state=_extended(model, found.state))

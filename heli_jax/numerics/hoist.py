@@ -1,5 +1,9 @@
 """What a function makes of the parameters alone, computed once instead of at every step."""
 
+# Why not leave it to XLA: `experiments/benchmarks/helicopter.py` runs batches of vehicles, in which
+# each quotient of two parameters is an array. XLA moves few such operations out of the loop over
+# time, and divisions are the slowest that there are.
+
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +28,8 @@ def hoisted(
     known = dict(zip(jaxpr.invars, leaves, strict=False))
     known |= dict(zip(jaxpr.constvars, closed.consts, strict=True))
     later = []
+    # An equation of what is known is computed now; what needs the others, or does more than
+    # compute, waits.
     for equation in jaxpr.eqns:
         inputs = [v for v in equation.invars if not isinstance(v, Literal)]
         if equation.effects or not all(v in known for v in inputs):
@@ -32,14 +38,14 @@ def hoisted(
         alone = jaxpr.replace(
             eqns=[equation], constvars=[], invars=inputs, outvars=equation.outvars,
         )  # fmt: skip
-        found = core.eval_jaxpr(alone, (), *(known[v] for v in inputs))
-        known |= dict(zip(equation.outvars, found, strict=True))
-    wanted = [v for e in later for v in e.invars] + list(jaxpr.outvars)
-    kept = list(dict.fromkeys(v for v in wanted if not isinstance(v, Literal) and v in known))
+        computed = core.eval_jaxpr(alone, (), *(known[v] for v in inputs))
+        known |= dict(zip(equation.outvars, computed, strict=True))
+    needed = [v for e in later for v in e.invars] + list(jaxpr.outvars)
+    kept = list(dict.fromkeys(v for v in needed if not isinstance(v, Literal) and v in known))
     rest = jaxpr.replace(eqns=later, constvars=kept, invars=jaxpr.invars[len(leaves) :])
 
     def remaining(values: list[Any], *others: Any) -> Any:
-        found = core.eval_jaxpr(rest, values, *jax.tree.leaves(others))
-        return jax.tree.unflatten(structure, found)
+        leaves = core.eval_jaxpr(rest, values, *jax.tree.leaves(others))
+        return jax.tree.unflatten(structure, leaves)
 
     return [known[v] for v in kept], remaining
