@@ -129,6 +129,16 @@ class Flight:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)
 
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_flight
+
+        return as_text(of_flight(self))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_flight
+
+        return as_html(of_flight(self))
+
 
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
     samples = np.array(values, dtype=np.float64)

@@ -25,8 +25,8 @@ from heli_jax.identification.validation.metrics import (
     metrics,
     whiteness,
 )
+from heli_jax.numbers import percent
 from heli_jax.report import frequency, style
-from heli_jax.report.numbers import percent
 from heli_jax.report.style import label, legend_above, line, subtitle
 
 BAND99 = 2.5758293035489004

@@ -16,9 +16,9 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import adequate_unjudged, whiteness_note
-from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.style import pretty
 from heli_jax.vehicle import Constant, of_helicopter
 
