@@ -1,6 +1,7 @@
 """YAML files, read with care: plain data alone, every key once, numbers as YAML 1.2 has them."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,11 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
 def parse_value(text: str, where: str) -> Any:
     """One value as it would stand behind a key: for `--set key=value`."""
     return _load(text, where)
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """Plain data as YAML, in its own order."""
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def _load(text: str, where: str) -> Any:
