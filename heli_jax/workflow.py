@@ -27,6 +27,7 @@ from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     import xarray as xr
+    from matplotlib.figure import Figure
 
     from heli_jax.sweeps.spec import Job
 
@@ -52,6 +53,24 @@ class FitRun:
     """where the report is, once it is written"""
     began: float = field(default_factory=time.perf_counter)
     """when the work began, by `time.perf_counter` [s]"""
+
+    def figure(self, name: str) -> "Figure":
+        """A figure of the report, drawn anew: `response_OUTPUT`, `bode`, `starts`, ...
+
+        Raises:
+            ValueError: the report has no figure of that name; the sentence lists those it has.
+        """
+        import matplotlib
+
+        from heli_jax.report import style
+        from heli_jax.report.html import drawings
+
+        draw = drawings(self.fit, self.problem, self.baseline, self.supplementary)
+        with matplotlib.rc_context(style.STYLE):
+            figure = draw[name]() if name in draw else None
+        if figure is None:
+            raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
+        return figure
 
     def __repr__(self) -> str:
         where = "" if self.directory is None else f"\n  report: {self.directory / 'report.html'}"

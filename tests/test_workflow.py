@@ -142,3 +142,25 @@ def test_no_sweep_is_said(config):
     plain = plain._replace(config=plain.config.model_copy(update={"sweep": None}))
     with pytest.raises(InputError, match="sweep: missing"):
         heli_jax.run_sweep(plain)
+
+
+def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
+    folder = config.parent
+    text = config.read_text().replace("{signal: stick, unit: m}", "{signal: stick}")
+    text = text.replace("{signal: roll, unit: rad, sd", "{signal: roll, sd")
+    path = folder / "no-units.yaml"
+    path.write_text(text)
+    assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 0
+    told = capsys.readouterr().err
+    assert "bench.csv: x_roll: no unit stated, taken as m\n" in told
+    assert "bench.csv: roll: no unit stated, taken as rad\n" in told
+    saved = heli_jax.load_fit(tmp_path / "fit")
+    assert saved.content["data"][0]["notes"] == [
+        "x_roll: no unit stated, taken as m",
+        "roll: no unit stated, taken as rad",
+    ]
+    page = (tmp_path / "fit/report.html").read_text()
+    assert "x_roll: no unit stated, taken as m" in page
+    with_units = heli_jax.run_fit(config)
+    assert with_units.problem.flights[0].source.notes == ()
+    assert with_units.fit.estimates == saved.estimates

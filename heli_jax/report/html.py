@@ -49,7 +49,7 @@ def write_report(
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
-    for name, draw in _drawings(fit, problem, baseline, supplementary).items():
+    for name, draw in drawings(fit, problem, baseline, supplementary).items():
         drawn = style.save(draw, folder / name)
         if drawn is not None:
             data = base64.b64encode(drawn[1]).decode("ascii")
@@ -63,7 +63,7 @@ def write_report(
 type Draw = Callable[[], Figure | None]
 
 
-def _drawings(
+def drawings(
     fit: Fit, problem: Problem, baseline: Baseline | None, supplementary: SupplementaryAnalyses
 ) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
