@@ -56,7 +56,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:
-        raise InputError(f"{path}: is not text, wanted is a YAML file") from e
+        raise InputError(f"{path}: is not text, expected a YAML file") from e
     return parse_mapping(text, str(path))
 
 
@@ -65,7 +65,7 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     value = _load(text, where)
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{where}: holds {found}, wanted are keys with values")
+        raise InputError(f"{where}: holds {found}, expected keys with values")
     return value
 
 
@@ -94,7 +94,7 @@ def _load(text: str, where: str) -> Any:
         mark = e.problem_mark or e.context_mark
         line = f", line {mark.line + 1}" if mark else ""
         problem = " ".join(str(e.problem or e.context or "broken").split())
-        raise InputError(f"{where}{line}: {problem}; wanted is plain YAML") from e
+        raise InputError(f"{where}{line}: {problem}; expected plain YAML") from e
     except (
         yaml.YAMLError,
         ValueError,

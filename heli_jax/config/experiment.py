@@ -121,7 +121,7 @@ def _child(at: Any, name: str, where: str) -> Any:
 
 def _index(at: list[Any], name: str, where: str) -> int:
     if not name.isdigit() or int(name) >= len(at):
-        raise InputError(f"{where}: found {name!r}, wanted is a number from 0 to {len(at) - 1}")
+        raise InputError(f"{where}: got {name!r}, expected a number from 0 to {len(at) - 1}")
     return int(name)
 
 
@@ -146,7 +146,7 @@ def _sentence(error: Any) -> str:
     message = message[0].lower() + message[1:]
     if isinstance(found, dict | list) or error["type"] == "value_error":
         return f"{place}: {message}"
-    return f"{place}: found {found!r:.60}, {message.replace('input should be', 'wanted is')}"
+    return f"{place}: got {found!r:.60}, {message.replace('input should be', 'expected')}"
 
 
 def _place(loc: tuple[Any, ...]) -> str:
