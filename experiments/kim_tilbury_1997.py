@@ -30,9 +30,9 @@ from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.validation.metrics import Metrics, metrics
 from heli_jax.naming import asdict, replace, unit
+from heli_jax.numbers import measured, number, percent
 from heli_jax.report import style
 from heli_jax.report.files import fit_json, write_json
-from heli_jax.report.numbers import measured, number, percent
 from heli_jax.simulation.inputs import random_steps
 from heli_jax.versions import versions
 

@@ -24,12 +24,24 @@ if TYPE_CHECKING:
     from heli_jax.identification.problem import Nuisance as Nuisance
     from heli_jax.identification.problem import Prior as Prior
     from heli_jax.identification.problem import Problem as Problem
+    from heli_jax.identification.result import Fit as Fit
+    from heli_jax.identification.uncertainty.comparison import intervals as intervals
+    from heli_jax.report.saved_fit import SavedFit as SavedFit
+    from heli_jax.report.saved_fit import load_fit as load_fit
     from heli_jax.simulation.accumulate import accumulate as accumulate
     from heli_jax.simulation.options import SimulationOptions as SimulationOptions
     from heli_jax.simulation.simulate import simulate as simulate
+    from heli_jax.simulation.trajectory import Trajectory as Trajectory
     from heli_jax.sweeps.run import sweep as sweep
     from heli_jax.vehicle import Helicopter as Helicopter
     from heli_jax.vehicle import load_vehicle as load_vehicle
+    from heli_jax.workflow import FitRun as FitRun
+    from heli_jax.workflow import compare_models as compare_models
+    from heli_jax.workflow import load_config as load_config
+    from heli_jax.workflow import run_check as run_check
+    from heli_jax.workflow import run_fit as run_fit
+    from heli_jax.workflow import run_sweep as run_sweep
+    from heli_jax.workflow import write_report as write_report
 
 _HOMES = {
     "Helicopter": "vehicle",
@@ -54,6 +66,18 @@ _HOMES = {
     "d2c": "analysis.lti",
     "linearize": "analysis.linear",
     "trim": "analysis.trim",
+    "Fit": "identification.result",
+    "Trajectory": "simulation.trajectory",
+    "intervals": "identification.uncertainty.comparison",
+    "SavedFit": "report.saved_fit",
+    "load_fit": "report.saved_fit",
+    "FitRun": "workflow",
+    "compare_models": "workflow",
+    "load_config": "workflow",
+    "run_check": "workflow",
+    "run_fit": "workflow",
+    "run_sweep": "workflow",
+    "write_report": "workflow",
 }
 
 

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -78,47 +78,60 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Any, words: str) -> argparse.ArgumentParser:
-        one = commands.add_parser(name, help=words, description=words)
-        one.set_defaults(run=run)
-        return one
-
-    def with_config(one: argparse.ArgumentParser) -> None:
-        one.add_argument("config", metavar="CONFIG", help="experiment configuration (YAML)")
-        one.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="KEY=VALUE",
-            help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50",
-        )
+    def command(name: str, run: Callable[[argparse.Namespace], int], words: str) -> Any:
+        added = commands.add_parser(name, help=words, description=words)
+        added.set_defaults(run=run)
+        return added
 
     fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
-    with_config(fit)
+    _add_config(fit)
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
-    with_config(check)
+    _add_config(check)
     simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
-    with_config(simulate)
-    simulate.add_argument("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)")
-    simulate.add_argument(
+    _add_config(simulate)
+    _add_simulate_options(simulate)
+    sweep = command("sweep", _sweep, "run a design of many vehicles; results in a Zarr store")
+    _add_config(sweep)
+    _add_sweep_options(sweep)
+    info = command("info", _info, "signals, rates, duration and gaps of a log")
+    info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
+    info.add_argument("--time", metavar="NAME", help="the column of time stamps")
+    return parser
+
+
+def _add_config(command: argparse.ArgumentParser) -> None:
+    command.add_argument("config", metavar="CONFIG", help="experiment configuration (YAML)")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50",
+    )
+
+
+def _add_simulate_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)")
+    command.add_argument(
         "--view",
         nargs="?",
         const="",
         metavar="HTML",
         help="also a page with figures and the flight in 3D (default: beside --out)",
     )
-    sweep = command("sweep", _sweep, "run a design of many vehicles; results in a Zarr store")
-    with_config(sweep)
-    sweep.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
-    sweep.add_argument(
+
+
+def _add_sweep_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+    command.add_argument(
         "--resume", action="store_true", help="go on where the sweep in --out was ended"
     )
-    sweep.add_argument(
+    command.add_argument(
         "--devices", type=_count, metavar="N", help="processor cores or GPUs to use (default: all)"
     )
-    sweep.add_argument("--no-figures", action="store_true", help="draw none: it takes seconds")
-    where = sweep.add_mutually_exclusive_group()
+    command.add_argument("--no-figures", action="store_true", help="draw none: it takes seconds")
+    where = command.add_mutually_exclusive_group()
     where.add_argument(
         "--workers", type=_count, metavar="N", help="compute in N processes of a local dask cluster"
     )
@@ -127,15 +140,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="tcp://HOST:8786",
         help="compute on the workers of this dask scheduler",
     )
-    info = command("info", _info, "signals, rates, duration and gaps of a log")
-    info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
-    info.add_argument("--time", metavar="NAME", help="the column of time stamps")
-    return parser
 
 
 def _count(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"found {text!r}, wanted is a number from 1")
+        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
     return int(text)
 
 
@@ -160,52 +169,17 @@ def _cache() -> Path:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    begin = time.perf_counter()
+    began = time.perf_counter()  # before JAX is imported, which the user waits for too
     config = Path(options.config)
     out = Path(options.out) if options.out else run_directory.default_directory(config)
     run_directory.require_free(out)
     _prepare_jax()
-    from heli_jax import config as configuration
-    from heli_jax.identification.equation_error.baseline import baseline
-    from heli_jax.identification.fit import fit
+    from heli_jax import output, workflow
 
-    experiment = configuration.load(config, options.set)
-    problem = configuration.problem(experiment)
-    wanted = experiment.config.fit
-    assert wanted is not None
-    _warn_reading(problem)
-    try:
-        found = fit(
-            problem,
-            starts=wanted.starts,
-            seed=wanted.seed,
-            max_steps=wanted.max_steps,
-            progress=_say,
-        )
-    except ValueError as e:
-        raise InputError(f"{config}: fit: {e}") from e
-    rls = None
-    if experiment.config.rls is not None:
-        _say("recursive least squares")
-        started = time.perf_counter()
-        try:
-            rls = baseline(
-                experiment.model,
-                experiment.vehicle.params,
-                problem.training[0],
-                order=experiment.config.rls.order,
-                forgetting=experiment.config.rls.forgetting,
-            )
-        except ValueError as e:
-            _say(f"no baseline: {e}")
-        found.timing["rls"] = time.perf_counter() - started
-    from heli_jax import output
-
-    further = _further(experiment, problem, found)
-    _say("writing the report")
-    output.write_fit(out, experiment, problem, found, rls, further, begin)
-    output.print_fit(problem, found, rls, further, out)
-    return _fit_code(found)
+    experiment = workflow.load_config(config, options.set)
+    run = workflow.run_fit(experiment, out, progress=_say, began=began)
+    output.print_fit(run)
+    return _fit_code(run.fit)
 
 
 def _fit_code(found: Any) -> int:
@@ -218,71 +192,25 @@ def _fit_code(found: Any) -> int:
     return code
 
 
-def _further(experiment: Any, problem: Any, found: Any) -> Any:
-    """Model choice and further intervals, where the configuration asks for them."""
-    from heli_jax import config as configuration
-    from heli_jax.identification.model_selection import choose
-    from heli_jax.identification.uncertainty.comparison import intervals
-    from heli_jax.report.files import Further
-
-    wanted = experiment.config.fit
-    more, choice = None, None
-    asked = wanted.intervals
-    try:
-        if asked.profile or asked.bootstrap or asked.nuts:
-            more = intervals(
-                found,
-                profiles=asked.profile,
-                runs=asked.bootstrap,
-                draws=asked.nuts,
-                seed=wanted.seed,
-                progress=_say,
-            )
-        if wanted.compare:
-            rivals = configuration.rivals(experiment, problem)
-            choice = choose(rivals.problems, rivals.nested, progress=_say)
-    except ValueError as e:
-        raise InputError(f"{experiment.path}: fit: {e}") from e
-    return Further(choice, more)
-
-
-def _warn_reading(problem: Any) -> None:
-    for flight in problem.flights:
-        for note in flight.source.notes if flight.source else ():
-            _say(f"{flight.source.path}: {note}")
-        for name, why in flight.hold_reason.items():
-            if flight.hold[name] == "linear":
-                where = flight.source.path if flight.source else flight.name
-                _say(f"{where}: {name} is taken as linear between samples, since it {why}")
-
-
 def _check(options: argparse.Namespace) -> int:
     _prepare_jax()
-    from heli_jax import config as configuration
-    from heli_jax import output
-    from heli_jax.identification.fit import check
+    from heli_jax import output, workflow
 
-    experiment = configuration.load(options.config, options.set)
-    problem = configuration.problem(experiment)
-    _warn_reading(problem)
-    try:
-        found = check(problem)
-    except ValueError as e:
-        raise InputError(f"{options.config}: fit: {e}") from e
-    output.print_check(found)
-    return DONE if found.verdict.identifiable else NOT_DETERMINED
+    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=_say)
+    output.print_check(check)
+    return DONE if check.verdict.identifiable else NOT_DETERMINED
 
 
 def _simulate(options: argparse.Namespace) -> int:
     out = Path(options.out) if options.out else None
     if out is not None and out.suffix.lower() not in (".csv", ".parquet"):
-        raise InputError(f"--out {out}: wanted is a name ending in .csv or .parquet")
+        raise InputError(f"--out {out}: expected a name ending in .csv or .parquet")
     view = None
     if options.view is not None:
         beside = (out or Path(Path(options.config).name)).with_suffix(".html")
         view = Path(options.view) if options.view else beside
         if view.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"--view {view}: wanted is a name ending in .html")
+            raise InputError(f"--view {view}: expected a name ending in .html")
     for option, place in (("--out", out), ("--view", view)):
         if place is not None:
             run_directory.require_place(place, f"{option} {place}")
@@ -310,9 +238,9 @@ def _simulate(options: argparse.Namespace) -> int:
 def _sweep(options: argparse.Namespace) -> int:
     config = Path(options.config)
     if options.resume and not options.out:
-        raise InputError("--resume: wanted is --out DIR too, the directory of the sweep")
-    out = Path(options.out) if options.out else None
-    if out is not None and not options.resume:
+        raise InputError("--resume: expected --out DIR too, the directory of the sweep")
+    out = Path(options.out) if options.out else run_directory.default_directory(config)
+    if not options.resume:
         run_directory.require_free(out, ", or --resume")
     _prepare_jax()
     import jax
@@ -323,54 +251,26 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import config as configuration
-    from heli_jax import generate, output
-    from heli_jax.config.sweeps import simulates, sweep_job
-    from heli_jax.sweeps.run import Options, carry_out
+    from heli_jax import output, workflow
 
-    experiment = configuration.load(config, options.set)
-    made = generate.drive(experiment) if simulates(experiment) else None
-    job = sweep_job(experiment) if made is None else sweep_job(*made)
-    wanted = experiment.config.sweep
-    assert wanted is not None
-    out = out or run_directory.default_directory(config)
-    resolved = output.as_yaml(configuration.resolved(experiment))
-    notes = []
-    if experiment.config.disturbance is not None and "seed" not in job.design.names:
-        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
-    with output.sweep_progress() as progress, _client(options, config) as client:
-        how = Options(
-            resume=options.resume,
-            chunk=wanted.chunk,
-            lanes=wanted.lanes,
-            devices=jax.local_devices()[: options.devices],
-            client=client,
-            memory=_cache() / "lanes.json",
-            progress=progress,
-            say=_say,
-        )
-        try:
-            dataset = carry_out(
-                job,
+    experiment = workflow.load_config(config, options.set)
+    try:
+        with output.sweep_progress() as progress, _client(options, config) as client:
+            workflow.run_sweep(
+                experiment,
                 out,
-                how,
-                files={"config.yaml": resolved},
-                attributes={"configuration": resolved},
-                seed=wanted.seed or 0,
-                notes=notes,
+                figures=not options.no_figures,
+                resume=options.resume,
+                devices=jax.local_devices()[: options.devices],
+                client=client,
+                memory=_cache() / "lanes.json",
+                progress=progress,
+                say=_say,
             )
-        except KeyboardInterrupt:
-            kept = f"what is finished is kept: --out {out} --resume goes on"
-            _say(f"interrupted; {kept if out.exists() else 'nothing was written'}")
-            return INTERRUPTED
-        except InputError:
-            raise
-        except ValueError as e:
-            raise InputError(f"{config}: sweep: {e}") from e
-    if not options.no_figures:
-        _say("drawing figures")
-        for words in output.draw_sweep(out, dataset, job):
-            _say(words)
+    except KeyboardInterrupt:
+        kept = f"what is finished is kept: --out {out} --resume goes on"
+        _say(f"interrupted; {kept if out.exists() else 'nothing was written'}")
+        return INTERRUPTED
     output.print_sweep(out)
     return DONE
 
@@ -384,7 +284,7 @@ def _client(options: argparse.Namespace, config: Path) -> Any:
     except ImportError as e:
         option = "--workers" if options.scheduler is None else "--scheduler"
         raise InputError(
-            f"{option}: dask.distributed is not installed, wanted is the extra distributed: "
+            f"{option}: dask.distributed is not installed, expected the extra distributed: "
             "pip install 'heli_jax[distributed]'"
         ) from e
     return connected(options.scheduler, options.workers, config.absolute().parent)

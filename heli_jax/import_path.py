@@ -31,7 +31,7 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
             it; `where` begins the sentence.
     """
     if not is_path(path):
-        raise InputError(f"{where}: found {path!r:.60}, wanted is package.module:name")
+        raise InputError(f"{where}: got {path!r:.60}, expected package.module:name")
     module_name, attribute = path.split(":")
     if folder is not None and str(folder) not in sys.path:
         sys.path.insert(0, str(folder))

@@ -5,7 +5,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,59 +13,24 @@ import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
-from heli_jax.errors import InputError
 from heli_jax.flights import write as tables
 from heli_jax.identification.equation_error.baseline import Baseline
-from heli_jax.identification.fit import Check, Estimate, Fit
+from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
-from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.workflow import FitRun
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
     from heli_jax.sweeps.run import Progress
-    from heli_jax.sweeps.spec import Job
 
 
-def write_fit(
-    out: Path,
-    experiment: configuration.Experiment,
-    problem: Problem,
-    fit: Fit,
-    baseline: Baseline | None,
-    further: files.Further,
-    begin: float,
-) -> None:
-    """The run directory: config.yaml, fit.json, signals.csv, report.html, figures/."""
-    from heli_jax.report.html import write_report
-
-    text = as_yaml(configuration.resolved(experiment))
-    with run_directory.whole(out) as directory:
-        (directory / "config.yaml").write_text(text, encoding="utf-8")
-        files.write_signals(directory / "signals.csv", fit.signals)
-        started = time.perf_counter()
-        title = experiment.path.stem
-        constants = experiment.vehicle.constants
-        write_report(directory, fit, problem, baseline, title, constants, further)
-        fit.timing["report"] = time.perf_counter() - started
-        fit.timing["total"] = time.perf_counter() - begin
-        files.write_json(directory / "fit.json", files.fit_json(fit, problem, baseline, further))
-
-
-def as_yaml(content: Mapping[str, Any]) -> str:
-    """Plain data as YAML, in its own order."""
-    import yaml
-
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
-
-
-def print_fit(
-    problem: Problem, fit: Fit, baseline: Baseline | None, further: files.Further, out: Path
-) -> None:
+def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
+    problem, fit, further = run.problem, run.fit, run.supplementary
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Did the optimiser arrive; what do the data determine; is the model adequate.
@@ -103,9 +68,10 @@ def print_fit(
         _table(compared.head, compared.rows)
         for sentence in further.choice.sentences:
             print(sentence)
-    if baseline is not None:
-        _print_baseline(baseline)
-    print(f"report: {out / 'report.html'}")
+    if run.baseline is not None:
+        _print_baseline(run.baseline)
+    if run.directory is not None:
+        print(f"report: {run.directory / 'report.html'}")
 
 
 def _determined(c: Combination) -> str:
@@ -273,25 +239,6 @@ def _progress_words(p: "Progress") -> str:
         return words
     left = max(0, round(p.remaining))
     return f"{words}, {left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left"
-
-
-def draw_sweep(out: Path, dataset: Any, job: "Job") -> list[str]:
-    """The figures of a sweep; returns what they leave out, in words.
-
-    Raises:
-        InputError: the figures cannot be written.
-    """
-    from heli_jax.report.sweeps import RESULTS, results, write_figures
-    from heli_jax.sweeps.summary import worst
-
-    try:
-        write_figures(out / "figures", dataset, worst(dataset, job))
-    except OSError as e:
-        raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
-    count = len(results(dataset))
-    if count <= RESULTS:
-        return []
-    return [f"slices and maps are of the first {RESULTS} of {count} results"]
 
 
 def _counted(elements: int) -> str:

@@ -19,13 +19,17 @@ def default_directory(config: Path) -> Path:
 
 
 def require_free(path: Path, otherwise: str = "") -> None:
-    """Refuse a directory that exists, before any work is done; `otherwise` is what else is wanted.
+    """Refuse a directory that exists, before any work is done.
+
+    Args:
+        path: the directory.
+        otherwise: what else is possible, as the end of the sentence.
 
     Raises:
         InputError: it exists, or its parent cannot hold it.
     """
     if os.path.lexists(path):  # a link to nothing is in the way too
-        raise InputError(f"--out {path}: exists already, wanted is a new directory{otherwise}")
+        raise InputError(f"--out {path}: exists already, expected a new directory{otherwise}")
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent

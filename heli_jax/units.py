@@ -118,7 +118,7 @@ def factor(unit: str, si: str) -> float:
         base = have.to_base_units()
         if float(base.magnitude) == 1.0 or dict(base.dimensionality):
             return float(base.magnitude / want.to_base_units().magnitude)
-    raise ValueError(f"unit {unit!r} is {_kind(have)}, wanted is {_kind(want)} such as {si!r}")
+    raise ValueError(f"unit {unit!r} is {_kind(have)}, expected {_kind(want)} such as {si!r}")
 
 
 _SI = [

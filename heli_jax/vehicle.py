@@ -89,6 +89,16 @@ class Helicopter(eqx.Module):
         math.nan
     )
 
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_vehicle
+
+        return as_text(of_vehicle(self))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_vehicle
+
+        return as_html(of_vehicle(self))
+
 
 # A vehicle may leave out what the model at hand does not read; what it gives must be possible.
 _MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}

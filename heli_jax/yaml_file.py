@@ -1,6 +1,7 @@
 """YAML files, read with care: plain data alone, every key once, numbers as YAML 1.2 has them."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:
-        raise InputError(f"{path}: is not text, wanted is a YAML file") from e
+        raise InputError(f"{path}: is not text, expected a YAML file") from e
     return parse_mapping(text, str(path))
 
 
@@ -64,13 +65,18 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     value = _load(text, where)
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{where}: holds {found}, wanted are keys with values")
+        raise InputError(f"{where}: holds {found}, expected keys with values")
     return value
 
 
 def parse_value(text: str, where: str) -> Any:
     """One value as it would stand behind a key: for `--set key=value`."""
     return _load(text, where)
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """Plain data as YAML, in its own order."""
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def _load(text: str, where: str) -> Any:
@@ -88,7 +94,7 @@ def _load(text: str, where: str) -> Any:
         mark = e.problem_mark or e.context_mark
         line = f", line {mark.line + 1}" if mark else ""
         problem = " ".join(str(e.problem or e.context or "broken").split())
-        raise InputError(f"{where}{line}: {problem}; wanted is plain YAML") from e
+        raise InputError(f"{where}{line}: {problem}; expected plain YAML") from e
     except (
         yaml.YAMLError,
         ValueError,

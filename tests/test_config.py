@@ -73,7 +73,7 @@ def test_corrections_switch_on_and_off(load):
     [
         ({"model": "helicoptr"}, ["model", "did you mean 'helicopter'"]),
         ({"corrections": {"tial": True}}, ["corrections", "'tial'", "did you mean 'tail'"]),
-        ({"corrections": {"tail": 2}}, ["corrections.tail", "found 2", "boolean"]),
+        ({"corrections": {"tail": 2}}, ["corrections.tail", "got 2", "boolean"]),
         ({"model": "roll", "corrections": {"tail": True}}, ["corrections", "'roll' takes no"]),
         ({"model": "roll", "corrections": {}}, ["corrections", "'roll' takes no", "helicopter"]),
         ({"corection": {}}, ["corection", "did you mean 'corrections'"]),
@@ -107,7 +107,7 @@ def test_shipped_configurations(path):
 @pytest.mark.parametrize(
     ("simulate", "words"),
     [
-        ({"ground": 0.0}, ["simulate.ground", "found 0", "less than 0"]),
+        ({"ground": 0.0}, ["simulate.ground", "got 0", "less than 0"]),
         ({"start": {"clmb": 1}}, ["simulate.start.clmb", "did you mean 'climb'"]),
         ({"wind": [1, 2]}, ["simulate.wind[2]", "missing"]),
         ({"wind": [1, 2, float("nan")]}, ["simulate.wind[2]", "finite"]),

@@ -152,4 +152,4 @@ def test_a_page_from_the_command_line(tmp_path, capfd):
     assert other.exists()
     assert capfd.readouterr().out.count("\n") == 251
     assert main(["simulate", str(config), "--view", str(tmp_path / "page.pdf")]) == 2
-    assert "wanted is a name ending in .html" in capfd.readouterr().err
+    assert "expected a name ending in .html" in capfd.readouterr().err

@@ -1,22 +1,58 @@
 """The README's Python runs as it stands."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from heli_jax.cli import main
+
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_python_of_the_readme_runs():
-    parts = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(parts) == 2
-    run = subprocess.run(
-        [sys.executable, "-W", "error", "-c", "\n".join(parts)],
-        capture_output=True, text=True, cwd=ROOT, check=False,
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the configurations and the log of `make demo`."""
+    folder = tmp_path_factory.mktemp("readme")
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    config = folder / "configs/bench-roll.yaml"
+    assert main(["simulate", str(config), "--out", str(folder / "runs/demo/bench.csv")]) == 0
+    return folder
+
+
+def parts():
+    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+
+
+def run(folder, program):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        capture_output=True, text=True, cwd=folder, check=False,
     )  # fmt: skip
-    assert run.returncode == 0, run.stderr[-2000:]
-    status, estimates, gradients, best = run.stdout.strip().split("\n", 3)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
+    program = parts()[0]
+    assert len(program.strip().splitlines()) <= 16
+    assert set(re.findall(r"from (\S+) import", program)) == {"heli_jax"}
+    out = run(folder, program)
+    assert "by filter-error: converged" in out
+    assert re.search(r"Ixx +0\.02\d+ .*kg m\^2", out)
+    assert "'profile': (0.02" in out
+    assert out.strip().splitlines()[-1].startswith("converged 0.02")
+    assert (folder / "runs/notebook/response.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "runs/notebook/fit/report.html").exists()
+
+
+def test_the_python_of_the_readme_runs(folder):
+    assert len(parts()) == 3
+    out = run(folder, "\n".join(parts()[1:]))
+    status, estimates, gradients, best = out.strip().split("\n", 3)
     assert status.startswith("converged The data alone determine only a/Ixx and a/If")
     assert "'Ixx': (0.024" in estimates
     assert gradients.startswith("[")

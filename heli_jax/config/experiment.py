@@ -1,6 +1,6 @@
 """An experiment: a configuration read and validated, with what it names at hand."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,18 +26,24 @@ class Experiment(NamedTuple):
     vehicle: Vehicle
 
 
-def load(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
+def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
     """Read and validate a configuration, its model and its vehicle; no log is opened yet.
 
-    `overrides` are `key.path=value` texts.
+    Args:
+        path: the configuration (YAML); paths in it begin at its folder.
+        overrides: `key.path=value` texts, or values by `key.path`.
 
     Raises:
         InputError: anything in the file or an override is wrong.
     """
     path = Path(path)
     content = read_mapping(path)
-    for text in overrides:
-        _override(content, text)
+    if isinstance(overrides, Mapping):
+        for key, value in overrides.items():
+            _set(content, str(key), value, f"override {key!r:.80}")
+    else:
+        for text in overrides:
+            _override(content, text)
     config = _validated(content, str(path))
     model = _model(config, path)
     vehicle = _vehicle(config, path, model)
@@ -87,15 +93,20 @@ def _override(content: dict[str, Any], text: str) -> None:
     key, equals, value = text.partition("=")
     where = f"--set {text!r:.80}"
     if not equals or not key.strip():
-        raise InputError(f"{where}: wanted is key.path=value")
-    *above, last = key.strip().split(".")
+        raise InputError(f"{where}: expected key.path=value")
+    _set(content, key.strip(), parse_value(value, where), where)
+
+
+def _set(content: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Put a value at `key.path`, in sections that are made where they are missing."""
+    *above, last = key.split(".")
     at: Any = content
     for name in above:
         at = _child(at, name, where)
     if isinstance(at, list):
-        at[_index(at, last, where)] = parse_value(value, where)
+        at[_index(at, last, where)] = value
     elif isinstance(at, dict):
-        at[last] = parse_value(value, where)
+        at[last] = value
     else:
         raise InputError(f"{where}: {'.'.join(above)} holds no keys to set")
 
@@ -110,7 +121,7 @@ def _child(at: Any, name: str, where: str) -> Any:
 
 def _index(at: list[Any], name: str, where: str) -> int:
     if not name.isdigit() or int(name) >= len(at):
-        raise InputError(f"{where}: found {name!r}, wanted is a number from 0 to {len(at) - 1}")
+        raise InputError(f"{where}: got {name!r}, expected a number from 0 to {len(at) - 1}")
     return int(name)
 
 
@@ -135,7 +146,7 @@ def _sentence(error: Any) -> str:
     message = message[0].lower() + message[1:]
     if isinstance(found, dict | list) or error["type"] == "value_error":
         return f"{place}: {message}"
-    return f"{place}: found {found!r:.60}, {message.replace('input should be', 'wanted is')}"
+    return f"{place}: got {found!r:.60}, {message.replace('input should be', 'expected')}"
 
 
 def _place(loc: tuple[Any, ...]) -> str:

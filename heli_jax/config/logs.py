@@ -1,11 +1,12 @@
 """The flights that a configuration names."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FlightConfig
+from heli_jax.config.schema import FlightConfig, SignalsConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
@@ -16,14 +17,18 @@ def read_flights(
 ) -> tuple[Flight, ...]:
     """The flights that a configuration names, in SI.
 
-    `gain` allows a plain number for an input with a unit: an estimated gain then carries the unit.
+    Args:
+        experiment: the configuration, with its model at hand.
+        gain: whether a plain number is allowed for an input with a unit: an estimated gain then
+            carries the unit.
+        moving_inputs: whether a run in which no input ever moves is refused.
 
     Raises:
         InputError: no flights, or one that cannot be read.
     """
     config, path = experiment.config, experiment.path
     if not config.flights:
-        raise InputError(f"{path}: flights: none given, wanted is at least one log")
+        raise InputError(f"{path}: flights: expected at least one log, got none")
     return tuple(
         _read_flight(experiment, i, f, gain, moving_inputs) for i, f in enumerate(config.flights)
     )
@@ -57,17 +62,45 @@ def _read_flight(
         raise
     except ValueError as e:
         raise InputError(f"{where}: {e}") from e
-    return flight
+    return _with_notes(flight, _unstated_units(model, f.signals))
+
+
+def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
+    """A sentence for each signal whose numbers are read as SI because no unit is stated.
+
+    Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
+    """
+    notes = []
+    for record, signals in ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs)):
+        for name, signal in signals.items():
+            si = naming.unit(record, name)
+            if signal.unit is None and si is not None and not units.is_plain(si):
+                notes.append(f"{name}: no unit stated, taken as {si}")
+    return tuple(notes)
+
+
+def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
+    if not notes or flight.source is None:
+        return flight
+    source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
+    return dataclasses.replace(flight, source=source)
 
 
 def signals(
     model: Model,
     role: Literal["inputs", "outputs"],
-    given: Mapping[str, Any],
+    stated: Mapping[str, Any],
     where: str,
     gain: bool = False,
 ) -> dict[str, Signal]:
     """Which column is which of the model's inputs or outputs, with units checked.
+
+    Args:
+        model: what the names are of.
+        role: whether they are its inputs or its outputs.
+        stated: a configuration's signals by the model's name (InputConfig or OutputConfig).
+        where: what a sentence about a wrong one begins with.
+        gain: whether a plain number is allowed for an input with a unit.
 
     Raises:
         InputError: a name that the model lacks, an input that is missing, no output at all, a
@@ -75,24 +108,24 @@ def signals(
     """
     record = model.Inputs if role == "inputs" else model.Outputs
     known = naming.names(record)
-    for name in given:
+    for name in stated:
         if name not in known:
             raise InputError(
                 f"{where}.{role}: model {model.name} has no {role[:-1]} {name!r}"
                 f"{nearest(name, known)}"
             )
-    missing = [n for n in known if n not in given]
+    missing = [n for n in known if n not in stated]
     if role == "inputs" and missing:
         raise InputError(f"{where}.inputs: {missing[0]} missing, model {model.name} needs it")
-    if not given:
-        raise InputError(f"{where}.{role}: none given, wanted is one of {', '.join(known)}")
+    if not stated:
+        raise InputError(f"{where}.{role}: expected one of {', '.join(known)}, got none")
     out = {}
-    for name, one in given.items():
+    for name, config in stated.items():
         place = f"{where}.{role}.{name}.unit"
         si = naming.unit(record, name)
-        unit = one.unit if one.unit is not None else (si or "1")
-        sd, hold = getattr(one, "sd", None), getattr(one, "hold", "auto")
-        out[name] = Signal(one.signal, unit, _si(unit, si, place, gain), sd, hold)
+        unit = config.unit if config.unit is not None else (si or "1")
+        sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
+        out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold)
     return out
 
 

@@ -28,9 +28,9 @@ def problem(experiment: Experiment) -> Problem:
     """
     config, path = experiment.config, experiment.path
     if config.fit is None:
-        raise InputError(f"{path}: fit: missing, wanted is fit.free with a parameter to estimate")
+        raise InputError(f"{path}: fit: missing, expected fit.free with a parameter to estimate")
     if not config.fit.free:
-        raise InputError(f"{path}: fit.free: nothing is free, wanted is a parameter to estimate")
+        raise InputError(f"{path}: fit.free: nothing is free, expected a parameter to estimate")
     _check_intervals(config.fit, path)
     asked = config.fit.nuisance.model_dump()
     if isinstance(asked["input_offset"], list):
@@ -51,7 +51,7 @@ def problem(experiment: Experiment) -> Problem:
     if config.fit.method == "filter-error":
         if config.disturbance is None:
             raise InputError(
-                f"{path}: fit.method: filter-error needs a disturbance, wanted is "
+                f"{path}: fit.method: filter-error needs a disturbance, expected "
                 "disturbance: {axis: roll, poles: 1}"
             )
         model, params = disturbed(experiment)
@@ -76,21 +76,21 @@ def problem(experiment: Experiment) -> Problem:
         ) from e
 
 
-def _check_intervals(wanted: FitConfig, path: Path) -> None:
+def _check_intervals(config: FitConfig, path: Path) -> None:
     """Refuse before the fit what could not be done after it."""
-    for name in wanted.intervals.profile:
-        if name not in wanted.free:
+    for name in config.intervals.profile:
+        if name not in config.free:
             raise InputError(
-                f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, wanted.free)}"
+                f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, config.free)}"
             )
-    if wanted.intervals.nuts and importlib.util.find_spec("blackjax") is None:
+    if config.intervals.nuts and importlib.util.find_spec("blackjax") is None:
         raise InputError(
-            f"{path}: fit.intervals.nuts: blackjax is not installed, wanted is the extra bayes: "
+            f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
-    if wanted.intervals.bootstrap and wanted.nuisance.time_shift:
+    if config.intervals.bootstrap and config.nuisance.time_shift:
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, wanted is "
+            f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, expected "
             "one of the two"
         )
 
@@ -105,14 +105,14 @@ def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
         alternatives,  # not before it is needed: slow
     )
 
-    model, wanted = experiment.model, experiment.config.disturbance
+    model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
     if not axes:
         raise InputError(
-            f"{experiment.path}: fit.compare: model {model.name} has no axis to disturb, wanted is "
+            f"{experiment.path}: fit.compare: model {model.name} has no axis to disturb, expected "
             "one with roll, pitch or yaw"
         )
-    axis = wanted.axis if wanted is not None else axes[0]
+    axis = disturbance.axis if disturbance is not None else axes[0]
     # Whether there is a stand is in question only where its stiffness is.
     bare = model.without_stand if "kappa" in fitted.free else None
     return alternatives(fitted, model, axis, without_stand=bare)
@@ -124,18 +124,18 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
     Raises:
         InputError: the model has no such axis.
     """
-    model, params, wanted = (
+    model, params, disturbance = (
         experiment.model,
         experiment.vehicle.params,
         experiment.config.disturbance,
     )
-    if wanted is None:
+    if disturbance is None:
         return model, params
     try:
-        model = with_disturbance(model, wanted.axis, wanted.poles)
+        model = with_disturbance(model, disturbance.axis, disturbance.poles)
     except ValueError as e:
         raise InputError(f"{experiment.path}: disturbance: {e}") from e
-    given = {"sigma_w": wanted.sigma_w, "tau_w": wanted.tau_w}
+    given = {"sigma_w": disturbance.sigma_w, "tau_w": disturbance.tau_w}
     extra = {n: jnp.asarray(v) for n, v in given.items() if v is not None}
     return model, model.Params(**{**naming.asdict(params), **extra})
 
@@ -143,8 +143,8 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
 def _gain_units(experiment: Experiment) -> dict[str, str]:
     """The unit that each input's gain carries: 1 where the log's unit is of the right kind."""
     out = {}
-    for name, one in experiment.config.flights[0].signals.inputs.items():
+    for name, signal in experiment.config.flights[0].signals.inputs.items():
         si = naming.unit(experiment.model.Inputs, name)
-        plain = one.unit is not None and units.is_plain(one.unit)
+        plain = signal.unit is not None and units.is_plain(signal.unit)
         out[name] = si if si and plain and not units.is_plain(si) else "1"
     return out

@@ -138,7 +138,7 @@ class DisturbanceConfig(_Strict):
     def _fixed_given(self) -> "DisturbanceConfig":
         for name in ("sigma_w", "tau_w"):
             if name in self.fixed and getattr(self, name) is None:
-                raise ValueError(f"{name} is fixed but not given, wanted is its value")
+                raise ValueError(f"{name} is fixed but not given, expected its value")
         return self
 
 
@@ -202,7 +202,7 @@ class SimulateConfig(_Strict):
     def _bounded(self) -> "SimulateConfig":
         if not 8 <= self.duration * self.rate <= 1e8:
             raise ValueError(
-                f"duration times rate is {self.duration * self.rate:g} samples, wanted are 8 to 1e8"
+                f"duration times rate is {self.duration * self.rate:g} samples, expected 8 to 1e8"
             )
         return self
 

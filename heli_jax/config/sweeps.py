@@ -34,13 +34,13 @@ def simulates(experiment: Experiment) -> bool:
     """
     config, path = experiment.config, experiment.path
     if config.sweep is None:
-        raise InputError(f"{path}: sweep: missing, wanted is a design with axes and results")
+        raise InputError(f"{path}: sweep: missing, expected a design with axes and results")
     source = config.sweep.inputs or ("flights" if config.flights else "simulate")
     if source == "flights" and not config.flights:
-        raise InputError(f"{path}: sweep.inputs: there are no flights, wanted is at least one log")
+        raise InputError(f"{path}: sweep.inputs: there are no flights, expected at least one log")
     if source == "simulate" and config.simulate is None:
         raise InputError(
-            f"{path}: sweep: no inputs, wanted are flights, or simulate, which makes some"
+            f"{path}: sweep: no inputs, expected flights, or simulate, which makes some"
         )
     return source == "simulate"
 
@@ -58,32 +58,32 @@ def sweep_job(
     Raises:
         InputError: something of it cannot be; the sentence says what and where.
     """
-    wanted, path = experiment.config.sweep, experiment.path
-    assert wanted is not None
+    sweep, path = experiment.config.sweep, experiment.path
+    assert sweep is not None
     where = f"{path}: sweep"
-    model, params = _model(experiment, wanted)
-    reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in wanted.reduce.items()}
-    kept = wanted.trajectories
+    model, params = _model(experiment, sweep)
+    reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in sweep.reduce.items()}
+    kept = sweep.trajectories
     flights = (made,) if made is not None else read_flights(experiment, moving_inputs=False)
-    if wanted.start is not None:
+    if sweep.start is not None:
         if made is not None:
-            raise InputError(f"{where}.start: wanted is simulate.start, which makes the inputs")
-        trimmed = Trimmed(Condition(**wanted.start.model_dump()), sticks=False, of=experiment.model)
+            raise InputError(f"{where}.start: expected simulate.start, which makes the inputs")
+        trimmed = Trimmed(Condition(**sweep.start.model_dump()), sticks=False, of=experiment.model)
     if trimmed is not None and experiment.config.initial_state:
         raise InputError(
             f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
-            "wanted is a configuration without it"
+            "expected a configuration without it"
         )
     try:
         return job(
             model,
             params,
             flights,
-            _design(wanted, model, path, wanted.seed or 0),
+            _design(sweep, model, path, sweep.seed or 0),
             reduce,
-            solver=wanted.solver,
-            substeps=wanted.substeps,
-            precision=wanted.precision,
+            solver=sweep.solver,
+            substeps=sweep.substeps,
+            precision=sweep.precision,
             trajectories=None if kept is None else Trajectories(tuple(kept.signals), kept.every),
             trimmed=trimmed,
             pilot=pilot,
@@ -95,20 +95,20 @@ def sweep_job(
         raise InputError(f"{path if outside else where}: {e}") from e
 
 
-def _model(experiment: Experiment, wanted: SweepConfig) -> tuple[Model, Any]:
+def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
     """The model, with the disturbance where an axis is one of its."""
     plain = naming.names(experiment.model.Params)
-    drawn = [n for n in _axes(wanted) if n in _DRAWN and n not in plain]
+    drawn = [n for n in _axes(sweep) if n in _DRAWN and n not in plain]
     if not drawn or experiment.config.disturbance is None:
         return experiment.model, experiment.vehicle.params
     where, given = f"{experiment.path}: disturbance", experiment.config.disturbance
     for name in ("sigma_w", "tau_w"):
         if getattr(given, name) is None and name not in drawn:
-            raise InputError(f"{where}.{name}: missing, wanted is a number to draw it with")
+            raise InputError(f"{where}.{name}: missing, expected a number to draw it with")
     if "seed" not in drawn:
         raise InputError(
             f"{experiment.path}: sweep.axes.{drawn[0]}: nothing is drawn without an axis seed, "
-            "wanted is seed: {values: [0]} too"
+            "expected seed: {values: [0]} too"
         )
     return disturbed(experiment)
 
@@ -141,10 +141,10 @@ def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
     _refuse(one, ("file",), f"only a table has it, not {one.design}")
     if one.design in ("lhs", "sobol"):
         if one.n is None:
-            raise ValueError(f"n: missing, wanted is how many elements {one.design} makes")
+            raise ValueError(f"n: missing, expected how many elements {one.design} makes")
         between = {n: _between(n, a, model, path) for n, a in one.axes.items()}
         return {"lhs": designs.lhs, "sobol": designs.sobol}[one.design](between, one.n, seed)
-    _refuse(one, ("n",), f"a {one.design} has its axes' points: wanted is n in an axis")
+    _refuse(one, ("n",), f"a {one.design} has its axes' points: expected n in an axis")
     axes = {n: _points(n, a, model, path) for n, a in one.axes.items()}
     return {"grid": designs.grid, "list": designs.listed}[one.design](axes)
 
@@ -163,9 +163,9 @@ def _refuse(one: DesignConfig, keys: tuple[str, ...], why: str) -> None:
 def _between(name: str, axis: AxisConfig, model: Model, path: Path) -> Between:
     for key in ("values", "column", "n"):
         if getattr(axis, key) is not None:
-            raise ValueError(f"axes.{name}.{key}: wanted are lower and upper here")
+            raise ValueError(f"axes.{name}.{key}: expected lower and upper here")
     if axis.lower is None or axis.upper is None:
-        raise ValueError(f"axes.{name}: wanted are lower and upper")
+        raise ValueError(f"axes.{name}: expected lower and upper")
     scale = _scale(name, axis, model, path)
     return Between(axis.lower * scale, axis.upper * scale, axis.scale)
 
@@ -178,7 +178,7 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
         return _between(name, points, model, path)._replace(n=axis.n)
     for key in ("lower", "upper", "n"):
         if getattr(axis, key) is not None:
-            raise ValueError(f"axes.{name}: wanted are values, or lower and upper, not both")
+            raise ValueError(f"axes.{name}: expected values, or lower and upper, not both")
     return _as_column(name, np.asarray(axis.values) * _scale(name, axis, model, path))
 
 
@@ -189,9 +189,9 @@ def _as_column(name: str, values: np.ndarray) -> np.ndarray:
 
 def _table(one: DesignConfig, model: Model, path: Path) -> Design:
     if one.file is None:
-        raise ValueError("file: missing, wanted is a table in CSV or Parquet")
+        raise ValueError("file: missing, expected a table in CSV or Parquet")
     if not one.axes:
-        raise ValueError("axes: none given, wanted is at least one, as Ixx: {} for a column Ixx")
+        raise ValueError("axes: none given, expected at least one, as Ixx: {} for a column Ixx")
     source = open_table(path.parent / one.file)
     for name, axis in one.axes.items():
         for key in ("lower", "upper", "values", "n"):
@@ -223,6 +223,6 @@ def _reduce(one: ReduceConfig, where: str, path: Path) -> Reduce:
         if not callable(how) and not isinstance(how, Streaming):
             found = "nothing" if how is None else f"a {type(how).__name__}"
             raise InputError(
-                f"{where}.how: {one.how!r} is {found}, wanted is a function of a Trajectory"
+                f"{where}.how: {one.how!r} is {found}, expected a function of a Trajectory"
             )
     return Reduce(how, one.signal, one.input, one.gain)

@@ -53,12 +53,12 @@ def open_csv(path: Path) -> "CsvTable":
     text = decode(str(path), data)
     start, line = find_header(text)
     if start is None:
-        raise wrong(str(path), "holds no header, wanted are names of columns and rows of numbers")
+        raise wrong(str(path), "holds no header, expected names of columns and rows of numbers")
     end = text.find("\n", start)
     end = len(text) if end < 0 else end
     body = text[end + 1 :]
     if not body.strip():
-        raise wrong(str(path), "holds a header alone, wanted are rows of numbers", f"line {line}")
+        raise wrong(str(path), "holds a header alone, expected rows of numbers", f"line {line}")
     header = text[start:end]
     if len(header) > LONGEST_HEADER:
         raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
@@ -114,7 +114,7 @@ class CsvTable:
         for name, text in zip(names, texts, strict=True):
             values = _floats(text)
             if isinstance(values, int):
-                found = f"found {self.found(name, values)}, wanted is a number"
+                found = f"got {self.found(name, values)}, expected a number"
                 raise wrong(self.path, found, self.place(values), column(name))
             result[name] = values
         return result
@@ -149,14 +149,13 @@ class CsvTable:
         if missing and all(_NUMBER.fullmatch(name) for name in self.names):
             raise wrong(
                 self.path,
-                f"found numbers, wanted are the names of the columns, {shown(missing[0])} among"
-                " them",
+                f"got numbers, expected the names of the columns, {shown(missing[0])} among them",
                 f"line {self._first_line - 1}",
             )
         if missing and len(self.names) == 1:
             raise wrong(
                 self.path,
-                f"found no comma, semicolon or tab between names, wanted are columns,"
+                f"got no comma, semicolon or tab between names, expected columns,"
                 f" {shown(missing[0])} among them",
                 f"line {self._first_line - 1}",
             )
@@ -184,7 +183,7 @@ class CsvTable:
                     yield start, cells
                 start = self._first_line + reader.line_num
         except csv.Error as e:
-            problem = "a quotation mark that closes nothing or is never closed, wanted are numbers"
+            problem = "a quotation mark that closes nothing or is never closed, expected numbers"
             raise wrong(self.path, problem, f"line {start}") from e
 
     def _texts(self, indices: Sequence[int]) -> list[Any]:
@@ -193,7 +192,7 @@ class CsvTable:
         if texts is None:
             texts = self._texts_row_by_row(indices)
         if texts and not len(texts[0]):
-            raise wrong(self.path, "holds a header alone, wanted are rows of numbers")
+            raise wrong(self.path, "holds a header alone, expected rows of numbers")
         return texts
 
     def _texts_by_pyarrow(self, indices: Sequence[int]) -> list[Any] | None:
@@ -244,7 +243,7 @@ class CsvTable:
 
         for row, (line, cells) in enumerate(self._records()):
             if len(cells) != width:
-                problem = f"{_count(len(cells))}, wanted are {width} as in the header"
+                problem = f"{_count(len(cells))}, expected {width} as in the header"
                 raise wrong(self.path, problem, f"line {line}")
             for one, i in zip(cells_of, indices, strict=True):
                 one.append(cells[i])
@@ -294,7 +293,7 @@ def _decimal_points(texts: list[Any], delimiter: str) -> list[Any]:
     if "," not in signs:
         return texts
     if "." in signs:
-        problem = f"found both {signs[',']} and {signs['.']}, wanted is one decimal sign"
+        problem = f"got both {signs[',']} and {signs['.']}, expected one decimal sign"
         raise _TwoDecimalSigns(problem)
     return [pc.replace_substring(text, ",", ".") for text in texts]
 

@@ -9,15 +9,15 @@ from heli_jax.flights.table import wrong
 def decode(path: str, data: bytes) -> str:
     """The text of a file with `\\n` between its lines."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise wrong(path, "is text in UTF-16, wanted is UTF-8")
+        raise wrong(path, "is text in UTF-16, expected UTF-8")
     if b"\x00" in data:
         line = data.count(b"\n", 0, data.index(b"\x00")) + 1
-        raise wrong(path, "found binary data, wanted is text", f"line {line}")
+        raise wrong(path, "got binary data, expected text", f"line {line}")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as e:
         line = data.count(b"\n", 0, e.start) + 1
-        found = f"found the byte 0x{data[e.start]:02x}, wanted is text in UTF-8"
+        found = f"got the byte 0x{data[e.start]:02x}, expected text in UTF-8"
         raise wrong(path, found, f"line {line}") from e
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
@@ -88,4 +88,4 @@ def header_names(path: str, header: str, delimiter: str, line: int) -> tuple[str
             for cell in next(csv.reader([header], delimiter=delimiter, skipinitialspace=True))
         )
     except csv.Error as e:
-        raise wrong(path, "is no header, wanted are names of columns", f"line {line}") from e
+        raise wrong(path, "is no header, expected names of columns", f"line {line}") from e

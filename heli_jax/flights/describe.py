@@ -126,7 +126,7 @@ def _asked_time(table: Table, survey: list[Survey], time: str | Signal) -> Signa
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
     if _values(survey, signal.name) is None:
-        raise wrong(table.path, "holds text, wanted are times", column(signal.name))
+        raise wrong(table.path, "holds text, expected times", column(signal.name))
     try:
         units.factor(signal.unit, "s")
     except ValueError as e:

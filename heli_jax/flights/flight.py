@@ -76,9 +76,9 @@ class Flight:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dt) and self.dt > 0):
-            raise ValueError(f"dt is {self.dt}, wanted is a positive number of seconds")
+            raise ValueError(f"dt is {self.dt}, expected a positive number of seconds")
         if not math.isfinite(self.t0):
-            raise ValueError(f"t0 is {self.t0}, wanted is a finite number of seconds")
+            raise ValueError(f"t0 is {self.t0}, expected a finite number of seconds")
         for kind in ("inputs", "outputs"):
             gaps = kind == "outputs"
             signals = {name: _samples(name, x, gaps) for name, x in getattr(self, kind).items()}
@@ -98,10 +98,10 @@ class Flight:
             if name not in self.outputs:
                 raise ValueError(f"sd is stated for {name!r}, which is no output of this flight")
             if not (math.isfinite(sd) and sd > 0):
-                raise ValueError(f"sd of {name!r} is {sd}, wanted is a positive number")
+                raise ValueError(f"sd of {name!r} is {sd}, expected a positive number")
         for name, value in self.known.items():
             if not math.isfinite(value):
-                raise ValueError(f"known {name!r} is {value}, wanted is a finite number")
+                raise ValueError(f"known {name!r} is {value}, expected a finite number")
 
     def _check_holds(self) -> None:
         for name, value in self.hold.items():
@@ -129,13 +129,23 @@ class Flight:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)
 
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_flight
+
+        return as_text(of_flight(self))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_flight
+
+        return as_html(of_flight(self))
+
 
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
     samples = np.array(values, dtype=np.float64)
     if samples.ndim != 1 or samples.size == 0:
-        raise ValueError(f"{name!r} has shape {samples.shape}, wanted is (N,) with N >= 1")
+        raise ValueError(f"{name!r} has shape {samples.shape}, expected (N,) with N >= 1")
     bad = np.flatnonzero(np.isinf(samples) if gaps else ~np.isfinite(samples))
     if bad.size:
-        raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, wanted are numbers")
+        raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, expected numbers")
     samples.setflags(write=False)
     return samples

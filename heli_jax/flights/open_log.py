@@ -20,12 +20,12 @@ def open_table(path: str | Path) -> Table:
     readers = {".parquet": open_parquet} | dict.fromkeys((".csv", ".txt", ".tsv"), open_csv)
     try:
         if not require_regular(path, "a log in CSV or Parquet", sys.maxsize):
-            raise wrong(str(path), "is empty, wanted is a log in CSV or Parquet")
+            raise wrong(str(path), "is empty, expected a log in CSV or Parquet")
         reader = readers.get(path.suffix.lower())
         if reader is None:
             raise wrong(
                 str(path),
-                f"logs ending in {shown(path.suffix)} cannot be read, wanted is .csv, .txt, .tsv"
+                f"logs ending in {shown(path.suffix)} cannot be read, expected .csv, .txt, .tsv"
                 " or .parquet; convert other logs to CSV or Parquet first",
             )
         return reader(path)

@@ -41,7 +41,7 @@ def open_parquet(path: Path) -> "ParquetTable":
         except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
             raise wrong(str(path), "is no whole Parquet file") from e
         if not len(schema) or not n_rows:
-            raise wrong(str(path), "holds no rows, wanted is a log")
+            raise wrong(str(path), "holds no rows, expected a log")
         require_few_columns(str(path), metadata.num_columns)
         if n_rows > _MOST_ROWS:
             raise wrong(str(path), f"expected a log of at most {_MOST_ROWS} rows, got {n_rows}")
@@ -95,7 +95,7 @@ class ParquetTable:
         for name in names:
             kind = self._schema.field(name).type
             if not _is_number(kind):
-                raise wrong(self.path, f"holds {kind}, wanted are numbers", column(name))
+                raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         data = self._read(sorted(set(names)))
         return {name: _floats(data.column(name)) for name in names}
 

@@ -96,7 +96,7 @@ def require_moving_inputs(flight: Flight) -> None:
     raise wrong(
         path,
         f"stays at {values[0]:.6g} (SI) for all of {flight.duration:.6g} s{others}, so nothing"
-        " can be learnt from it; wanted is an input that moves",
+        " can be learnt from it; expected an input that moves",
         f"input {name!r}",
     )
 
@@ -122,14 +122,14 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
         row = int(bad[0])
-        found = f"found {table.found(time.name, row)}, wanted is a time"
+        found = f"got {table.found(time.name, row)}, expected a time"
         raise wrong(table.path, found, table.place(row), place)
     back = np.flatnonzero(np.diff(stamps) <= 0)
     if back.size:
         row = int(back[0]) + 1
         what = "stands still" if stamps[row] == stamps[row - 1] else "runs backwards"
         after, now = table.found(time.name, row - 1), table.found(time.name, row)
-        problem = f"the time {what}, found {now} after {after}, wanted are increasing times"
+        problem = f"the time {what}, got {now} after {after}, expected increasing times"
         raise wrong(table.path, problem, table.place(row), place)
     return _Clock(stamps, scale)
 
@@ -147,7 +147,7 @@ def _rows(
         if end < 0 or start > elapsed[-1]:
             raise wrong(
                 path,
-                f"{where} lies outside the log, wanted is a part of 0 s to {elapsed[-1]:.6g} s",
+                f"{where} lies outside the log, expected a part of 0 s to {elapsed[-1]:.6g} s",
             )
         if start < 0 or end > elapsed[-1] + step:
             notes = (f"{where} was cut to the log, which ends at {elapsed[-1]:.6g} s",)
@@ -156,7 +156,7 @@ def _rows(
         last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
     if last - first < _FEWEST:
         count = max(last - first, 0)
-        raise wrong(path, f"{where} holds {count} samples, wanted are at least {_FEWEST}")
+        raise wrong(path, f"{where} holds {count} samples, expected at least {_FEWEST}")
     return slice(first, last), notes
 
 
@@ -175,7 +175,7 @@ def _to_si(
         bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:
             row = rows.start + int(bad[0])
-            found = f"found {table.found(signal.name, row)}, wanted is a finite number"
+            found = f"got {table.found(signal.name, row)}, expected a finite number"
             raise wrong(table.path, found, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples
@@ -207,7 +207,7 @@ def _check_step(table: Table, name: str, seconds: np.ndarray, start: int) -> Non
     usual = float(np.median(np.diff(seconds)))
     if usual < SHORTEST_STEP:
         problem = (
-            f"the usual step is {usual:.3g} s, wanted is at least 1 ns; look at the time's unit"
+            f"the usual step is {usual:.3g} s, expected at least 1 ns; look at the time's unit"
         )
         raise wrong(table.path, problem, table.place(start), column(name))
 
@@ -222,7 +222,7 @@ def _uneven(table: Table, name: str, seconds: np.ndarray, start: int, uneven: Un
     remedy = f"give `rate: {1 / uneven.usual:.4g}` to resample, or a window"
     if np.diff(seconds).max() > longest_gap(seconds):
         remedy = "give a window"
-    wanted = f"wanted is a uniform grid; {remedy} without such steps"
+    wanted = f"expected a uniform grid; {remedy} without such steps"
     return wrong(table.path, f"{problem}, {wanted}", place, column(name))
 
 
@@ -263,15 +263,15 @@ def _check_rate(table: Table, name: str, seconds: np.ndarray, start: int, rate: 
         raise wrong(
             table.path,
             f"found a gap of {steps[row]:.6g} s, {seconds[row]:.6g} s after the first sample,"
-            f" wanted is none longer than {most:.3g} s; give a window without it",
+            f" expected none longer than {most:.3g} s; give a window without it",
             table.place(start + row + 1),
             column(name),
         )
     usual = float(np.median(steps))
     count = (seconds[-1] - seconds[0]) * rate
     if not count >= _FEWEST - 1 - 1e-6:
-        problem = f"a rate of {rate:g} Hz leaves fewer than {_FEWEST} samples, wanted are more"
+        problem = f"a rate of {rate:g} Hz leaves fewer than {_FEWEST} samples, expected more"
         raise wrong(table.path, problem)
     if not (rate * usual <= _MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
-        raise wrong(table.path, f"{problem}, wanted is at most {_MOST_UPSAMPLING} times as much")
+        raise wrong(table.path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")

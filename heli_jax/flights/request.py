@@ -30,7 +30,7 @@ class Request:
         self.signals = {(key, "input"): signal for key, signal in inputs.items()}
         self.signals |= {(key, "output"): signal for key, signal in outputs.items()}
         if not self.signals:
-            raise wrong(path, "no input or output is asked for, wanted is at least one")
+            raise wrong(path, "no input or output is asked for, expected at least one")
         self._check_columns()
         self._check_units()
         self._check_noise()
@@ -56,7 +56,7 @@ class Request:
             use = (kind, f"{kind} {key!r}")
             before = uses.setdefault(signal.name, use)
             if before != use and not before[0] == kind == "input":
-                problem = f"serves both as {before[1]} and as {use[1]}, wanted is one use"
+                problem = f"serves both as {before[1]} and as {use[1]}, expected one use"
                 raise wrong(self.path, problem, column(signal.name))
 
     def _check_units(self) -> None:
@@ -75,11 +75,11 @@ class Request:
                 continue
             use = f"{kind} {key!r}"
             if kind == "input":
-                problem = f"an sd is stated for {use}, wanted is one for outputs alone"
+                problem = f"an sd is stated for {use}, expected one for outputs alone"
                 raise wrong(self.path, problem, column(signal.name))
             scale = abs(units.factor(signal.unit, signal.si))
             if not (sd > 0 and 0 < sd * scale < math.inf):
-                problem = f"the sd of {use} is {sd:g}, wanted is a positive number"
+                problem = f"the sd of {use} is {sd:g}, expected a positive number"
                 raise wrong(self.path, problem, column(signal.name))
 
     def _check_holds(self) -> None:
@@ -95,14 +95,14 @@ class Request:
 
     def _check_numbers(self, window: tuple[float, float] | None) -> None:
         if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
-            raise wrong(self.path, f"rate is {self.rate:g}, wanted is a positive number in Hz")
+            raise wrong(self.path, f"rate is {self.rate:g}, expected a positive number in Hz")
         if window is not None:
-            wanted = "wanted are two increasing numbers of seconds"
+            wanted = "expected two increasing numbers of seconds"
             if len(window) != 2 or not all(math.isfinite(w) for w in window):
                 raise wrong(self.path, f"window is {list(window)}, {wanted}")
             if not window[0] < window[1]:
                 raise wrong(self.path, f"window is empty or reversed, {list(window)}, {wanted}")
         for name, value in self.known.items():
             if not math.isfinite(value):
-                problem = f"known {name!r} is {value:g}, wanted is a finite number"
+                problem = f"known {name!r} is {value:g}, expected a finite number"
                 raise wrong(self.path, problem)

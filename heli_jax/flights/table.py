@@ -88,7 +88,7 @@ def require_columns(path: str, have: Sequence[str], wanted: Sequence[str]) -> No
     for name in wanted:
         times = have.count(name)
         if times > 1:
-            raise wrong(path, f"{times} columns have this name, wanted is one", column(name))
+            raise wrong(path, f"{times} columns have this name, expected one", column(name))
         if times == 0:
             known = {n[:40] for n in have if n}
             raise wrong(path, f"no column {shown(name)}{nearest(name[:40], known)}")

@@ -160,6 +160,16 @@ class Problem:
             **{n: jnp.asarray(f.start, jnp.result_type(float)) for n, f in self.free.items()},
         )
 
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_problem
+
+        return as_text(of_problem(self))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_problem
+
+        return as_html(of_problem(self))
+
 
 def _check_method(problem: Problem) -> None:
     model = problem.model

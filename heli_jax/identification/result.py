@@ -1,7 +1,7 @@
 """What a fit gives: plain data."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from heli_jax.identification.methods import METHODS
 from heli_jax.identification.unknowns.layout import Reached
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
@@ -165,3 +168,24 @@ class Fit:
     def white(self) -> bool:
         """Whether all residuals look white, so that the intervals may be taken at their word."""
         return all(w.white for w in self.whiteness.values())
+
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_fit
+
+        return as_text(of_fit(self))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_fit
+
+        return as_html(of_fit(self))
+
+    def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
+        """The estimates as a pandas data frame: a row each, with value, sd, lower95, upper95, unit
+        and prior_share; NaN where the data do not determine a parameter.
+
+        Args:
+            nuisance: whether initial states, biases, gains and offsets follow the parameters.
+        """
+        from heli_jax.exports import estimates_frame
+
+        return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})

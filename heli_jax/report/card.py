@@ -14,9 +14,9 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.report import frequency
-from heli_jax.report.coherence import Coherence, coherences
+from heli_jax.report.coherence import COHERENT, Coherence, coherences
 
-CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, 0.6
+CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
 CORRELATION = 0.9
 """Klein and Morelli, Aircraft System Identification (2006)"""

@@ -17,6 +17,9 @@ from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.operating_point import OperatingPoint
 from heli_jax.report import frequency
 
+COHERENT = 0.6
+"""coherence from which on a record's response is taken for the machine's: Tischler and Remple,
+Aircraft and Rotorcraft System Identification (2012)"""
 SIZEABLE = 0.1
 """part of an output's power that the model puts down to an input, from which on it is asked for"""
 _MORE = 2
@@ -105,8 +108,8 @@ def _spectra(
     length = frequency.segment_length(y.size, dt, memory)
     segments = 1 + (y.size - length) // (length // 2)
     if segments < least:
-        wanted = length * dt * (least + 1) / 2
-        return f"wanted are {least} segments of {length * dt:.3g} s, a record of {wanted:.3g} s"
+        duration = length * dt * (least + 1) / 2
+        return f"expected {least} segments of {length * dt:.3g} s, a record of {duration:.3g} s"
     channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
     at = np.arange(segments)[:, None] * (length // 2) + np.arange(length)[None, :]
     transforms = np.fft.rfft(_detrended(channels[:, at]) * np.hanning(length), axis=-1)[..., 1:-1]

@@ -19,19 +19,18 @@ from heli_jax.identification.fit import Fit, Signals, StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.metrics import (
+    BAND99,
     autocorrelation,
     cross_correlation,
     lags_for,
     metrics,
     whiteness,
 )
+from heli_jax.numbers import percent
 from heli_jax.report import frequency, style
-from heli_jax.report.numbers import percent
+from heli_jax.report.coherence import COHERENT
 from heli_jax.report.style import label, legend_above, line, subtitle
 
-BAND99 = 2.5758293035489004
-"""half width of the 99 % band of a correlation, times sqrt(N)"""
-_COHERENT = 0.6
 _CONTINUOUS = "fit, continuous"
 
 type Panels = tuple[Axes, ...]
@@ -227,19 +226,19 @@ def _draw_record(
     """The record's own response where it is coherent; what to say of it."""
     if isinstance(record, str):
         return f"no empirical response: {record}"
-    clear = record.coherence > _COHERENT
+    clear = record.coherence > COHERENT
     omega, H = record.omega[clear], record.H[clear]
     how: dict[str, Any] = {"ls": "", "marker": "o", "ms": 2.2, "mew": 0, "color": style.BLACK}
     name = "record" if clear.any() else None
     axes[0].plot(omega, 20 * np.log10(np.abs(H)), alpha=0.6, label=name, zorder=1.5, **how)
     axes[1].plot(omega, reference.beside(omega, H), alpha=0.6, zorder=1.5, **how)
     line(axes[2], record.omega, record.coherence, color=style.BLACK, lw=0.8)
-    axes[2].axhline(_COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
+    axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
     axes[2].set_ylabel("coherence")
-    note = f"record: {record.segments} half-overlapping segments, where coherence > {_COHERENT}"
+    note = f"record: {record.segments} half-overlapping segments, where coherence > {COHERENT}"
     if not clear.any():
-        note = f"no empirical response: coherence stays below {_COHERENT}"
+        note = f"no empirical response: coherence stays below {COHERENT}"
     return note + ("; other inputs taken as uncorrelated" if others else "")
 
 

@@ -21,15 +21,18 @@ from heli_jax.report.card import card
 from heli_jax.versions import versions
 
 
-class Further(NamedTuple):
-    """What was asked for beside the fit."""
+class SupplementaryAnalyses(NamedTuple):
+    """What was asked for beside the fit: model selection, and intervals by other methods."""
 
     choice: Choice | None = None
     intervals: Intervals | None = None
 
 
 def fit_json(
-    fit: Fit, problem: Problem, baseline: Baseline | None, further: Further = Further()
+    fit: Fit,
+    problem: Problem,
+    baseline: Baseline | None,
+    supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> dict[str, Any]:
     """A fit as plain data for fit.json; what is not a finite number is null."""
     whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
@@ -58,8 +61,8 @@ def fit_json(
             "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
             "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
             "acceptance": [g._asdict() for g in card(problem, fit)],
-            "models": _choice(further.choice),
-            "intervals": _intervals(further.intervals),
+            "models": _choice(supplementary.choice),
+            "intervals": _intervals(supplementary.intervals),
             "log_likelihood": fit.log_likelihood,
             "unknowns": fit.unknowns,
             "aic": fit.aic,

@@ -9,6 +9,7 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.spectra import spectra
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
@@ -143,21 +144,17 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         return "the input does not move"
     if np.isnan(y).any():
         return "samples are missing"
-    from matplotlib import mlab  # not at the start: commands without a report need none of it
-
     needed = _needed(dt, memory)
     length = segment_length(u.size, dt, memory)
     segments = 1 + (u.size - length) // (length // 2)
     if segments < SEGMENTS:
-        wanted = needed * dt * (SEGMENTS + 1) / 2
-        return f"wanted are {SEGMENTS} segments of {needed * dt:.3g} s, a record of {wanted:.3g} s"
-    how: dict[str, Any] = {"NFFT": length, "Fs": 1.0 / dt, "noverlap": length // 2}
-    how["detrend"] = "linear"
-    Suu, f = (np.asarray(v) for v in mlab.psd(u, **how))
-    Syy, Suy = np.asarray(mlab.psd(y, **how)[0]), np.asarray(mlab.csd(u, y, **how)[0])
-    useful = (f > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
-    f, Suu, Syy, Suy = f[useful], Suu[useful], Syy[useful], Suy[useful]
-    return Empirical(2 * np.pi * f, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), Suu, segments)
+        least = needed * dt * (SEGMENTS + 1) / 2
+        return f"expected {SEGMENTS} segments of {needed * dt:.3g} s, a record of {least:.3g} s"
+    omega, Suu, Syy, Suy = spectra(u, y, dt, length)
+    # Where the input has no power the quotient is rounding alone, and at zero the trend was taken.
+    useful = (omega > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
+    omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
+    return Empirical(omega, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), Suu, segments)
 
 
 def phase(H: np.ndarray) -> np.ndarray:

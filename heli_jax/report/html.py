@@ -14,15 +14,13 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
-from heli_jax.report.files import Further
+from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
-
-_GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
 
 
 class Picture(NamedTuple):
@@ -41,7 +39,7 @@ def write_report(
     baseline: Baseline | None,
     title: str,
     vehicle_constants: Mapping[str, Constant],
-    further: Further = Further(),
+    supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> list[str]:
     """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
 
@@ -51,13 +49,13 @@ def write_report(
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
-    for name, draw in _drawings(fit, problem, baseline, further).items():
+    for name, draw in drawings(fit, problem, baseline, supplementary).items():
         drawn = style.save(draw, folder / name)
         if drawn is not None:
             data = base64.b64encode(drawn[1]).decode("ascii")
             pictures[name] = Picture(name, drawn[0], data)
     made = list(pictures.values())
-    page = render(fit, problem, baseline, title, vehicle_constants, made, further)
+    page = render(fit, problem, baseline, title, vehicle_constants, made, supplementary)
     (directory / "report.html").write_text(page, encoding="utf-8")
     return list(pictures)
 
@@ -65,13 +63,13 @@ def write_report(
 type Draw = Callable[[], Figure | None]
 
 
-def _drawings(
-    fit: Fit, problem: Problem, baseline: Baseline | None, further: Further
+def drawings(
+    fit: Fit, problem: Problem, baseline: Baseline | None, supplementary: SupplementaryAnalyses
 ) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
     model, drawings = problem.model, {}
-    if further.intervals is not None:
-        drawings["intervals"] = _drawing(figures.intervals, further.intervals, fit)
+    if supplementary.intervals is not None:
+        drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
     shown = fit.signals[:MOST_FLIGHTS]
     for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
         for output in s.measured:
@@ -123,7 +121,7 @@ def render(
     title: str,
     vehicle_constants: Mapping[str, Constant],
     pictures: list[Picture],
-    further: Further = Further(),
+    supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> str:
     """The page as text."""
     lines = card.card(problem, fit)
@@ -140,9 +138,11 @@ def render(
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),
-        further=further,
-        choice=tables.choice(further.choice) if further.choice else None,
-        intervals=tables.intervals(further.intervals, fit) if further.intervals else None,
+        supplementary=supplementary,
+        choice=tables.choice(supplementary.choice) if supplementary.choice else None,
+        intervals=tables.intervals(supplementary.intervals, fit)
+        if supplementary.intervals
+        else None,
         acceptance=tables.acceptance(lines),
         summary=card.summary(lines),
         residuals=tables.residuals(fit, problem),

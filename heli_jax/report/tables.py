@@ -11,14 +11,15 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.files import adequate_unjudged, whiteness_note
-from heli_jax.report.numbers import NOTHING, measured, number, percent, relative, with_sd
 from heli_jax.report.style import pretty
 from heli_jax.vehicle import Constant, of_helicopter
 
@@ -39,10 +40,6 @@ class Headline(NamedTuple):
     """good, warning or bad"""
     word: str
     text: str
-
-
-def _listed(names: list[str] | tuple[str, ...]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def headline(fit: Fit) -> Headline:
@@ -69,11 +66,11 @@ def _determined(fit: Fit) -> Headline:
         return Headline("bad", "not converged", text)
     if fit.status == "not-identifiable":
         lost = [n for n in v.names if n in v.undetermined or n in v.without_effect]
-        text = f"the data do not determine {_listed(lost or list(v.names))}"
+        text = f"the data do not determine {listed(lost or list(v.names))}"
         return Headline("bad", "converged, not identifiable", text)
     resting = bool(v.resting)
     who = "the data and the priors together" if resting else "the data"
-    text = f"{who} determine {_listed(names)}"
+    text = f"{who} determine {listed(names)}"
     doubts = [
         ("the intervals are too narrow", fit.narrow),
         ("the residuals are not white", fit.coloured and not fit.white),
@@ -83,7 +80,7 @@ def _determined(fit: Fit) -> Headline:
     ]
     said = [words for words, is_so in doubts if is_so]
     if said:
-        text += f", but {_listed(said)}"
+        text += f", but {listed(said)}"
     return Headline("warning" if said or resting else "good", "converged", text)
 
 

@@ -1,12 +1,15 @@
 """What a simulation gives."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STATUS = ("ok", "ended by an event", "outside the model's range", "not finite", "solver stopped")
 """What `Trajectory.status` counts, from the best to the worst."""
@@ -43,7 +46,7 @@ class Trajectory(NamedTuple):
         )
 
     @property
-    def status(self) -> Int[Array, ""]:
+    def status(self) -> Int[Array, " *batch"]:
         """The worst that happened, an index into `STATUS`; one a run of a batch."""
         code = jnp.where(jnp.asarray(self.event) >= 0, 1, 0)
         for out in self.outside.values():
@@ -58,3 +61,23 @@ class Trajectory(NamedTuple):
         return self._replace(
             times=times, states=states, outputs=outputs, inputs=inputs, outside=outside
         )
+
+    def __repr__(self) -> str:
+        from heli_jax.summaries import as_text, of_trajectory
+
+        return as_text(of_trajectory(self, STATUS))
+
+    def _repr_html_(self) -> str:
+        from heli_jax.summaries import as_html, of_trajectory
+
+        return as_html(of_trajectory(self, STATUS))
+
+    def to_xarray(self) -> "xr.Dataset":
+        """The run as an xarray Dataset over `time` [s]: states, outputs and inputs by name, each
+        with its unit in `attrs["units"]`; runs of a batch along `run_0`, ...
+
+        An output or input of a name that is taken is `NAME_output` or `NAME_input`.
+        """
+        from heli_jax.exports import trajectory_dataset
+
+        return trajectory_dataset(self)

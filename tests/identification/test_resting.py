@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from heli_jax import Free, Prior, Problem, fit, models, output
-from heli_jax.report import numbers, tables
+from heli_jax import Free, Prior, Problem, fit, models, numbers, output
+from heli_jax.report import tables
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(4.0, prior=Prior(5.1, 0.3))}

@@ -8,8 +8,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from heli_jax import numbers
 from heli_jax.identification.validation.metrics import Whiteness
-from heli_jax.report import numbers, tables
+from heli_jax.report import tables
 from heli_jax.report.html import write_report
 from heli_jax.vehicle import Constant
 from tests.report.conftest import SCRIPT

@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_hex
 
+from heli_jax.numbers import number
 from heli_jax.report import style, sweeps
-from heli_jax.report.numbers import number
 from heli_jax.report.sweeps import columns
 from heli_jax.sweeps import chunks as pieces
 

@@ -37,6 +37,17 @@ class Posterior(NamedTuple):
         low, high = np.percentile(self.draws[name], [2.5, 97.5])
         return float(low), float(high)
 
+    def to_arviz(self) -> Any:
+        """The draws as arviz' inference data (an xarray DataTree), group `posterior`, for its
+        diagnostics and plots.
+
+        Raises:
+            ValueError: arviz is not installed (extra `bayes`).
+        """
+        from heli_jax.exports import posterior_tree
+
+        return posterior_tree(self.draws)
+
 
 def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Posterior:
     """Four chains of `draws` draws each, begun about the optimum in its own ellipse.

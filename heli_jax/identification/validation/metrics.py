@@ -25,6 +25,10 @@ class Metrics(NamedTuple):
     """the rest: what does not move together; the three make 1"""
 
 
+BAND99 = 2.5758293035489004
+"""half width of the 99 % band of a white residual's correlation, times sqrt(N): the 99.5 % point of
+the normal distribution"""
+
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
@@ -120,7 +124,7 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
         * together
         * min(scipy.special.chdtrc(lags, q[-1]), scipy.special.chdtrc(short, q[short - 1])),
     )
-    outside = float(np.mean(np.abs(r) * whole > 2.5758 * np.sqrt(whole / pairs)))
+    outside = float(np.mean(np.abs(r) * whole > BAND99 * np.sqrt(whole / pairs)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
 
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import FixedLocator, FuncFormatter, Locator, MaxNLocator, NullLocator
 
-from heli_jax.report.numbers import number
+from heli_jax.numbers import number
 from heli_jax.report.style import label, pretty
 from heli_jax.report.sweeps.columns import Column
 

@@ -9,8 +9,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
+from heli_jax.numbers import number
 from heli_jax.report import style
-from heli_jax.report.numbers import number
 from heli_jax.report.style import pretty
 from heli_jax.report.sweeps.columns import Column, Table, by_lot
 from heli_jax.report.sweeps.panels import crosses, dots, first, head, marked

@@ -1,0 +1,77 @@
+"""Results as the objects of other libraries: pandas, xarray, arviz; each imported where it is
+used.
+
+The classes whose methods call this import it, so that it imports none of them: their objects are
+`Any` here.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heli_jax import naming
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+
+def estimates_frame(estimates: Mapping[str, Any]) -> "pd.DataFrame":
+    """Estimates as a data frame: a row each, with value, sd, lower95, upper95, unit, prior_share.
+
+    sd and interval are NaN where the data do not determine a parameter.
+    """
+    import pandas as pd
+
+    columns = ("value", "sd", "lower95", "upper95", "unit", "prior_share")
+    rows = {name: [getattr(e, c) for c in columns] for name, e in estimates.items()}
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
+    numeric = [c for c in columns if c != "unit"]
+    frame = frame.astype(dict.fromkeys(numeric, float))  # None, not determined, becomes NaN
+    return frame.rename_axis("parameter")
+
+
+def trajectory_dataset(run: Any) -> "xr.Dataset":
+    """A run as a Dataset over `time` [s], each signal with its unit and its role (state, output or
+    input) in the attributes.
+
+    An output of the same name as a state or input, whose values it would repeat or replace, is
+    `NAME_output`; an input likewise `NAME_input`. Of a batch of runs each signal has further
+    dimensions `run_0`, `run_1` ... before time.
+
+    Raises:
+        ValueError: the runs of a batch differ in their times.
+    """
+    import xarray as xr
+
+    times = np.asarray(run.times)
+    batch = [f"run_{i}" for i in range(times.ndim - 1)]
+    first = times.reshape(-1, times.shape[-1])[0]
+    if not (times == first).all():
+        raise ValueError("to_xarray: expected the same times in every run of the batch")
+    variables: dict[str, Any] = {}
+    for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs)):
+        for name, values in naming.asdict(record).items():
+            known = name if name not in variables else f"{name}_{role}"
+            attributes = {"units": naming.unit(type(record), name) or "", "role": role}
+            variables[known] = ([*batch, "time"], np.asarray(values), attributes)
+    status = (batch, np.asarray(run.status), {"meaning": "index into trajectory.STATUS"})
+    coordinates = {"time": ("time", first, {"units": "s"}), "status": status}
+    return xr.Dataset(variables, coordinates)
+
+
+def posterior_tree(draws: Mapping[str, np.ndarray]) -> Any:
+    """Posterior draws, each (chains, draws), as arviz' inference data with a group `posterior`.
+
+    Raises:
+        ValueError: arviz is not installed.
+    """
+    try:
+        import arviz  # pyright: ignore[reportMissingImports]
+    except ImportError as e:
+        raise ValueError(
+            "to_arviz: arviz is not installed, expected the extra bayes: "
+            "pip install 'heli_jax[bayes]'"
+        ) from e
+    return arviz.from_dict({"posterior": dict(draws)})

@@ -1,0 +1,185 @@
+"""A fit read back from its run directory: plain data, no model and no log."""
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate, Signals
+from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.regular_file import read_regular
+from heli_jax.summaries import Summary, as_html, as_text, of_estimates
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_LIMIT_BYTES = 1_000_000_000
+
+
+class SavedFit(NamedTuple):
+    """What fit.json and signals.csv hold; the names are those of `Fit`."""
+
+    directory: Path
+    model: str
+    method: str
+    status: str
+    verdict: str
+    """what the data determine, in words"""
+    identifiable: bool
+    adequate: bool | None
+    """whether the model explains what was measured; None where that was not judged"""
+    estimates: dict[str, Estimate]
+    nuisance: dict[str, Estimate]
+    intervals: dict[str, dict[str, tuple[float, float]]]
+    """95 %, by parameter and method: 'gaussian', and those that were asked for"""
+    metrics: dict[str, Metrics]
+    """of the simulation, over the fitted flights, by output"""
+    validation: dict[str, Metrics]
+    """of the simulation, over the flights held out, by output"""
+    signals: tuple[Signals, ...]
+    notes: tuple[str, ...]
+    content: dict[str, Any]
+    """all of fit.json"""
+
+    def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
+        """The estimates as a pandas data frame, as `Fit.to_dataframe`.
+
+        Args:
+            nuisance: whether initial states, biases, gains and offsets follow the parameters.
+        """
+        from heli_jax.exports import estimates_frame
+
+        return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
+
+    def _summary(self) -> Summary:
+        head, rows = of_estimates(self.estimates)
+        title = f"SavedFit of {self.model} by {self.method}: {self.status}, in {self.directory}"
+        return Summary(title, head, rows, (self.verdict, *self.notes))
+
+    def __repr__(self) -> str:
+        return as_text(self._summary())
+
+    def _repr_html_(self) -> str:
+        return as_html(self._summary())
+
+
+def load_fit(directory: str | Path) -> SavedFit:
+    """Read the run directory of an earlier fit.
+
+    Raises:
+        InputError: it holds no fit.json and signals.csv that a fit wrote.
+    """
+    directory = Path(directory)
+    content = _content(directory / "fit.json")
+    try:
+        estimates = {
+            n: _estimate(e) for n, e in content["parameters"].items() if not e.get("fixed", False)
+        }
+        return SavedFit(
+            directory=directory,
+            model=content["model"],
+            method=content["method"],
+            status=content["status"],
+            verdict=content["verdict"]["text"],
+            identifiable=content["identifiable"],
+            adequate=content["adequate"],
+            estimates=estimates,
+            nuisance={n: _estimate(e) for n, e in content["nuisance"].items()},
+            intervals=_intervals(estimates, content["intervals"]),
+            metrics={n: _metrics(m) for n, m in content["metrics"].items()},
+            validation={n: _metrics(m) for n, m in content["validation"].items()},
+            signals=_signals(directory / "signals.csv", content),
+            notes=tuple(content["notes"]),
+            content=content,
+        )
+    except (KeyError, TypeError, AttributeError) as e:
+        raise InputError(
+            f"{directory / 'fit.json'}: expected what heli-jax fit writes, got a file without a "
+            f"usable {e}"
+        ) from e
+
+
+def _content(path: Path) -> dict[str, Any]:
+    data = read_regular(path, "the fit.json of a run directory", _LIMIT_BYTES)
+    try:
+        content = json.loads(data)
+    except ValueError as e:  # no JSON, or no text
+        raise InputError(f"{path}: expected JSON, got {str(e)[:80]}") from e
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a JSON object, got a {type(content).__name__}")
+    return content
+
+
+def _estimate(saved: Mapping[str, Any]) -> Estimate:
+    return Estimate(**{name: saved[name] for name in Estimate._fields})
+
+
+def _metrics(saved: Mapping[str, float | None]) -> Metrics:
+    # JSON has no NaN: fit.json says null.
+    return Metrics(*(_number(saved[name]) for name in Metrics._fields))
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _intervals(
+    estimates: Mapping[str, Estimate], saved: Mapping[str, Any] | None
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """By parameter and method; the Gaussian ones alone where no others were asked for."""
+    if saved is not None:
+        return {
+            name: {method: (_number(ends[0]), _number(ends[1])) for method, ends in by.items()}
+            for name, by in saved["by_parameter"].items()
+        }
+    return {
+        name: {"gaussian": (e.lower95, e.upper95)}
+        for name, e in estimates.items()
+        if e.lower95 is not None and e.upper95 is not None
+    }
+
+
+def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
+    """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
+    held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
+    outputs = [
+        *content["metrics"],
+        *(n for n in content["validation"] if n not in content["metrics"]),
+    ]
+    rows: dict[str, list[list[str]]] = {}
+    text = read_regular(path, "the signals.csv of a run directory", _LIMIT_BYTES).decode("utf-8")
+    lines = csv.reader(text.splitlines())
+    head = next(lines, [])
+    if head[:2] != ["flight", "time"]:
+        raise InputError(f"{path}: expected the columns flight and time, got {head[:2]}")
+    for line in lines:
+        rows.setdefault(line[0], []).append(line[1:])
+    return tuple(
+        _flight(name, held_out.get(name, False), head[1:], cells, outputs)
+        for name, cells in rows.items()
+    )
+
+
+def _flight(
+    name: str, hold_out: bool, head: list[str], cells: list[list[str]], outputs: list[str]
+) -> Signals:
+    table = np.array([[float(c) if c else math.nan for c in row] for row in cells])
+    # A flight without some signal has an empty column there.
+    columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
+    of_outputs = {f"{o}_{w}" for o in outputs for w in _OF_AN_OUTPUT}
+    inputs = {n: v for n, v in columns.items() if n != "time" and n not in of_outputs}
+    measured, simulated, _, innovations = (
+        {o: columns[f"{o}_{what}"] for o in outputs if f"{o}_{what}" in columns}
+        for what in _OF_AN_OUTPUT
+    )
+    return Signals(
+        name, hold_out, columns["time"], inputs, measured, simulated, innovations or None
+    )
+
+
+_OF_AN_OUTPUT = ("measured", "simulated", "residual", "innovation")

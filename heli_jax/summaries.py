@@ -1,0 +1,176 @@
+"""How flights, problems, fits, runs and vehicles show themselves: as text in a session, as a table
+in a notebook.
+
+Each `of_...` function makes a `Summary` of one object; `as_text` and `as_html` lay it out. The
+classes call these from `__repr__` and `_repr_html_`. Since they import this module, it imports
+none of them, and its arguments are `Any`.
+"""
+
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.numbers import NOTHING, measured, number, percent
+
+type Row = tuple[str, ...]
+
+
+class Summary(NamedTuple):
+    """What is shown of an object."""
+
+    title: str
+    head: Row = ()
+    rows: tuple[Row, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def as_text(summary: Summary) -> str:
+    """A summary as lines of text, its columns in line."""
+    rows = [row for row in (summary.head, *summary.rows) if row]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  " + "  ".join(map(str.ljust, row, widths)).rstrip() if any(row) else "" for row in rows
+    ]
+    return "\n".join([summary.title, *lines, *(f"  {note}" for note in summary.notes)])
+
+
+def as_html(summary: Summary) -> str:
+    """A summary as HTML; names and notes come from logs and files, so all text is escaped."""
+
+    def cells(row: Row, tag: str) -> str:
+        return "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
+
+    head = f"<thead><tr>{cells(summary.head, 'th')}</tr></thead>" if summary.head else ""
+    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in summary.rows)
+    table = f"<table>{head}<tbody>{body}</tbody></table>" if head or body else ""
+    notes = "".join(f"<p>{html.escape(note)}</p>" for note in summary.notes)
+    return f"<p><b>{html.escape(summary.title)}</b></p>{table}{notes}"
+
+
+def of_flight(flight: Any) -> Summary:
+    """Signals with their ranges in SI, what inputs do between samples, and the reader's notes."""
+    rows = []
+    for role in ("inputs", "outputs"):
+        for name, values in getattr(flight, role).items():
+            hold = flight.hold[name] if role == "inputs" else ""
+            rows.append((role[:-1], name, *_range(values), hold))
+    used = ", held out" if flight.hold_out else ""
+    known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
+    return Summary(
+        f"Flight{_quoted(flight.name)}: {flight.n_samples} samples at {1 / flight.dt:g} Hz, "
+        f"{flight.duration:.6g} s{used}",
+        ("", "signal", "lowest", "highest", "hold"),
+        tuple(rows),
+        (*known, *(flight.source.notes if flight.source else ())),
+    )
+
+
+def of_problem(problem: Any) -> Summary:
+    """What is free, with bounds and priors, and which flights are fitted."""
+    rows = []
+    for name, free in problem.free.items():
+        prior = "" if free.prior is None else f"{number(free.prior.mean)} ± {number(free.prior.sd)}"
+        bounds = (number(v) if v is not None else "" for v in (free.start, free.lower, free.upper))
+        unit = naming.unit(problem.model.Params, name) or ""
+        rows.append((name, *bounds, prior, unit))
+    held_out = len(problem.flights) - len(problem.training)
+    flights = f"{len(problem.training)} flights" if len(problem.training) > 1 else "1 flight"
+    return Summary(
+        f"Problem: {problem.model.name} by {problem.method}, {flights}"
+        + (f" and {held_out} held out" if held_out else ""),
+        ("free", "start", "lower", "upper", "prior", "unit"),
+        tuple(rows),
+    )
+
+
+def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
+    """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate."""
+    head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
+    rows = []
+    for name, e in estimates.items():
+        if e.sd is None or e.lower95 is None or e.upper95 is None:
+            cells = ("not determined", "", "")
+        else:
+            value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+            cells = (value, sd, f"{low} to {high}")
+        rows.append((name, *cells, e.unit, percent(e.prior_share, 0)))
+    return head, tuple(rows)
+
+
+def of_fit(fit: Any) -> Summary:
+    """Status, verdict, estimates with intervals, and agreement by output."""
+    head, rows = of_estimates(fit.estimates)
+    agreement = [f"{name}: VAF {percent(m.vaf)}" for name, m in fit.metrics.items()]
+    return Summary(
+        f"Fit of {fit.model} by {fit.method}: {fit.status}",
+        (*head[:3], fit.interval, *head[4:]),
+        rows,
+        (fit.verdict.text, *agreement, *fit.notes),
+    )
+
+
+def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
+    """Signals with their ranges in SI and how the run ended (`statuses` are the words for it); of
+    a batch, and within jit, the shapes alone."""
+    signals = [
+        (role, name, values)
+        for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
+        for name, values in naming.asdict(record).items()
+    ]
+    if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
+        shape = tuple(np.shape(run.times))
+        rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
+        return Summary(f"Trajectory, times of shape {shape}", ("", "signal", "shape"), rows)
+    times = np.asarray(run.times)
+    units = {
+        (role, name): naming.unit(type(record), name) or ""
+        for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
+        for name in naming.names(type(record))
+    }
+    return Summary(
+        f"Trajectory: {times.size} samples, {float(times[-1]):.6g} s, "
+        f"{statuses[int(np.asarray(run.status))]}",
+        ("", "signal", "lowest", "highest", "unit"),
+        tuple((role, n, *_range(np.asarray(v)), units[role, n]) for role, n, v in signals),
+        tuple(f"outside: {n}" for n, where in run.outside.items() if np.any(np.asarray(where))),
+    )
+
+
+def of_vehicle(vehicle: Any) -> Summary:
+    """The constants that were given, with unit and meaning; `vehicle` is any record of numbers."""
+    record, rows, missing = type(vehicle), [], []
+    for name, value in naming.asdict(vehicle).items():
+        if not _concrete([value]) or np.ndim(value) != 0:
+            shown = f"shape {tuple(np.shape(value))}" if hasattr(value, "shape") else repr(value)
+        elif np.isnan(float(value)):
+            missing.append(name)
+            continue
+        else:
+            shown = number(float(value), 6)
+        rows.append((name, shown, naming.unit(record, name) or "", naming.meaning(record, name)))
+    notes = (f"not given: {', '.join(missing)}",) if missing else ()
+    return Summary(record.__name__, ("constant", "value", "unit", "meaning"), tuple(rows), notes)
+
+
+def _concrete(values: Iterable[Any]) -> bool:
+    """Whether all are numbers that can be read now."""
+    try:
+        for value in values:
+            np.asarray(value, dtype=float)
+    except Exception:  # JAX's tracers, within jit and vmap, each have an error of their own
+        return False
+    return True
+
+
+def _range(values: np.ndarray) -> tuple[str, str]:
+    seen = np.asarray(values, float)[np.isfinite(values)]
+    if not seen.size:
+        return NOTHING, NOTHING
+    return number(float(seen.min())), number(float(seen.max()))
+
+
+def _quoted(name: str) -> str:
+    return f" {name!r}" if name else ""

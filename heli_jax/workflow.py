@@ -1,0 +1,357 @@
+"""A whole analysis as functions, for a script, a notebook and the command line alike.
+
+`load_config` reads a configuration; `run_fit` does what `heli-jax fit` does, `run_check` what
+`heli-jax check` does and `run_sweep` what `heli-jax sweep` does. `load_fit` reads what an earlier
+fit wrote.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from heli_jax import config as configuration
+from heli_jax import run_directory
+from heli_jax.config import Experiment
+from heli_jax.errors import InputError
+from heli_jax.identification.equation_error.baseline import Baseline, baseline
+from heli_jax.identification.fit import check, fit
+from heli_jax.identification.model_selection import Choice, choose
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Check, Fit
+from heli_jax.identification.uncertainty.comparison import Intervals, intervals
+from heli_jax.report import files
+from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.yaml_file import as_yaml
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from heli_jax.sweeps.spec import Job
+
+type Say = Callable[[str], None]
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, eq=False)
+class FitRun:
+    """A fit with all that its configuration asks for beside it."""
+
+    config: Experiment
+    problem: Problem
+    fit: Fit
+    baseline: Baseline | None = None
+    """the recursive least squares on the same data; None where it is off or has none to give"""
+    supplementary: SupplementaryAnalyses = field(default_factory=SupplementaryAnalyses)
+    """model selection and further intervals, where the configuration asks for them"""
+    directory: Path | None = None
+    """where the report is, once it is written"""
+    began: float = field(default_factory=time.perf_counter)
+    """when the work began, by `time.perf_counter` [s]"""
+
+    def figure(self, name: str) -> "Figure":
+        """A figure of the report, drawn anew: `response_OUTPUT`, `bode`, `starts`, ...
+
+        Raises:
+            ValueError: the report has no figure of that name; the sentence lists those it has.
+        """
+        import matplotlib
+
+        from heli_jax.report import style
+        from heli_jax.report.html import drawings
+
+        draw = drawings(self.fit, self.problem, self.baseline, self.supplementary)
+        with matplotlib.rc_context(style.STYLE):
+            figure = draw[name]() if name in draw else None
+        if figure is None:
+            raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
+        return figure
+
+    def __repr__(self) -> str:
+        where = "" if self.directory is None else f"\n  report: {self.directory / 'report.html'}"
+        return f"FitRun of {self.config.path}: {self.fit!r}{where}"
+
+    def _repr_html_(self) -> str:
+        return self.fit._repr_html_()
+
+
+def load_config(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
+    """Read and validate a configuration, its model and its vehicle; no log is opened yet.
+
+    Args:
+        path: the configuration (YAML); paths in it begin at its folder.
+        overrides: values in place of the file's: `{"fit.free.a.start": 5}`, or as on the command
+            line, `["fit.free.a.start=5"]`.
+
+    Raises:
+        InputError: anything in the file or an override is wrong.
+    """
+    return configuration.load(path, overrides)
+
+
+def run_fit(
+    config: Experiment | str | Path,
+    out: str | Path | None = None,
+    *,
+    progress: Say = _silent,
+    began: float | None = None,
+) -> FitRun:
+    """Fit a configuration's flights, with baseline, intervals and model selection as it asks.
+
+    Args:
+        config: of `load_config`, or the path of a configuration.
+        out: a new directory for the report, as of `write_report`; none is written unless given.
+        progress: told in words what the log's reader assumed and what is going on.
+        began: when the work began, by `time.perf_counter` [s]; now unless given.
+
+    Raises:
+        InputError: a log or something of the configuration is wrong, or `out` exists.
+    """
+    began = time.perf_counter() if began is None else began
+    if out is not None:
+        run_directory.require_free(Path(out))  # before the work, not after it
+    config = config if isinstance(config, Experiment) else load_config(config)
+    problem = configuration.problem(config)
+    for note in reading_notes(problem):
+        progress(note)
+    options = config.config.fit
+    assert options is not None  # `problem` refuses a configuration without
+    try:
+        fitted = fit(
+            problem,
+            starts=options.starts,
+            seed=options.seed,
+            max_steps=options.max_steps,
+            progress=progress,
+        )
+    except ValueError as e:
+        raise InputError(f"{config.path}: fit: {e}") from e
+    run = FitRun(
+        config,
+        problem,
+        fitted,
+        _baseline(config, problem, fitted, progress),
+        _supplementary(config, problem, fitted, progress),
+        began=began,
+    )
+    if out is None:
+        return run
+    progress("writing the report")
+    return write_report(run, out)
+
+
+def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:
+    """What a configuration's flights can determine, before any fit.
+
+    Args:
+        config: of `load_config`, or the path of a configuration.
+        progress: told in words what the log's reader assumed.
+
+    Raises:
+        InputError: a log or something of the configuration is wrong.
+    """
+    config = config if isinstance(config, Experiment) else load_config(config)
+    problem = configuration.problem(config)
+    for note in reading_notes(problem):
+        progress(note)
+    try:
+        return check(problem)
+    except ValueError as e:
+        raise InputError(f"{config.path}: fit: {e}") from e
+
+
+def reading_notes(problem: Problem) -> list[str]:
+    """What the reader of each log assumed or did, a sentence each that begins with the log."""
+    notes = []
+    for flight in problem.flights:
+        where = flight.source.path if flight.source else flight.name
+        notes += [f"{where}: {note}" for note in (flight.source.notes if flight.source else ())]
+        notes += [
+            f"{where}: {name} is taken as linear between samples, since it {reason}"
+            for name, reason in flight.hold_reason.items()
+            if flight.hold[name] == "linear"
+        ]
+    return notes
+
+
+def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) -> Baseline | None:
+    options = config.config.rls
+    if options is None:
+        return None
+    progress("recursive least squares")
+    started = time.perf_counter()
+    estimate = None
+    try:
+        estimate = baseline(
+            config.model,
+            config.vehicle.params,
+            problem.training[0],
+            order=options.order,
+            forgetting=options.forgetting,
+        )
+    except ValueError as e:
+        progress(f"no baseline: {e}")
+    fitted.timing["rls"] = time.perf_counter() - started
+    return estimate
+
+
+def _supplementary(
+    config: Experiment, problem: Problem, fitted: Fit, progress: Say
+) -> SupplementaryAnalyses:
+    """Further intervals and model selection, where the configuration asks for them."""
+    options = config.config.fit
+    assert options is not None
+    methods = options.intervals
+    further: Intervals | None = None
+    choice = None
+    try:
+        if methods.profile or methods.bootstrap or methods.nuts:
+            further = intervals(
+                fitted,
+                profiles=methods.profile,
+                runs=methods.bootstrap,
+                draws=methods.nuts,
+                seed=options.seed,
+                progress=progress,
+            )
+    except ValueError as e:
+        raise InputError(f"{config.path}: fit: {e}") from e
+    if options.compare:
+        choice = compare_models(config, problem, progress=progress)
+    return SupplementaryAnalyses(choice, further)
+
+
+def compare_models(
+    config: Experiment | str | Path, problem: Problem | None = None, *, progress: Say = _silent
+) -> Choice:
+    """Fit the models that `fit.compare` puts beside a configuration's own, and compare them by
+    likelihood ratio, AIC and BIC.
+
+    Args:
+        config: of `load_config`, or the path of a configuration.
+        problem: the configuration's problem where it is at hand (`FitRun.problem`), so that the
+            logs need not be read again.
+        progress: told in words what is going on.
+
+    Raises:
+        InputError: no axis of the model can be disturbed, or a model cannot be fitted.
+    """
+    config = config if isinstance(config, Experiment) else load_config(config)
+    candidates = configuration.rivals(config, problem or configuration.problem(config))
+    try:
+        return choose(candidates.problems, candidates.nested, progress=progress)
+    except ValueError as e:
+        raise InputError(f"{config.path}: fit: {e}") from e
+
+
+def write_report(run: FitRun, out: str | Path) -> FitRun:
+    """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/.
+
+    The directory appears whole or not at all. Returns the run with `directory` set.
+
+    Raises:
+        InputError: `out` exists or cannot be written to.
+    """
+    from heli_jax.report.html import write_report as write_page  # matplotlib: slow
+
+    out = Path(out)
+    run_directory.require_free(out)
+    text = as_yaml(configuration.resolved(run.config))
+    vehicle, extra = run.config.vehicle, run.supplementary
+    with run_directory.whole(out) as folder:
+        (folder / "config.yaml").write_text(text, encoding="utf-8")
+        files.write_signals(folder / "signals.csv", run.fit.signals)
+        started = time.perf_counter()
+        title = run.config.path.stem
+        write_page(folder, run.fit, run.problem, run.baseline, title, vehicle.constants, extra)
+        run.fit.timing["report"] = time.perf_counter() - started
+        run.fit.timing["total"] = time.perf_counter() - run.began
+        content = files.fit_json(run.fit, run.problem, run.baseline, extra)
+        files.write_json(folder / "fit.json", content)
+    return replace(run, directory=out)
+
+
+def run_sweep(
+    config: Experiment | str | Path,
+    out: str | Path | None = None,
+    *,
+    figures: bool = True,
+    **options: Any,
+) -> "xr.Dataset":
+    """Run the design of a configuration's `sweep`.
+
+    Args:
+        config: of `load_config`, or the path of a configuration.
+        out: a directory for sweep.zarr, summary.json, config.yaml and figures/; in memory, and
+            without figures, unless given.
+        figures: whether to draw: it takes seconds.
+        **options: of `heli_jax.sweeps.run.Options`, as of `heli_jax.sweep`: resume, chunk, lanes,
+            devices, client, memory, progress, say.
+
+    Returns:
+        A Dataset over `element`, with axes and `status` as coordinates.
+
+    Raises:
+        InputError: something of the configuration is wrong, or `out` exists (without `resume`),
+            is of another sweep, or cannot be written to.
+    """
+    from heli_jax.sweeps.run import Options, carry_out
+
+    config = config if isinstance(config, Experiment) else load_config(config)
+    job = _sweep_job(config)
+    design = config.config.sweep
+    assert design is not None  # `_sweep_job` refuses a configuration without
+    resolved = as_yaml(configuration.resolved(config))
+    notes = []
+    if config.config.disturbance is not None and "seed" not in job.design.names:
+        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
+    out = None if out is None else Path(out)
+    carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
+    try:
+        dataset = carry_out(
+            job,
+            out,
+            carrying,
+            files={"config.yaml": resolved},
+            attributes={"configuration": resolved},
+            seed=design.seed or 0,
+            notes=notes,
+        )
+    except InputError:
+        raise
+    except ValueError as e:
+        raise InputError(f"{config.path}: sweep: {e}") from e
+    if figures and out is not None:
+        carrying.say("drawing figures")
+        _draw_sweep(out, dataset, job, carrying.say)
+    return dataset
+
+
+def _sweep_job(config: Experiment) -> "Job":
+    from heli_jax import generate
+    from heli_jax.config.sweeps import simulates, sweep_job
+
+    return sweep_job(*generate.drive(config)) if simulates(config) else sweep_job(config)
+
+
+def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
+    """The figures of a sweep; what they leave out is said.
+
+    Raises:
+        InputError: the figures cannot be written.
+    """
+    from heli_jax.report.sweeps import RESULTS, results, write_figures
+    from heli_jax.sweeps.summary import worst
+
+    try:
+        write_figures(out / "figures", dataset, worst(dataset, job))
+    except OSError as e:
+        raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
+    count = len(results(dataset))
+    if count > RESULTS:
+        say(f"slices and maps are of the first {RESULTS} of {count} results")

@@ -1,0 +1,35 @@
+"""Welch's spectra against matplotlib's, and against a response that is known."""
+
+import numpy as np
+import pytest
+from matplotlib import mlab
+
+from heli_jax.analysis.spectra import spectra
+
+
+@pytest.fixture(scope="module")
+def record():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(4096) + 0.01 * np.arange(4096)
+    y = 2.0 * u - 0.7 * np.roll(u, 1) + 0.1 * rng.standard_normal(4096)
+    return u, y
+
+
+@pytest.mark.parametrize("length", [64, 255, 256])
+def test_as_matplotlib_has_them(record, length):
+    u, y = record
+    s = spectra(u, y, 0.02, length)
+    options = {"NFFT": length, "Fs": 50.0, "noverlap": length // 2, "detrend": "linear"}
+    uu, f = mlab.psd(u, **options)
+    np.testing.assert_allclose(s.omega, 2 * np.pi * f, rtol=1e-12)
+    np.testing.assert_allclose(s.uu, uu, rtol=1e-9)
+    np.testing.assert_allclose(s.yy, mlab.psd(y, **options)[0], rtol=1e-9)
+    expected = mlab.csd(u, y, **options)[0]
+    np.testing.assert_allclose(s.uy, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_response_of_a_known_filter(record):
+    s = spectra(*record, 0.02, 256)
+    inner = slice(4, -4)
+    expected = 2.0 - 0.7 * np.exp(-1j * s.omega * 0.02)
+    np.testing.assert_allclose((s.uy / s.uu)[inner], expected[inner], atol=0.1)

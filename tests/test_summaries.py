@@ -1,0 +1,128 @@
+"""How objects show themselves, and what other libraries get of them."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Flight, Free, Prior, Problem, fit, load_vehicle, models, simulate
+from heli_jax.flights.flight import Source
+from heli_jax.identification.uncertainty.nuts import Posterior
+from heli_jax.naming import replace
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+SCRIPT = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return load_vehicle(CONFIGS / "vehicles/bench-30.yaml")
+
+
+@pytest.fixture(scope="module")
+def run(bench):
+    stick = np.repeat(np.random.default_rng(0).uniform(-3e-6, 3e-6, 20), 50)
+    inputs = models.roll_on_stand.Inputs(x_roll=jnp.asarray(stick))
+    return simulate(models.roll_on_stand, bench, inputs, dt=0.02)
+
+
+@pytest.fixture(scope="module")
+def flight(run):
+    roll = np.asarray(run.outputs.roll) + 2e-3 * np.random.default_rng(1).standard_normal(1000)
+    return Flight(
+        0.02,
+        {"x_roll": np.asarray(run.inputs.x_roll)},
+        {"roll": roll},
+        name=SCRIPT,
+        source=Source("log.csv", "0", (f"a note {SCRIPT}",)),
+    )
+
+
+@pytest.fixture(scope="module")
+def problem(bench, flight):
+    free = {"Ixx": Free(0.03, 0.001, 1.0), "If": Free(2e-4), "a": Free(5.1, prior=Prior(5.1, 0.3))}
+    return Problem(models.roll_on_stand, bench, [flight], free)
+
+
+@pytest.fixture(scope="module")
+def fitted(problem):
+    return fit(problem)
+
+
+def test_objects_say_what_they_hold(bench, run, flight, problem, fitted):
+    expected = {
+        "Helicopter": (bench, ["Ixx", "0.024", "kg m^2", "fuselage inertia", "not given: m,"]),
+        "Trajectory": (run, ["1000 samples", "19.98 s", "ok", "x_roll", "rad/s"]),
+        "Flight": (flight, ["1000 samples at 50 Hz", "roll", "zero-order", "a note"]),
+        "Problem": (problem, ["roll-on-stand by output-error", "1 flight", "5.1 ± 0.3", "0.03"]),
+        "Fit": (fitted, ["converged", "Ixx", "kg m^2", "95 %", "VAF", fitted.verdict.text]),
+    }
+    for name, (value, words) in expected.items():
+        assert repr(value).startswith(name)
+        page = value._repr_html_()
+        assert page.startswith(f"<p><b>{name}")
+        for word in words:
+            assert word in repr(value)
+            assert word.replace("'", "&#x27;") in page
+
+
+def test_names_and_notes_are_escaped(flight):
+    page = flight._repr_html_()
+    assert "<script>" not in page
+    assert page.count("&lt;script&gt;") == 2
+
+
+def test_what_is_traced_or_batched_shows_its_shape(bench, run):
+    seen = []
+
+    @jax.jit
+    def traced(vehicle):
+        seen.append(repr(vehicle))
+        return vehicle.Ixx
+
+    traced(bench)
+    assert "shape ()" in seen[0]
+    many = jax.tree.map(lambda v: jnp.stack([v, v]), run)
+    assert repr(many).startswith("Trajectory, times of shape (2, 1000)")
+    assert "shape (3,)" in repr(replace(bench, Ixx=jnp.arange(3.0)))
+
+
+def test_estimates_as_a_data_frame(fitted):
+    frame = fitted.to_dataframe()
+    assert list(frame.columns) == ["value", "sd", "lower95", "upper95", "unit", "prior_share"]
+    assert list(frame.index) == ["Ixx", "If", "a"]
+    assert frame.loc["Ixx", "value"] == fitted.estimates["Ixx"].value
+    assert frame.loc["Ixx", "unit"] == "kg m^2"
+    everything = fitted.to_dataframe(nuisance=True)
+    assert set(everything.index) == {*fitted.estimates, *fitted.nuisance}
+    assert everything["sd"].dtype == float
+
+
+def test_a_run_as_a_dataset(run):
+    data = run.to_xarray()
+    assert data["roll"].attrs == {"units": "rad", "role": "output"}
+    assert float(data.phi.sel(time=0.02)) == float(run.states.phi[1])
+    assert int(data.status) == 0
+    many = jax.tree.map(lambda v: jnp.stack([v, v]), run)
+    batch = many.to_xarray()
+    assert batch.x_roll.dims == ("run_0", "time")
+    assert batch.status.shape == (2,)
+    with pytest.raises(ValueError, match="same times"):
+        many._replace(times=jnp.stack([run.times, 2.0 * run.times])).to_xarray()
+
+
+def test_draws_as_arviz_data_or_a_sentence(monkeypatch):
+    draws = {"Ixx": np.random.default_rng(0).standard_normal((4, 100))}
+    posterior = Posterior(draws, 1.0, 400.0, 0)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "arviz", None)
+        with pytest.raises(ValueError, match=r"arviz is not installed.*extra bayes"):
+            posterior.to_arviz()
+    try:
+        import arviz  # noqa: F401
+    except ImportError:
+        pytest.skip("arviz is not installed")
+    np.testing.assert_array_equal(posterior.to_arviz()["posterior"]["Ixx"].values, draws["Ixx"])

@@ -1,0 +1,166 @@
+"""The whole analysis from Python: the same as the command line, and read back."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import heli_jax
+from heli_jax.cli import main
+from heli_jax.errors import InputError
+
+CONFIG = """
+model: roll-on-stand
+vehicle: {vehicle}
+flights:
+  - log: bench.csv
+    signals:
+      time: {{signal: t}}
+      inputs: {{x_roll: {{signal: stick, unit: m}}}}
+      outputs: {{roll: {{signal: roll, unit: rad, sd: 0.002}}}}
+fit:
+  free:
+    Ixx: {{start: 0.03}}
+    If: {{start: 2.0e-4}}
+rls: {{order: 4}}
+simulate:
+  duration: 20.0
+  rate: 50.0
+  inputs: {{x_roll: {{kind: random-steps, amplitude: 3.0e-6, hold: [0.2, 1.5]}}}}
+  noise: {{roll: {{sd: 0.002}}}}
+sweep:
+  design: grid
+  axes: {{Ixx: {{lower: 0.02, upper: 0.03, n: 3}}}}
+  reduce: {{misfit: {{how: nrmse, signal: roll}}}}
+"""
+VEHICLE = Path(__file__).parents[1] / "configs/vehicles/bench-30.yaml"
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("workflow")
+    path = folder / "bench.yaml"
+    path.write_text(CONFIG.format(vehicle=VEHICLE))
+    assert main(["simulate", str(path), "--out", str(folder / "bench.csv")]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(config):
+    said = []
+    done = heli_jax.run_fit(config, config.parent / "fit", progress=said.append)
+    assert said[-1] == "writing the report"
+    return done
+
+
+def test_a_fit_from_python_is_that_of_the_command_line(config, run, tmp_path, capsys):
+    out = tmp_path / "cli"
+    assert main(["fit", str(config), "--out", str(out)]) == 0
+    assert "report:" in capsys.readouterr().out
+    ours, theirs = (json.loads((d / "fit.json").read_text()) for d in (run.directory, out))
+    assert ours.pop("timing_s").keys() == theirs.pop("timing_s").keys()
+    assert ours == theirs
+    names = {p.name for p in run.directory.iterdir()}
+    assert names == {"config.yaml", "fit.json", "signals.csv", "report.html", "figures"}
+
+
+def test_a_saved_fit_is_read_back(run):
+    saved = heli_jax.load_fit(run.directory)
+    assert saved.estimates == run.fit.estimates
+    assert saved.nuisance.keys() == run.fit.nuisance.keys()
+    assert (saved.status, saved.verdict) == (run.fit.status, run.fit.verdict.text)
+    assert saved.adequate == run.fit.adequate
+    assert saved.metrics["roll"] == run.fit.metrics["roll"]
+    assert saved.notes == run.fit.notes
+    [mine], [theirs] = run.fit.signals, saved.signals
+    for part in ("inputs", "measured", "simulated"):
+        assert getattr(mine, part).keys() == getattr(theirs, part).keys()
+    np.testing.assert_array_equal(mine.residual("roll"), theirs.residual("roll"))
+    lower, upper = saved.intervals["Ixx"]["gaussian"]
+    assert lower < saved.estimates["Ixx"].value < upper
+    assert saved.to_dataframe().equals(run.fit.to_dataframe())
+    assert str(run.directory) in repr(saved)
+    assert "kg m^2" in saved._repr_html_()
+
+
+def test_a_directory_without_a_fit_is_refused_in_a_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"fit\.json"):
+        heli_jax.load_fit(tmp_path)
+    for text in ("[]", "{", '{"status": "converged"}', '{"parameters": 1}'):
+        (tmp_path / "fit.json").write_text(text)
+        with pytest.raises(InputError, match=r"fit\.json: expected"):
+            heli_jax.load_fit(tmp_path)
+
+
+def test_overrides_are_a_mapping_or_the_command_lines_texts(config):
+    by_key = heli_jax.load_config(config, {"fit.free.Ixx.start": 0.04, "flights.0.rate": 25})
+    by_text = heli_jax.load_config(config, ["fit.free.Ixx.start=0.04", "flights.0.rate=25"])
+    assert by_key.config == by_text.config
+    assert by_key.config.fit.free["Ixx"].start == 0.04
+    with pytest.raises(InputError, match=r"flights\.0\.rate\.x"):
+        heli_jax.load_config(config, {"flights.0.rate.x": 1, "flights.0.rate.x.y": 2})
+
+
+def test_nothing_is_written_over(config, run):
+    with pytest.raises(InputError, match="exists already"):
+        heli_jax.run_fit(config, run.directory)
+    with pytest.raises(InputError, match="exists already"):
+        heli_jax.write_report(run, run.directory)
+
+
+def test_a_run_shows_its_fit(run):
+    assert repr(run).startswith("FitRun of ")
+    assert "report.html" in repr(run)
+    assert run._repr_html_() == run.fit._repr_html_()
+
+
+def test_check_and_further_intervals(config, run):
+    check = heli_jax.run_check(config)
+    assert check.verdict.identifiable
+    more = heli_jax.intervals(run.fit, profiles=["Ixx"])
+    assert set(more.by_parameter["Ixx"]) == {"gaussian", "profile"}
+
+
+def test_models_are_compared(config, run):
+    choice = heli_jax.compare_models(run.config, run.problem)
+    assert len(choice.candidates) > 1
+    assert choice.sentences
+
+
+def test_a_sweep_in_memory_and_in_a_directory(config, tmp_path):
+    in_memory = heli_jax.run_sweep(config)
+    stored = heli_jax.run_sweep(config, tmp_path / "sweep", figures=False)
+    np.testing.assert_array_equal(in_memory["misfit"], stored["misfit"])
+    assert in_memory.sizes["element"] == 3
+    assert (tmp_path / "sweep" / "config.yaml").exists()
+    assert not (tmp_path / "sweep" / "figures").exists()
+
+
+def test_no_sweep_is_said(config):
+    plain = heli_jax.load_config(config)
+    plain = plain._replace(config=plain.config.model_copy(update={"sweep": None}))
+    with pytest.raises(InputError, match="sweep: missing"):
+        heli_jax.run_sweep(plain)
+
+
+def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
+    folder = config.parent
+    text = config.read_text().replace("{signal: stick, unit: m}", "{signal: stick}")
+    text = text.replace("{signal: roll, unit: rad, sd", "{signal: roll, sd")
+    path = folder / "no-units.yaml"
+    path.write_text(text)
+    assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 0
+    told = capsys.readouterr().err
+    assert "bench.csv: x_roll: no unit stated, taken as m\n" in told
+    assert "bench.csv: roll: no unit stated, taken as rad\n" in told
+    saved = heli_jax.load_fit(tmp_path / "fit")
+    assert saved.content["data"][0]["notes"] == [
+        "x_roll: no unit stated, taken as m",
+        "roll: no unit stated, taken as rad",
+    ]
+    page = (tmp_path / "fit/report.html").read_text()
+    assert "x_roll: no unit stated, taken as m" in page
+    with_units = heli_jax.run_fit(config)
+    assert with_units.problem.flights[0].source.notes == ()
+    assert with_units.fit.estimates == saved.estimates
