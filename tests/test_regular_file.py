@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.flights import describe_log, read_flight
 from heli_jax.flights.flight import Signal
@@ -167,7 +168,7 @@ def test_a_sweep_goes_on_only_in_a_directory_of_files(tmp_path, configuration):
     simulate = {**configuration()[1]["simulate"], "duration": 2}
     config = configuration(sweep=sweep, simulate=simulate)[0]
     arguments = ["sweep", config, "--out", str(out), "--no-figures"]
-    assert commands(tmp_path, [arguments], 60)[0][0] == 0
+    assert main(arguments) == 0
 
     hidden = [
         ("sweep.zarr/zarr.json", os.mkfifo),

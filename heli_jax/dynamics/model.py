@@ -1,5 +1,6 @@
 """Model: how dynamics, ours or anyone's, reach simulation, identification and report."""
 
+import copy
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -215,9 +216,17 @@ def field_and_output(model: Model, params: Any, state: Any, inputs: Any) -> tupl
     )
 
 
-def plain(record: Any) -> Any:
-    """A record of concrete numbers as NumPy scalars: quicker than JAX outside jit."""
-    return type(record)(**{n: np.float64(v) for n, v in naming.asdict(record).items()})
+def plain(record: Any, **changes: Any) -> Any:
+    """A record of concrete numbers, some of them changed, as NumPy scalars: quicker than JAX
+    outside jit."""
+    values = {n: np.float64(v) for n, v in {**naming.asdict(record), **changes}.items()}
+    if isinstance(record, tuple):
+        return type(record)(**values)
+    # Past the class, which may make arrays of them (Helicopter does).
+    made = copy.copy(record)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 def needed_but_missing(model: Model, params: Any) -> list[str]:
@@ -241,7 +250,7 @@ def _at_one(model: Model, params: Any, name: str, value: float) -> np.ndarray:
     `value`."""
     one = np.float64(1.0)
     others = {n: one for n, v in naming.asdict(params).items() if np.isnan(v)}
-    filled = naming.replace(plain(params), **{**others, name: np.float64(value)})
+    filled = plain(params, **{**others, name: value})
     x = model.State(**dict.fromkeys(naming.names(model.State), one))
     u = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), one))
     with np.errstate(all="ignore"):

@@ -352,7 +352,7 @@ def unread(one: Job) -> list[str]:
     drawn = model.noise_intensity if "seed" in one.design.names else None
 
     def else_read(name: str) -> bool:
-        missing = naming.replace(plain(params), **{name: np.float64(np.nan)})
+        missing = plain(params, **{name: np.nan})
         with np.errstate(all="ignore"):
             parts = (model.initial_state(missing), None if drawn is None else drawn(missing))
         return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))

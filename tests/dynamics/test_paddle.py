@@ -102,7 +102,7 @@ def test_a_sweep_over_them_is_read():
 
 def flight(noise=2e-3):
     """A run of the machine with the small paddle, by the independent program."""
-    made = record(OWN, seed=6, n=1500, dt=0.02, noise=noise)
+    made = record(OWN, seed=6, n=1000, dt=0.02, noise=noise)
     return dataclasses.replace(made)
 
 

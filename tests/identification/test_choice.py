@@ -8,6 +8,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit, models, naming
+from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.model_selection import Candidate, _test, alternatives, choose
 from tests.identification.bench import steps
 from tests.identification.test_filter_error import FREE, made
@@ -33,8 +34,17 @@ def test_two_poles_are_seen(bench30):
         assert test.p_value < 1e-6
 
 
-def test_the_stand_is_asked_for_only_where_it_is_free(bench30):
-    model, _, start, flight = made(bench30, 3)
+@pytest.fixture(scope="module")
+def disturbed(bench30):
+    """A model, a vehicle and some record, which is not fitted."""
+    model = with_disturbance(models.roll_on_stand, "roll")
+    signal = steps(np.random.default_rng(0), 50, 0.02, 1e-6)
+    flight = Flight(dt=0.02, inputs={"x_roll": signal}, outputs={"roll": signal})
+    return model, model.Params(**naming.asdict(bench30)), flight
+
+
+def test_the_stand_is_asked_for_only_where_it_is_free(disturbed):
+    model, start, flight = disturbed
     free = FREE | {"zeta": Free(0.3)}
     problem = Problem(model, start, [flight], free, method="filter-error")
     rivals = alternatives(problem, models.roll_on_stand, "roll", without_stand=models.roll)
@@ -42,8 +52,8 @@ def test_the_stand_is_asked_for_only_where_it_is_free(bench30):
     assert ("one pole, no stand", "one pole") in rivals.nested
 
 
-def test_a_damping_that_is_fixed_is_no_part_of_a_machine_without_stand(bench30):
-    model, _, start, flight = made(bench30, 3)
+def test_a_damping_that_is_fixed_is_no_part_of_a_machine_without_stand(disturbed):
+    model, start, flight = disturbed
     rolls = {"without_stand": models.roll}
     for zeta, free, nested in (
         (0.2, FREE, False),

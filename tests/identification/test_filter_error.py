@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Flight, Free, Problem, fit, models, simulate
+from heli_jax import Flight, Free, Nuisance, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.filter_error import _disturbed
@@ -39,14 +39,22 @@ def made(bench30, seed, *, sigma_w=1.04, poles=1):
     return model, params, start, flight
 
 
+@pytest.fixture(scope="module")
+def disturbed(bench30):
+    """A record, its problem and the fit that other fits are compared with."""
+    model, params, start, flight = made(bench30, 1)
+    problem = Problem(model, start, [flight], FREE, method="filter-error")
+    return params, problem, fit(problem)
+
+
 def errors(found, params):
     return {n: (e.value - float(getattr(params, n))) / e.sd for n, e in found.estimates.items()}
 
 
-def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(bench30):
-    for seed in range(2):
-        model, params, start, flight = made(bench30, seed)
-        found = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+def test_a_disturbed_record_gives_parameters_and_noise_within_their_intervals(bench30, disturbed):
+    params, problem, first = disturbed
+    other = dataclasses.replace(problem, flights=[made(bench30, 0)[3]])
+    for found in (first, fit(other)):
         assert found.status == "converged"
         assert found.steps <= 40
         assert all(abs(e) < 4 for e in errors(found, params).values())
@@ -70,16 +78,6 @@ def test_white_noise_alone_ends_as_output_error(bench30):
     assert any("output error suffices" in note for note in filtered.notes)
 
 
-def test_tau_w_may_be_fixed(bench30):
-    model, params, start, flight = made(bench30, 1)
-    start = replace(start, tau_w=jnp.asarray(1.0))
-    problem = Problem(model, start, [flight], FREE, method="filter-error", fixed_noise=("tau_w",))
-    found = fit(problem)
-    assert found.status == "converged"
-    assert "tau_w" not in found.nuisance
-    assert all(abs(e) < 4 for e in errors(found, params).values())
-
-
 def test_damping_of_stand_and_flybar_are_named_together(bench30):
     model, _, start, flight = made(bench30, 0)
     found = fit(Problem(model, start, [flight], {**FREE, "zeta": Free(0.3)}, method="filter-error"))
@@ -93,32 +91,33 @@ def test_a_model_without_disturbance_is_refused(bench30):
         Problem(models.roll_on_stand, bench30, [flight], FREE, method="filter-error")
 
 
-@pytest.mark.parametrize("fixed", [("sigma_y",), ("sigma_w", "tau_w")], ids=" ".join)
-def test_noise_may_be_fixed(bench30, fixed):
-    model, params, start, flight = made(bench30, 1)
-    start = replace(start, sigma_w=params.sigma_w, tau_w=params.tau_w)
-    flight = dataclasses.replace(flight, sd={"roll": 2e-3})
-    found = fit(Problem(model, start, [flight], FREE, method="filter-error", fixed_noise=fixed))
+@pytest.mark.parametrize(
+    "fixed", [("sigma_y", "tau_w"), ("sigma_w", "tau_w", "sigma_y")], ids=" ".join
+)
+def test_noise_may_be_fixed(disturbed, fixed):
+    params, problem, free = disturbed
+    start = replace(problem.vehicle, sigma_w=params.sigma_w, tau_w=params.tau_w)
+    flights = [dataclasses.replace(problem.flights[0], sd={"roll": 2e-3})]
+    found = fit(dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed))
     assert found.status == "converged"
     assert found.nuisance.keys().isdisjoint(fixed)
     assert all(abs(e) < 4 for e in errors(found, params).values())
-    free = fit(Problem(model, start, [flight], FREE, method="filter-error"))
     for name, one in found.estimates.items():
         assert one.sd == pytest.approx(free.estimates[name].sd, rel=0.4)
         assert one.value == pytest.approx(free.estimates[name].value, abs=one.sd)
     assert 0.0 <= free.log_likelihood - found.log_likelihood < 8.0
-    if "sigma_y" in fixed:
-        assert found.noise == {"flight 1/roll": 2e-3}
+    assert found.noise == {"flight 1/roll": 2e-3}
 
 
-def test_missing_samples_cost_information_and_no_more(bench30):
-    model, params, start, flight = made(bench30, 1)
+def test_missing_samples_cost_information_and_no_more(disturbed):
+    params, problem, _ = disturbed
+    [flight] = problem.flights
     roll = flight.outputs["roll"].copy()
     gone = np.random.default_rng(0).uniform(size=N) < 0.3
     gone[400:600] = True
     flight = dataclasses.replace(flight, outputs={"roll": np.where(gone, np.nan, roll)})
     for method in ("filter-error", "output-error"):
-        found = fit(Problem(model, start, [flight], FREE, method=method))
+        found = fit(dataclasses.replace(problem, flights=[flight], method=method))
         assert found.status == "converged"
         assert found.n_samples == np.count_nonzero(~gone)
         assert all(abs(e) < 4 for e in errors(found, params).values())
@@ -148,7 +147,7 @@ def test_outputs_of_different_quality_get_each_its_noise(bench30):
 
 def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
     """Truth by Euler-Maruyama in NumPy; the stand's spring is a sine."""
-    n, fine = 1500, 40
+    n, fine = 800, 40
     A, B, *_ = (np.asarray(m) for m in matrices(BENCH, True))
     A = A.copy()
     A[1, 0] = 0.0
@@ -185,22 +184,16 @@ def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
     assert all(abs(e) < 4 for e in errors(found, params).values())
 
 
-def test_noise_that_cannot_be_is_told(bench30):
-    model, _, start, flight = made(bench30, 1)
-    start = replace(start, sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(1.0))
+def test_noise_that_cannot_be_is_told(disturbed):
+    _, problem, _ = disturbed
+    [flight] = problem.flights
+    start = replace(problem.vehicle, sigma_w=jnp.asarray(1.0), tau_w=jnp.asarray(1.0))
 
     def run(sd):
-        return fit(
-            Problem(
-                model,
-                start,
-                [dataclasses.replace(flight, sd={"roll": sd})],
-                FREE,
-                method="filter-error",
-                fixed_noise=("sigma_w", "tau_w", "sigma_y"),
-            ),
-            max_steps=30,
-        )
+        flights = [dataclasses.replace(flight, sd={"roll": sd})]
+        fixed = ("sigma_w", "tau_w", "sigma_y")
+        fixed_ = dataclasses.replace(problem, vehicle=start, flights=flights, fixed_noise=fixed)
+        return fit(fixed_, max_steps=30)
 
     too_small = run(2e-4)
     assert any("times as large as the fixed noise" in note for note in too_small.notes)
@@ -210,11 +203,10 @@ def test_noise_that_cannot_be_is_told(bench30):
     assert all(np.isfinite(e.value) for e in no_digits.estimates.values())
 
 
-def test_a_flight_held_out_is_predicted_and_not_fitted(bench30):
-    model, _, start, flight = made(bench30, 1)
+def test_a_flight_held_out_is_predicted_and_not_fitted(bench30, disturbed):
+    _, problem, alone = disturbed
     other = dataclasses.replace(made(bench30, 2)[3], hold_out=True, name="held")
-    both = fit(Problem(model, start, [flight, other], FREE, method="filter-error"))
-    alone = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+    both = fit(dataclasses.replace(problem, flights=[*problem.flights, other]))
     assert both.n_samples == N
     for name, one in both.estimates.items():
         assert one.value == pytest.approx(alone.estimates[name].value, rel=1e-6)
@@ -253,7 +245,8 @@ def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
         inputs={n: v[:10] for n, v in flight.inputs.items()},
         outputs=dict.fromkeys(("roll", "roll_rate"), flight.outputs["roll"][:10]),
     )
-    problem = Problem(shown, start, [short], FREE, method="filter-error")
+    nuisance = Nuisance(bias=False, initial_state=False)
+    problem = Problem(shown, start, [short], FREE, nuisance, method="filter-error")
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     z = start_vector(layout, data, problem)
     at = Reached(layout, data, first_noise(problem, problem.training), z)

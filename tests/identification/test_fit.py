@@ -20,6 +20,8 @@ IXX = Free(0.05, 0.001, 1.0)
 IF = Free(5e-4)
 A = Free(5.0)
 THREE = {"Ixx": IXX, "If": IF, "a": A}
+N = 1000
+"""samples, as many as in other modules: what is compiled for one serves all"""
 
 
 def started(v, factor_ixx=2.0, factor_if=0.4):
@@ -31,7 +33,7 @@ def started(v, factor_ixx=2.0, factor_if=0.4):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_recovers_inertias_of_random_machines(seed, rate, stand):
     v = stable_geometry(seed)
-    flight = record(v, seed=seed, dt=1.0 / rate, stand=stand)
+    flight = record(v, seed=seed, n=N if stand else 2000, dt=1.0 / rate, stand=stand)
     model = models.roll_on_stand if stand else models.roll
     found = fit(Problem(model, vehicle(v), [flight], started(v)))
     assert found.status == "converged"
@@ -50,7 +52,7 @@ def test_intervals_cover_on_white_noise():
     ratios = {"Ixx": [], "If": []}
     runs = 40
     for seed in range(runs):
-        flight = record(BENCH, seed=100 + seed, n=1000, amplitude=amplitude)
+        flight = record(BENCH, seed=100 + seed, n=N, amplitude=amplitude)
         found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], started(BENCH)))
         for name in inside:
             e = found.estimates[name]
@@ -64,7 +66,7 @@ def test_intervals_cover_on_white_noise():
 
 @pytest.fixture(scope="module")
 def bench_run():
-    return record(BENCH, seed=11, n=4000)
+    return record(BENCH, seed=11, n=N)
 
 
 def test_three_free_are_not_identifiable(bench_run):
@@ -114,13 +116,13 @@ def doubts(flight):
 
 
 def test_check_warns_of_sampling_and_excitation():
-    weak = record(BENCH, seed=3, n=500, amplitude=1e-9)
+    weak = record(BENCH, seed=3, n=N, amplitude=1e-9)
     notes = " ".join(
         check(Problem(models.roll_on_stand, vehicle(BENCH), [weak], started(BENCH, 1.0, 1.0))).notes
     )
     assert "Nyquist" in notes
     assert "hardly excites" in notes
-    u = np.zeros(500)
+    u = np.zeros(N)
     u[100:] = 2e-6
     one = Flight(dt=0.02, inputs={"x_roll": u}, outputs={"roll": response(BENCH, u, 0.02, True)})
     notes = " ".join(
@@ -140,9 +142,9 @@ def test_parameter_without_effect_is_named(bench_run):
 
 def test_added_inertia_determines_all_three():
     runs = [
-        record(BENCH, seed=5, amplitude=2e-6, name="bare"),
+        record(BENCH, seed=5, n=N, amplitude=2e-6, name="bare"),
         record(
-            BENCH | {"Ixx_added": 0.012}, seed=6, amplitude=2e-6, name="loaded",
+            BENCH | {"Ixx_added": 0.012}, seed=6, n=N, amplitude=2e-6, name="loaded",
             known={"Ixx_added": 0.012},
         ),
     ]  # fmt: skip
@@ -217,7 +219,7 @@ def test_coloured_residuals_are_called_so(bench_run):
 
 
 def test_held_out_flight_is_predicted_not_fitted(bench_run):
-    other = record(BENCH, seed=12, n=1500, hold_out=True, name="later")
+    other = record(BENCH, seed=12, n=N, hold_out=True, name="later")
     found = fit(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run, other], started(BENCH)))
     alone = fit(Problem(models.roll_on_stand, vehicle(BENCH), [bench_run], started(BENCH)))
     assert found.estimates["Ixx"].value == alone.estimates["Ixx"].value

@@ -1,5 +1,6 @@
 """Fits of records whose input moved between the samples; made by scipy, integrated continuously."""
 
+import functools
 import importlib
 import re
 from dataclasses import replace
@@ -16,16 +17,20 @@ from heli_jax import Nuisance, check, fit
 def held_inputs():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(Path(__file__).parents[2] / "experiments")
-        yield importlib.import_module("coverage_cases.held_inputs")
+        module = importlib.import_module("coverage_cases.held_inputs")
+        # The same records and fits serve several tests.
+        for name in ("late_record", "aircraft_fit"):
+            patch.setattr(module, name, functools.cache(getattr(module, name)))
+        yield module
 
 
 def test_an_unstable_aircraft_with_a_continuous_elevator(held_inputs):
     truth = held_inputs.TRUTH
-    found = held_inputs.aircraft_fit(0, "linear", noise=0.3)
+    found = held_inputs.aircraft_fit(0, "linear", 0.3)
     assert found.status == "converged"
     for name in ("Zw", "Mw", "Mq", "Mde"):
         assert found.estimates[name].value == pytest.approx(truth[name], rel=0.02), name
-    held = held_inputs.aircraft_fit(0, "zero-order", noise=0.3)
+    held = held_inputs.aircraft_fit(0, "zero-order", 0.3)
     assert 1.2 < held.estimates["Mq"].value / truth["Mq"] < 1.4
 
 
@@ -57,10 +62,10 @@ def test_check_tells_what_the_other_hold_would_change(held_inputs, hold):
 
 
 def test_the_change_told_is_that_between_two_fits(held_inputs):
-    found = held_inputs.aircraft_fit(0, "zero-order", noise=0.3)
+    found = held_inputs.aircraft_fit(0, "zero-order", 0.3)
     assert not words(found.notes)  # as stated: nothing is in doubt
     (note,) = words(check(held_inputs.aircraft_problem(0, "zero-order", 0.3)).notes)
-    other = held_inputs.aircraft_fit(0, "linear", noise=0.3)
+    other = held_inputs.aircraft_fit(0, "linear", 0.3)
     off = 100 * (other.estimates["Mq"].value / found.estimates["Mq"].value - 1)
     assert off < -15
     assert told(note, "Mq") == pytest.approx(off, rel=0.5)

@@ -29,7 +29,7 @@ def white():
 
 def test_on_white_noise_all_agree(white):
     bayes = importlib.util.find_spec("blackjax") is not None
-    found = intervals(white, profiles=list(FREE), runs=300, draws=300 if bayes else 0)
+    found = intervals(white, profiles=list(FREE), runs=200, draws=300 if bayes else 0)
     assert found.sentences == ()
     for by in found.by_parameter.values():
         assert set(by) == {"gaussian", "profile", "bootstrap", *(["nuts"] if bayes else [])}

@@ -15,7 +15,7 @@ SCRIPT = "<script>alert(1)</script>"
 
 def _made(free, **how):
     source = Source("/logs/<b>bench</b>.csv", "ab" * 32, ("stick: <i>mm</i> to m",))
-    flight = record(BENCH, seed=1, n=400, dt=0.05, source=source, **how)
+    flight = record(BENCH, seed=1, n=1000, dt=0.05, source=source, **how)
     problem = Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
     found = fit(problem)
     [row] = found.starts

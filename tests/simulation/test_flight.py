@@ -1,5 +1,7 @@
 """The whole helicopter in flight: invariants, order of the steps, feedback, events, status."""
 
+from typing import NamedTuple
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -114,25 +116,24 @@ def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
     start = model.State(**naming.asdict(hover.state), work=jnp.zeros(()))
     u = sticks(hover, 100, roll=2e-3, pitch=2e-3, yaw=0.2, throttle=0.05)
     left = []
-    for substeps in (2, 4, 8):
+    for substeps in (4, 8):
         run = jax.jit(
             lambda s, k=substeps: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=k)
         )(start)
         E = np.asarray(jax.vmap(energy)(run.states))
         assert np.ptp(E) > 10.0  # something happens
         left.append(np.max(np.abs(E - E[0] - np.asarray(run.states.work))) / np.ptp(E))
-    assert left[2] < 1e-6
+    assert left[1] < 1e-6
     assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
-    assert 10 < left[1] / left[2] < 30
 
 
 @pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
 def test_rk4_is_dopri8(variant, substeps, xcell):
     model = models.helicopter(variant)
     found = trim(model, xcell)
-    u = sticks(found, 500, roll=1e-6, pitch=1e-6, yaw=0.01, throttle=2e-3)
+    u = sticks(found, 250, roll=1e-6, pitch=1e-6, yaw=0.01, throttle=2e-3)
     if variant == "consistent":
-        u = sticks(found, 500)
+        u = sticks(found, 250)
     run = jax.jit(lambda s: simulate(model, xcell, u, dt=DT, initial_state=s, substeps=substeps))(
         found.state
     )
@@ -207,11 +208,30 @@ def test_feedback_is_applied_once_a_sample(xcell, hover):
         simulate(model, xcell, u, dt=DT, feedback=law, delay=0.01)
 
 
-def test_the_ground_ends_a_run_at_its_moment(xcell):
-    model, p = models.helicopter(), bare(xcell)
-    zero = jnp.zeros(60)
-    u = model.Inputs(zero, zero, zero, zero)
-    fall = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, z=2.0)
+class Gravity(NamedTuple):
+    g: float
+
+
+class Stone(NamedTuple):
+    x: float
+    z: float
+    dx: float
+    dz: float
+
+
+class Nothing(NamedTuple):
+    u: float
+
+
+def falling(g, s, u):
+    return Stone(s.dx, s.dz, 0.0 * u.u, -g.g + 0.0 * u.u)
+
+
+def test_the_ground_ends_a_run_at_its_moment():
+    """A stone is enough: what the event does has nothing of a helicopter."""
+    model = Model("stone", falling, lambda g, s, u: s, Gravity, Stone, Nothing, Stone)
+    p, u = Gravity(9.80665), Nothing(jnp.zeros(60))
+    fall = Stone(x=0.0, z=2.0, dx=3.0, dz=0.0)
 
     def land(z, **how):
         start = naming.replace(fall, z=z)

@@ -83,7 +83,7 @@ def test_killed_and_resumed(tmp_path, monkeypatch):
     """The experiment that shows it at full size, in small."""
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))
     survives = __import__("sweep_survives")
-    config = survives.configuration(tmp_path, n=6144, chunk=256, duration=20.0)
+    config = survives.configuration(tmp_path, n=3072, chunk=128, duration=20.0)
     first = survives.run_through(config, tmp_path / "whole")
     found = survives.kills(config, tmp_path / "whole", tmp_path / "killed", 2, first, seed=1)
     assert found.equal
