@@ -11,7 +11,8 @@ import xarray as xr
 
 from heli_jax import Flight, models, sweep
 from heli_jax.errors import InputError
-from heli_jax.sweeps import Between, Reduce, listed, pieces, sobol
+from heli_jax.sweeps import Between, Reduce, listed, sobol
+from heli_jax.sweeps import chunks as pieces
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.spec import job
