@@ -27,7 +27,6 @@ from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
     from heli_jax.sweeps.spec import Job
 
@@ -54,20 +53,18 @@ class FitRun:
     began: float = field(default_factory=time.perf_counter)
     """when the work began, by `time.perf_counter` [s]"""
 
-    def figure(self, name: str) -> "Figure":
-        """A figure of the report, drawn anew: `response_OUTPUT`, `bode`, `starts`, ...
+    def figure(self, name: str) -> Any:
+        """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`, `bode`,
+        `starts`, ...
 
         Raises:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
-        import matplotlib
-
-        from heli_jax.report import style
-        from heli_jax.report.html import drawings
+        from heli_jax.report.html import drawings  # matplotlib: slow
+        from heli_jax.report.style import styled
 
         draw = drawings(self.fit, self.problem, self.baseline, self.supplementary)
-        with matplotlib.rc_context(style.STYLE):
-            figure = draw[name]() if name in draw else None
+        figure = styled(draw[name]) if name in draw else None
         if figure is None:
             raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
         return figure

@@ -115,6 +115,12 @@ def test_a_run_shows_its_fit(run):
     assert run._repr_html_() == run.fit._repr_html_()
 
 
+def test_a_figure_of_the_report_is_drawn(run):
+    assert run.figure("response_roll").axes[0].get_title("left").startswith("roll")
+    with pytest.raises(ValueError, match=r"expected one of .*response_roll.*got 'roll'"):
+        run.figure("roll")
+
+
 def test_check_and_further_intervals(config, run):
     check = heli_jax.run_check(config)
     assert check.verdict.identifiable

@@ -157,6 +157,12 @@ def plain_log_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def styled(draw: Callable[[], Figure | None]) -> Figure | None:
+    """Draw a figure in the style."""
+    with matplotlib.rc_context(STYLE):
+        return draw()
+
+
 def svg(draw: Callable[[], Figure | None]) -> tuple[str, bytes] | None:
     """Draw a figure in the style: its first title and the SVG; None where there is none."""
     with matplotlib.rc_context(STYLE):
