@@ -326,7 +326,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import config as configuration
     from heli_jax import generate, output
     from heli_jax.config.sweeps import simulates, sweep_job
-    from heli_jax.sweeps.run import Options, carry_out
+    from heli_jax.sweeps.run import Options, run_sweep
 
     experiment = configuration.load(config, options.set)
     made = generate.drive(experiment) if simulates(experiment) else None
@@ -350,13 +350,12 @@ def _sweep(options: argparse.Namespace) -> int:
             say=_say,
         )
         try:
-            dataset = carry_out(
+            dataset = run_sweep(
                 job,
                 out,
                 how,
                 files={"config.yaml": resolved},
-                attributes={"configuration": resolved},
-                seed=wanted.seed or 0,
+                attributes={"configuration": resolved, "seed": wanted.seed or 0},
                 notes=notes,
             )
         except KeyboardInterrupt:
