@@ -297,7 +297,8 @@ def run_sweep(
         InputError: something of the configuration is wrong, or `out` exists (without `resume`),
             is of another sweep, or cannot be written to.
     """
-    from heli_jax.sweeps.run import Options, carry_out
+    from heli_jax.sweeps.run import Options
+    from heli_jax.sweeps.run import run_sweep as run_job
 
     config = config if isinstance(config, Experiment) else load_config(config)
     job = _sweep_job(config)
@@ -310,13 +311,12 @@ def run_sweep(
     out = None if out is None else Path(out)
     carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
     try:
-        dataset = carry_out(
+        dataset = run_job(
             job,
             out,
             carrying,
             files={"config.yaml": resolved},
-            attributes={"configuration": resolved},
-            seed=design.seed or 0,
+            attributes={"configuration": resolved, "seed": design.seed or 0},
             notes=notes,
         )
     except InputError:

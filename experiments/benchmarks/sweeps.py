@@ -34,7 +34,7 @@ from heli_jax import Flight, load_vehicle, models, sweep
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.naming import replace
 from heli_jax.simulation.discretize import discretize
-from heli_jax.sweeps import Between, Reduce, sobol
+from heli_jax.sweeps import Range, Reduce, sobol
 
 jax.config.update("jax_enable_x64", True)
 if __name__ == "__main__":
@@ -80,7 +80,7 @@ def record(samples: int) -> Flight:
 
 
 def design(n: int) -> Any:
-    return sobol({"Ixx": Between(0.02, 0.05, "log"), "If": Between(2e-4, 6e-4, "log")}, n)
+    return sobol({"Ixx": Range(0.02, 0.05, "log"), "If": Range(2e-4, 6e-4, "log")}, n)
 
 
 def seconds(run: Callable[[], Any]) -> float:
@@ -399,15 +399,15 @@ def ours_at(flight: Flight, n: int) -> float:
 def on_gpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
     """The compiled part alone on a GPU, whole batches at once, and what a step of it takes."""
     from heli_jax.sweeps.program import Program, arguments
-    from heli_jax.sweeps.spec import job
+    from heli_jax.sweeps.spec import RunOptions, job
 
     flight, rows, drawn = record(6000), [], {}
     for precision in ("float64", "float32"):
         for solver in ("exact", "rk4"):
             for n in (1000, 10_000, 100_000, 1_000_000):
                 wanted = job(
-                    models.roll_on_stand, VEHICLE, flight, design(n), REDUCE, solver=solver,
-                    substeps=SUBSTEPS, precision=precision,
+                    models.roll_on_stand, VEHICLE, flight, design(n), REDUCE,
+                    RunOptions(solver, SUBSTEPS, precision),
                 )  # fmt: skip
                 program = Program(wanted, 0, jax.local_devices()[:1], n)
                 values = arguments(wanted, wanted.design.values(0, n))

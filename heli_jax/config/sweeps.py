@@ -18,9 +18,9 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.open_log import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
-from heli_jax.sweeps.design import Between, Design
-from heli_jax.sweeps.reducers import HOWS, LINEAR, Reduce, Streaming
-from heli_jax.sweeps.spec import Job, Trajectories, Trimmed, axis_unit, job
+from heli_jax.sweeps.design import Design, Range
+from heli_jax.sweeps.reducers import LINEAR, REDUCERS, Reduce, Streaming
+from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_unit, job
 
 _DRAWN = ("seed", "sigma_w", "tau_w")
 """axes that are of the disturbance"""
@@ -81,12 +81,14 @@ def sweep_job(
             flights,
             _design(sweep, model, path, sweep.seed or 0),
             reduce,
-            solver=sweep.solver,
-            substeps=sweep.substeps,
-            precision=sweep.precision,
-            trajectories=None if kept is None else Trajectories(tuple(kept.signals), kept.every),
-            trimmed=trimmed,
-            pilot=pilot,
+            RunOptions(
+                sweep.solver,
+                sweep.substeps,
+                sweep.precision,
+                None if kept is None else Trajectories(tuple(kept.signals), kept.every),
+                trimmed,
+                pilot,
+            ),
         )
     except InputError:
         raise
@@ -146,7 +148,7 @@ def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
         return {"lhs": designs.lhs, "sobol": designs.sobol}[one.design](between, one.n, seed)
     _refuse(one, ("n",), f"a {one.design} has its axes' points: expected n in an axis")
     axes = {n: _points(n, a, model, path) for n, a in one.axes.items()}
-    return {"grid": designs.grid, "list": designs.listed}[one.design](axes)
+    return {"grid": designs.grid, "list": designs.paired}[one.design](axes)
 
 
 def _another(seed: int, i: int) -> int:
@@ -160,14 +162,14 @@ def _refuse(one: DesignConfig, keys: tuple[str, ...], why: str) -> None:
             raise ValueError(f"{key}: {why}")
 
 
-def _between(name: str, axis: AxisConfig, model: Model, path: Path) -> Between:
+def _between(name: str, axis: AxisConfig, model: Model, path: Path) -> Range:
     for key in ("values", "column", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}.{key}: expected lower and upper here")
     if axis.lower is None or axis.upper is None:
         raise ValueError(f"axes.{name}: expected lower and upper")
     scale = _scale(name, axis, model, path)
-    return Between(axis.lower * scale, axis.upper * scale, axis.scale)
+    return Range(axis.lower * scale, axis.upper * scale, axis.scale)
 
 
 def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
@@ -218,7 +220,7 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
 
 def _reduce(one: ReduceConfig, where: str, path: Path) -> Reduce:
     how: Any = one.how
-    if how not in HOWS and how not in LINEAR and is_path(how):
+    if how not in REDUCERS and how not in LINEAR and is_path(how):
         how = by_path(how, f"{where}.how", path.absolute().parent)
         if not callable(how) and not isinstance(how, Streaming):
             found = "nothing" if how is None else f"a {type(how).__name__}"

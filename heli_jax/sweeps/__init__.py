@@ -5,14 +5,15 @@ run; `sweep` computes chunks of elements and writes each when it is done.
 """
 
 import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from heli_jax.sweeps.design import Between as Between
     from heli_jax.sweeps.design import Design as Design
+    from heli_jax.sweeps.design import Range as Range
     from heli_jax.sweeps.design import grid as grid
     from heli_jax.sweeps.design import lhs as lhs
-    from heli_jax.sweeps.design import listed as listed
+    from heli_jax.sweeps.design import paired as paired
     from heli_jax.sweeps.design import product as product
     from heli_jax.sweeps.design import sobol as sobol
     from heli_jax.sweeps.design import table as table
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 # Loaded when they are first used: the store's libraries take a second that other commands spare.
 _HOMES = {
     **dict.fromkeys(
-        ("Between", "Design", "grid", "lhs", "listed", "product", "sobol", "table", "zipped"),
+        ("Range", "Design", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),
         "design",
     ),
     **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
@@ -36,7 +37,19 @@ _HOMES = {
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+_OLD = {"Between": "Range", "listed": "paired"}
+"""Names of before, and what they are called now."""
+
+
 def __getattr__(name: str) -> Any:
+    if name in _OLD:
+        new = _OLD[name]
+        warnings.warn(
+            f"heli_jax.sweeps.{name} is deprecated, expected {new}",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        name = new
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax.sweeps' has no attribute {name!r}")
     return getattr(importlib.import_module(f"heli_jax.sweeps.{_HOMES[name]}"), name)

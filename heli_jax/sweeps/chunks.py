@@ -8,7 +8,7 @@ import xarray as xr
 _ELEMENTS = 1 << 20
 
 
-def pieces(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
+def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
     """Which elements, and what the variable has for them, (k, ...); all of them in turn."""
     variable = variable.transpose("element", ...)
     for start in range(0, variable.sizes["element"], _ELEMENTS):

@@ -82,7 +82,7 @@ def connected(
             cache = None
         else:
             made: Any = LocalCluster  # which takes None too
-            with _deaf():
+            with _ignore_sigint():
                 cluster = made(
                     n_workers=workers,
                     threads_per_worker=1,
@@ -98,7 +98,7 @@ def connected(
 
 
 @contextlib.contextmanager
-def _deaf() -> Iterator[None]:
+def _ignore_sigint() -> Iterator[None]:
     """Processes that are started meanwhile do not hear Ctrl-C: they end with this one, which
     does."""
     if threading.current_thread() is not threading.main_thread():

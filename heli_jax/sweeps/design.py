@@ -17,7 +17,7 @@ import numpy as np
 Columns = dict[str, np.ndarray]
 
 
-class Between(NamedTuple):
+class Range(NamedTuple):
     """An axis from `lower` to `upper`, in SI, evenly in the value or in its logarithm."""
 
     lower: float
@@ -71,7 +71,7 @@ def digest(arrays: Mapping[str, np.ndarray]) -> str:
     return found.hexdigest()
 
 
-def _check_between(name: str, axis: Between) -> None:
+def _check_between(name: str, axis: Range) -> None:
     low, high = axis.lower, axis.upper
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(
@@ -91,9 +91,9 @@ def _check_axes(axes: Mapping[str, Any]) -> None:
         raise ValueError("axes: none given, wanted is at least one")
 
 
-def _points(name: str, axis: Between | Sequence[float] | np.ndarray) -> np.ndarray:
+def _points(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray:
     """The values of one axis of a grid or a list."""
-    if isinstance(axis, Between):
+    if isinstance(axis, Range):
         _check_between(name, axis)
         if axis.n is None or axis.n < 2:
             found = "none" if axis.n is None else axis.n
@@ -156,10 +156,10 @@ class _Grid(NamedTuple):
 class _Sampled:
     """Points of the unit cube, mapped to the axes."""
 
-    def __init__(self, axes: Mapping[str, Between], n: int, seed: int, kind: str) -> None:
+    def __init__(self, axes: Mapping[str, Range], n: int, seed: int, kind: str) -> None:
         _check_axes(axes)
         for name, axis in axes.items():
-            if not isinstance(axis, Between):
+            if not isinstance(axis, Range):
                 raise ValueError(f"axes.{name}: wanted are lower and upper, for {kind}")
             _check_between(name, axis)
         if n < 1:
@@ -259,7 +259,7 @@ class _Zipped(_Combined):
         return {"design": "zip", "of": [part.describe() for part in self.parts]}
 
 
-def grid(axes: Mapping[str, Between | Sequence[float]]) -> Design:
+def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     """Every combination of the axes' values, the last axis fastest.
 
     Raises:
@@ -269,7 +269,7 @@ def grid(axes: Mapping[str, Between | Sequence[float]]) -> Design:
     return _Grid({n: _points(n, a) for n, a in axes.items()})
 
 
-def listed(axes: Mapping[str, Between | Sequence[float]]) -> Design:
+def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     """The axes' values side by side: element k takes the k-th of each.
 
     Raises:
@@ -297,7 +297,7 @@ def table(columns: Mapping[str, np.ndarray]) -> Design:
     return _Listed(found, "table")
 
 
-def lhs(axes: Mapping[str, Between], n: int, seed: int = 0) -> Design:
+def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     """A Latin hypercube of n points (`scipy.stats.qmc.LatinHypercube`).
 
     Raises:
@@ -306,7 +306,7 @@ def lhs(axes: Mapping[str, Between], n: int, seed: int = 0) -> Design:
     return _Sampled(axes, n, seed, "lhs")
 
 
-def sobol(axes: Mapping[str, Between], n: int, seed: int = 0) -> Design:
+def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     """The first n points of a scrambled Sobol sequence (`scipy.stats.qmc.Sobol`).
 
     Raises:

@@ -14,7 +14,6 @@ from heli_jax.analysis.trim import STICKS, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.simulation.accumulate import accumulated
 from heli_jax.simulation.simulate import simulate
-from heli_jax.simulation.solvers import solver_named
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
 from heli_jax.sweeps.reducers import Measured, Reduce
@@ -87,7 +86,7 @@ class Start(NamedTuple):
     """whether there is such a flight"""
 
 
-def element(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | None) -> Found:
+def design_point(plan: Plan, numbers: Given, values: dict[str, Any], start: Start | None) -> Found:
     """One element: the axes' values are scalars."""
     model, dtype = plan.model, numbers.dt.dtype
     params, moved = _params(plan, numbers, values)
@@ -243,6 +242,9 @@ def _streamed(
 ) -> tuple[dict[str, Any], dict[str, Any], Any, list[Any]]:
     """The run reduced while it goes on."""
     update, start, data = _updating(plan, numbers)
+    options = plan.simulation(
+        dt=numbers.dt, initial_state=state, block=_BLOCK if plan.solver == "exact" else 1
+    )
     found = accumulated(
         plan.model,
         params,
@@ -250,13 +252,8 @@ def _streamed(
         update,
         start,
         data=data,
-        dt=numbers.dt,
-        initial_state=state,
-        solver=solver_named(plan.solver),
-        substeps=plan.substeps,
-        block=_BLOCK if plan.solver == "exact" else 1,
         limits=True,
-        hold=plan.hold,
+        options=options,
     )
     n = jax.tree.leaves(inputs)[0].shape[0]
     return _finished(plan, numbers, found.value, n), {}, found.state, list(found.outside.values())
@@ -266,19 +263,14 @@ def _whole(
     plan: Plan, numbers: Given, params: Any, state: Any, inputs: Any, moved: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any], Any, list[Any]]:
     """The whole run, for functions of it and for trajectories to keep."""
-    run: Trajectory = simulate(
-        plan.model,
-        params,
-        inputs,
+    options = plan.simulation(
         dt=numbers.dt,
         initial_state=state,
-        solver=solver_named(plan.solver),
-        substeps=plan.substeps,
         delay=moved.get("delay"),
         key=jax.random.key(moved["seed"]) if "seed" in moved else None,
         feedback=numbers.pilot,
-        hold=plan.hold,
     )
+    run: Trajectory = simulate(plan.model, params, inputs, options)
     update, start, data = _updating(plan, numbers)
     value, _ = jax.lax.scan(lambda v, now: (update(v, *now), None), start, (run.outputs, data))
     n = run.times.shape[0]
@@ -305,7 +297,7 @@ def arguments(job: Job, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def shapes(job: Job, index: int) -> Found:
-    """The shapes of what `element` gives."""
+    """The shapes of what `design_point` gives."""
     columns = arguments(job, job.design.values(0, 1))
     taken = (given(job, index), {n: v[0] for n, v in columns.items()})
     leaves, structure = jax.tree.flatten(taken)
@@ -318,7 +310,7 @@ def _shapes(plan: Plan, structure: Any, leaves: tuple[Any, ...]) -> Found:
     start = None
     if plan.trimmed is not None:
         start = jax.eval_shape(functools.partial(steady, plan), numbers, values)
-    return jax.eval_shape(functools.partial(element, plan), numbers, values, start)
+    return jax.eval_shape(functools.partial(design_point, plan), numbers, values, start)
 
 
 @functools.lru_cache(maxsize=32)
@@ -329,7 +321,7 @@ def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, An
     split = PartitionSpec("device")
 
     def part(numbers: Given, mapped: Any) -> Found:
-        return _each(lambda m: element(plan, numbers, *m), mapped, lanes)
+        return _each(lambda m: design_point(plan, numbers, *m), mapped, lanes)
 
     def starts(numbers: Given, values: dict[str, Any]) -> Start:
         return _each(functools.partial(steady, plan, numbers), values, lanes)

@@ -50,7 +50,7 @@ class Reduce(NamedTuple):
     """A named result of a sweep: `how`, of which signal."""
 
     how: str | Callable[[Any], Any] | Streaming
-    """a name of `HOWS` or of `LINEAR`, a function of a Trajectory, or a Streaming"""
+    """a name of `REDUCERS` or of `LINEAR`, a function of a Trajectory, or a Streaming"""
     signal: str | None = None
     """an output of the model"""
     input: str | None = None
@@ -133,7 +133,7 @@ def _theil(value: Any, n: Any, m: Measured) -> Any:
     return jnp.sqrt(value[0]) / (jnp.sqrt(value[1]) + jnp.sqrt(m.power))
 
 
-HOWS: dict[str, Streaming] = {
+REDUCERS: dict[str, Streaming] = {
     "rms": Streaming(0.0, _squared, _root_mean),
     "mean": Streaming(0.0, _summed, _mean),
     "peak": Streaming(0.0, lambda v, y, _: jnp.maximum(v, jnp.abs(y)), _same),
@@ -162,10 +162,10 @@ def check(name: str, one: Reduce, outputs: tuple[str, ...], inputs: tuple[str, .
             needed.
     """
     where = f"reduce.{name}"
-    if isinstance(one.how, str) and one.how not in (*HOWS, *LINEAR):
-        known = [*HOWS, *LINEAR]
+    if isinstance(one.how, str) and one.how not in (*REDUCERS, *LINEAR):
+        known = [*REDUCERS, *LINEAR]
         raise ValueError(f"{where}.how: unknown reducer {one.how!r}{nearest(one.how, known)}")
-    needs_signal = one.how == "margins" or one.how in HOWS
+    needs_signal = one.how == "margins" or one.how in REDUCERS
     if needs_signal and one.signal is None:
         raise ValueError(f"{where}.signal: missing, wanted is one of {', '.join(outputs)}")
     if one.signal is not None and one.signal not in outputs:
@@ -194,4 +194,4 @@ def streaming(one: Reduce) -> Streaming | None:
     """The reducer itself, or None where it is none that goes along with a run."""
     if isinstance(one.how, Streaming):
         return one.how
-    return HOWS.get(one.how) if isinstance(one.how, str) else None
+    return REDUCERS.get(one.how) if isinstance(one.how, str) else None

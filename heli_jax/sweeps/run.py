@@ -17,7 +17,7 @@ from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.design import Design, table
 from heli_jax.sweeps.reducers import Reduce
-from heli_jax.sweeps.spec import Job, Precision, Trajectories, Trimmed, unread
+from heli_jax.sweeps.spec import Job, RunOptions, unread
 from heli_jax.sweeps.spec import job as checked
 from heli_jax.sweeps.summary import write_summary
 from heli_jax.sweeps.worker import Split, Worker
@@ -67,91 +67,65 @@ def sweep(
     reduce: Mapping[str, Reduce],
     *,
     out: str | Path | None = None,
-    solver: str | None = None,
-    substeps: int | None = None,
-    precision: Precision = "float64",
-    trajectories: Trajectories | None = None,
-    trimmed: Trimmed | None = None,
-    pilot: Any = None,
     **options: Any,
 ) -> xr.Dataset:
     """Run a model once for every element of a design, and keep numbers of each run.
 
     Args:
+        model: what is simulated.
+        params: the model's Params, SI; the axes of the design take the place of theirs.
         flights: what the model flies: inputs, and where results compare with them, outputs. With
             several each result has a dimension `flight`.
-        design: which values the axes take, from `heli_jax.sweeps`: grid, listed, lhs, sobol, table,
+        design: which values the axes take, from `heli_jax.sweeps`: grid, paired, lhs, sobol, table,
             product or zipped. An axis is a parameter of the model, or `initial.STATE`,
             `gain.INPUT`, `offset.INPUT`, `delay` [s] or `seed` (of the model's noise).
         reduce: by name, what is kept of each run.
         out: a directory for sweep.zarr and summary.json; in memory unless given.
-        solver: "exact" (linear models, the default there), "rk4", or a diffrax solver's name;
-            steps are fixed.
-        substeps: steps a sample; enough for 5 ms unless given.
-        precision: float32 is faster on some devices; how far off its results are is measured on
-            64 elements and stands in the attributes.
-        trajectories: outputs to keep, thinned.
-        trimmed: a whole helicopter begins in a steady flight of its own.
-        pilot: a `heli_jax.analysis.pilot.Pilot` who holds the attitude.
-        **options: of `Options`: resume, chunk, lanes, devices, client, progress.
+        **options: fields of `RunOptions`: solver, substeps, precision, trajectories, trimmed,
+            pilot; and of `Options`: resume, chunk, lanes, devices, client, progress.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.
 
     Raises:
         ValueError: the model cannot have an axis or a result.
+        TypeError: a keyword that is no option.
         InputError: the directory exists (without `resume`), is of another sweep, or cannot be
             written to.
     """
-    wanted = checked(
-        model,
-        params,
-        flights if isinstance(flights, Flight) else tuple(flights),
-        design,
-        reduce,
-        solver=solver,
-        substeps=substeps,
-        precision=precision,
-        trajectories=trajectories,
-        trimmed=trimmed,
-        pilot=pilot,
-    )
-    return carry_out(wanted, None if out is None else Path(out), Options(**options))
+    runs = {n: options.pop(n) for n in RunOptions._fields if n in options}
+    job = checked(model, params, flights, design, reduce, RunOptions(**runs))
+    return run_sweep(job, None if out is None else Path(out), Options(**options))
 
 
-def carry_out(
+def run_sweep(
     job: Job,
     out: Path | None,
     options: Options,
     *,
     files: Mapping[str, str] | None = None,
     attributes: Mapping[str, Any] | None = None,
-    seed: int = 0,
     notes: Sequence[str] = (),
 ) -> xr.Dataset:
-    """Carry out a checked sweep; `files` are written beside the store when it is made, `notes` are
-    said and kept.
+    """Run a checked sweep.
+
+    Args:
+        job: what is computed.
+        out: a directory for the store, or None for one in memory.
+        options: how it is carried out.
+        files: by name, texts that are written beside the store when it is made.
+        attributes: kept with the store; `seed` is 0 unless given.
+        notes: said and kept.
 
     Raises:
         InputError: as `sweep`.
     """
-    notes = [
-        *notes,
-        *(
-            f"axes.{n}: {job.model.name} does not read {n}: no run depends on it"
-            for n in unread(job)
-        ),
-        *(
-            f"reduce.{n}: the margins are those of the loop without the delay"
-            for n, r in job.reduce.items()
-            if r.how == "margins" and "delay" in job.design.names
-        ),
-    ]
+    notes = [*notes, *_notes(job)]
     for note in notes:
         options.say(note)
-    words = {**(attributes or {}), "seed": seed, "versions": versions(), "notes": notes}
+    kept = {"seed": 0, **(attributes or {}), "versions": versions(), "notes": notes}
     if out is None:
-        store = stores.create(None, job, *_cut(job, options, words), "the sweep")
+        store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
         _compute(job, store, store.done(), options)
         return store.dataset().load()
     where = f"--out {out}"
@@ -159,16 +133,43 @@ def carry_out(
     if not (options.resume and out.exists() and not empty):
         if not (options.resume and empty):
             run_directory.require_free(out, ", or --resume")
-        split, words = _cut(job, options, words)
-        try:
-            with run_directory.whole(out) as directory:
-                for name, text in (files or {}).items():
-                    (directory / name).write_text(text, encoding="utf-8")
-                stores.create(directory / "sweep.zarr", job, split, words, where)
-        except OSError as e:
-            raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
+        _create(job, out, options, kept, files or {})
     if not out.is_dir() or not stores.writable(out):
         raise InputError(f"{where}: is no directory that can be written to")
+    return _resume(job, out, options)
+
+
+def _notes(job: Job) -> list[str]:
+    """What of a sweep has no effect, or another than one might think."""
+    without_effect = [
+        f"axes.{n}: {job.model.name} does not read {n}: no run depends on it" for n in unread(job)
+    ]
+    delayed = [
+        f"reduce.{n}: the margins are those of the loop without the delay"
+        for n, r in job.reduce.items()
+        if r.how == "margins" and "delay" in job.design.names
+    ]
+    return [*without_effect, *delayed]
+
+
+def _create(
+    job: Job, out: Path, options: Options, attributes: dict[str, Any], files: Mapping[str, str]
+) -> None:
+    """A new directory with an empty store; it appears whole or not at all."""
+    where = f"--out {out}"
+    split, attributes = _cut(job, options, attributes)
+    try:
+        with run_directory.whole(out) as directory:
+            for name, text in files.items():
+                (directory / name).write_text(text, encoding="utf-8")
+            stores.create(directory / "sweep.zarr", job, split, attributes, where)
+    except OSError as e:
+        raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
+
+
+def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
+    """Compute what is missing in a store on disk, and write its summary."""
+    where = f"--out {out}"
     stores.require_files(out, where)
     with stores.only_writer(out, where):
         store = stores.reopen(out / "sweep.zarr", job, where)

@@ -2,7 +2,7 @@
 
 import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.regular_file import read_regular
+from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
@@ -45,6 +46,25 @@ class Trimmed(NamedTuple):
     """what is trimmed, where the sweep's model is that with a disturbance"""
 
 
+class RunOptions(NamedTuple):
+    """How each run of a sweep is made; each field is also a keyword of `sweep`."""
+
+    solver: str | None = None
+    """"exact" (linear models, the default there), "rk4", or a diffrax solver's name; steps are
+    fixed"""
+    substeps: int | None = None
+    """steps a sample; enough for 5 ms unless given"""
+    precision: Precision = "float64"
+    """float32 is faster on some devices; how far off its results are is measured on 64 elements and
+    stands in the attributes"""
+    trajectories: Trajectories | None = None
+    """outputs to keep, thinned"""
+    trimmed: Trimmed | None = None
+    """a full nonlinear model begins in a steady flight of its own"""
+    pilot: Pilot | None = None
+    """who holds the attitude"""
+
+
 class Plan(NamedTuple):
     """What is compiled for a sweep; sweeps of the same plan share the program."""
 
@@ -60,12 +80,17 @@ class Plan(NamedTuple):
     linear: tuple[str, ...] = ()
     """inputs that are linear between samples; the others are held"""
 
-    @property
-    def hold(self) -> dict[str, str]:
-        """What the inputs do between samples, as `simulate` takes it."""
-        return dict.fromkeys(self.linear, "linear")
+    def simulation(self, **numbers: Any) -> SimulationOptions:
+        """How a run is simulated; `numbers` are the fields that an element has of its own."""
+        return SimulationOptions(
+            solver=solver_named(self.solver),
+            substeps=self.substeps,
+            hold=dict.fromkeys(self.linear, "linear"),
+            **numbers,
+        )
 
 
+DEFAULT = RunOptions()
 _MOST = 10**10
 """elements: more take months"""
 _LOOKED_AT = 1 << 16
@@ -132,18 +157,20 @@ def special_axes(model: Model, design: Design) -> list[str]:
 def job(
     model: Model,
     params: Any,
-    flights: Flight | tuple[Flight, ...] | list[Flight],
+    flights: Flight | Sequence[Flight],
     design: Design,
     reduce: Mapping[str, Reduce],
-    *,
-    solver: str | None = None,
-    substeps: int | None = None,
-    precision: Precision = "float64",
-    trajectories: Trajectories | None = None,
-    trimmed: Trimmed | None = None,
-    pilot: Pilot | None = None,
+    options: RunOptions = DEFAULT,
 ) -> Job:
     """Check a sweep and lay it out.
+
+    Args:
+        model: what is simulated.
+        params: the model's Params, SI; the axes of the design take the place of theirs.
+        flights: one or several, whose inputs are flown.
+        design: which values the axes take, by element.
+        reduce: by name, what is kept of each run.
+        options: how each run is made.
 
     Raises:
         ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
@@ -152,49 +179,51 @@ def job(
     check_model(model)
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
-        raise ValueError("flights: none given, wanted is at least one")
+        raise ValueError("flights: expected at least one, got none")
     if not 1 <= design.size <= _MOST:
         raise ValueError(
-            f"axes: the design has {design.size:.3g} elements, wanted are 1 to {_MOST:.0e}"
+            f"axes: expected a design of 1 to {_MOST:.0e} elements, got {design.size:.3g}"
         )
     _check_axes(model, design, flights)
     _check_inputs(model, flights)
-    _check_results(model, design, reduce, flights, trajectories)
+    _check_results(model, design, reduce, flights, options.trajectories)
+    _check_precision(options.precision)
+    solver = options.solver or ("exact" if model.linear else "rk4")
+    if solver == "exact" and not model.linear:
+        raise ValueError(f"solver: model {model.name!r} is not linear, expected rk4")
+    solver_named(solver)
+    _check_vehicle(model, params, design, flights)
+    trimmed = options.trimmed
+    if trimmed is not None and not is_full_nonlinear(trimmed.of or model):
+        raise ValueError(
+            f"model {model.name!r} cannot be trimmed: it is not the full nonlinear model"
+        )
+    substeps = options.substeps
+    if substeps is None:
+        substeps = substeps_for(max(f.dt for f in flights))
+    if substeps < 1:
+        raise ValueError(f"substeps must be at least 1, got {substeps}")
+    numbers = {n: float(v) for n, v in naming.asdict(params).items()}
+    checked = options._replace(solver=solver, substeps=substeps)
+    return Job(model, numbers, flights, design, dict(reduce), **checked._asdict())
+
+
+def _check_precision(precision: str) -> None:
     if precision not in ("float64", "float32"):
-        raise ValueError(f"precision: found {precision!r}, wanted is float64 or float32")
+        raise ValueError(f"precision: expected float64 or float32, got {precision!r}")
     if precision == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
         raise ValueError(
-            "precision: float64 is switched off in JAX, wanted is "
+            "precision: float64 is switched off in JAX, expected "
             "jax.config.update('jax_enable_x64', True), or precision='float32'"
         )
-    solver = solver or ("exact" if model.linear else "rk4")
-    if solver == "exact" and not model.linear:
-        raise ValueError(f"solver: model {model.name!r} is not linear, wanted is rk4")
-    solver_named(solver)
-    numbers = {n: float(v) for n, v in naming.asdict(params).items()}
-    lacking = needed_but_missing(model, params)
-    lacking = [n for n in lacking if n not in design.names]
-    lacking = [n for n in lacking if not all(n in f.known for f in flights)]
-    if lacking:
-        raise ValueError(f"vehicle: {', '.join(lacking)} missing, model {model.name} needs it")
-    if trimmed is not None and not is_full_nonlinear(trimmed.of or model):
-        raise ValueError(f"model {model.name!r} cannot be trimmed: it is not a whole helicopter")
-    most = substeps_for(max(f.dt for f in flights)) if substeps is None else substeps
-    if most < 1:
-        raise ValueError(f"substeps is {most}, wanted is at least 1")
-    return Job(
-        model,
-        numbers,
-        flights,
-        design,
-        dict(reduce),
-        solver,
-        most,
-        precision,
-        trajectories,
-        trimmed,
-        pilot,
-    )
+
+
+def _check_vehicle(model: Model, params: Any, design: Design, flights: tuple[Flight, ...]) -> None:
+    """Refuse a vehicle that lacks what neither an axis nor every flight gives."""
+    missing = [n for n in needed_but_missing(model, params) if n not in design.names]
+    missing = [n for n in missing if not all(n in f.known for f in flights)]
+    if missing:
+        raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
 
 
 def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> None:

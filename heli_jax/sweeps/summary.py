@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from heli_jax import run_directory
-from heli_jax.sweeps.chunks import pieces
+from heli_jax.sweeps.chunks import chunks_of
 from heli_jax.sweeps.program import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
@@ -72,7 +72,7 @@ def _unit(variable: xr.DataArray) -> dict[str, str]:
 
 def _ends(variable: xr.DataArray) -> dict[str, Any]:
     """The least and the largest finite value; nothing where there is none."""
-    finite = [found for _, values in pieces(variable) if (found := _finite(values)).size]
+    finite = [found for _, values in chunks_of(variable) if (found := _finite(values)).size]
     if not finite:
         return {}
     ends = {"min": min(float(v.min()) for v in finite), "max": max(float(v.max()) for v in finite)}
@@ -83,7 +83,7 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
     # The values are held once: the partition for the quantiles is made where they are.
     values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
     infinite = nan = 0
-    for which, piece in pieces(variable):
+    for which, piece in chunks_of(variable):
         used = piece[fine[which]]
         infinite += int(np.count_nonzero(np.isinf(used)))
         nan += int(np.count_nonzero(np.isnan(used)))
@@ -108,7 +108,7 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.nd
         if name not in dataset.data_vars:
             continue
         badness, element = np.empty(0), np.empty(0, np.int64)
-        for which, piece in pieces(dataset[name]):
+        for which, piece in chunks_of(dataset[name]):
             values = piece.astype(np.float64)
             bad = -values if one.how in _SMALL_IS_BAD else np.abs(values)
             bad = bad.reshape(len(values), -1).max(axis=1)

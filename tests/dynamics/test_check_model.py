@@ -15,7 +15,7 @@ from heli_jax.cli import main
 from heli_jax.dynamics import check_model as checks
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.models import on_stand
-from heli_jax.sweeps import Between, Reduce, sobol
+from heli_jax.sweeps import Range, Reduce, sobol
 
 
 class Params(NamedTuple):
@@ -190,7 +190,7 @@ def test_every_way_in_says_it(case):
         "linearize": lambda: linearize(model, params),
         "trim": lambda: trim(model, params),
         "sweep": lambda: sweep(
-            model, params, flight(), sobol({"Lp": Between(-4.0, -2.0)}, 4),
+            model, params, flight(), sobol({"Lp": Range(-4.0, -2.0)}, 4),
             {"peak": Reduce("max", "roll_rate")},
         ),
         "on_stand": lambda: on_stand(model),
@@ -209,7 +209,7 @@ def test_what_is_no_model(value, got):
         lambda: Problem(value, Params(-3.0, 20.0), [flight()], {"Lp": Free(-2.0)}),
         lambda: simulate(value, Params(-3.0, 20.0), flight()),
         lambda: trim(value, Params(-3.0, 20.0)),
-        lambda: sweep(value, Params(-3.0, 20.0), flight(), sobol({"Lp": Between(1, 2)}, 4), {}),
+        lambda: sweep(value, Params(-3.0, 20.0), flight(), sobol({"Lp": Range(1, 2)}, 4), {}),
     ]
     for call in ways:
         said = said_by(call, error=TypeError)

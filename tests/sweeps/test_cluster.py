@@ -11,7 +11,7 @@ from distributed.comm.core import CommClosedError
 
 from heli_jax import models, sweep
 from heli_jax.errors import InputError
-from heli_jax.sweeps import Between, Reduce, cluster, sobol
+from heli_jax.sweeps import Range, Reduce, cluster, sobol
 
 ROOT = Path(__file__).parents[2]
 ROLL = models.roll_on_stand
@@ -28,7 +28,7 @@ def test_a_worker_that_dies_costs_nothing(bench30, record):
     pytest.importorskip("distributed")
     from heli_jax.sweeps.cluster import connected
 
-    design = sobol({"Ixx": Between(0.02, 0.05), "a": Between(4.0, 6.0)}, 600)
+    design = sobol({"Ixx": Range(0.02, 0.05), "a": Range(4.0, 6.0)}, 600)
     reduce = {"rms": Reduce("rms", "roll"), "fit": Reduce("fit", "roll"), "mode": Reduce("modes")}
     options = {"chunk": 32, "lanes": 16}
     alone = sweep(ROLL, bench30, record, design, reduce, **options)

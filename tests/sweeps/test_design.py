@@ -9,9 +9,10 @@ import pytest
 import scipy.stats.qmc
 from hypothesis import given
 
-from heli_jax.sweeps import Between, grid, lhs, listed, product, sobol, table, zipped
+from heli_jax import sweeps
+from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
 
-AXES = {"Ixx": Between(0.01, 0.1, "log"), "a": Between(4.0, 6.0)}
+AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
 
 
 def whole(design):
@@ -19,14 +20,14 @@ def whole(design):
 
 
 DESIGNS = {
-    "grid": grid({"Ixx": Between(0.01, 0.1, "log", 7), "a": [1.0, 2.0, 4.0], "If": [3.0]}),
-    "list": listed({"Ixx": [1.0, 2.0, 3.0], "a": Between(0.0, 1.0, n=3)}),
+    "grid": grid({"Ixx": Range(0.01, 0.1, "log", 7), "a": [1.0, 2.0, 4.0], "If": [3.0]}),
+    "list": paired({"Ixx": [1.0, 2.0, 3.0], "a": Range(0.0, 1.0, n=3)}),
     "lhs": lhs(AXES, 50, seed=3),
     "sobol": sobol(AXES, 50, seed=3),
     "table": table({"Ixx": np.array([1.0, np.nan, 3.0]), "a": np.arange(3.0)}),
     "product": product(sobol(AXES, 9), grid({"seed": np.arange(4), "If": [1.0, 2.0]})),
-    "zip": zipped(sobol(AXES, 6), listed({"seed": np.arange(6)})),
-    "nested": product(zipped(lhs(AXES, 5), listed({"seed": np.arange(5)})), grid({"B": [0.9, 1]})),
+    "zip": zipped(sobol(AXES, 6), paired({"seed": np.arange(6)})),
+    "nested": product(zipped(lhs(AXES, 5), paired({"seed": np.arange(5)})), grid({"B": [0.9, 1]})),
 }
 
 
@@ -71,9 +72,9 @@ def test_a_grid_is_every_combination_the_last_axis_fastest():
 
 
 def test_points_of_an_axis_reach_both_ends_evenly():
-    found = whole(grid({"a": Between(-1.0, 2.0, n=7)}))["a"]
+    found = whole(grid({"a": Range(-1.0, 2.0, n=7)}))["a"]
     np.testing.assert_allclose(found, np.linspace(-1.0, 2.0, 7), rtol=1e-15, atol=1e-15)
-    found = whole(grid({"a": Between(-1e3, -1e-3, "log", 7)}))["a"]
+    found = whole(grid({"a": Range(-1e3, -1e-3, "log", 7)}))["a"]
     np.testing.assert_allclose(found, -np.geomspace(1e3, 1e-3, 7), rtol=1e-13)
     assert found[0] == -1e3
     assert found[-1] == -1e-3
@@ -90,7 +91,7 @@ def test_samples_are_scipys(make, engine):
 
 
 def test_a_latin_hypercube_has_one_point_in_every_row():
-    found = whole(lhs({"a": Between(0.0, 1.0), "Ixx": Between(0.0, 1.0)}, 40, seed=1))
+    found = whole(lhs({"a": Range(0.0, 1.0), "Ixx": Range(0.0, 1.0)}, 40, seed=1))
     for v in found.values():
         np.testing.assert_array_equal(np.sort(np.floor(40 * v)), np.arange(40))
 
@@ -112,28 +113,34 @@ def test_descriptions_tell_designs_apart():
     ("make", "words"),
     [
         (lambda: grid({}), "none given"),
-        (lambda: listed({}), "none given"),
+        (lambda: paired({}), "none given"),
         (lambda: sobol({}, 3), "none given"),
         (lambda: grid({"a": []}), "axes.a: no values"),
         (lambda: table({"a": np.array([])}), "axes.a: no values"),
         (lambda: grid({"a": ["x"]}), "wanted are numbers"),
-        (lambda: grid({"a": Between(1.0, 2.0)}), "at least 2 points"),
-        (lambda: grid({"a": Between(1.0, 2.0, n=1)}), "at least 2 points"),
-        (lambda: grid({"a": Between(2.0, 1.0, n=3)}), "lower < upper"),
-        (lambda: lhs({"a": Between(1.0, 1.0)}, 3), "lower < upper"),
-        (lambda: lhs({"a": Between(-1.0, 1.0, "log")}, 3), "one sign"),
-        (lambda: lhs({"a": Between(1.0, np.inf)}, 3), "lower < upper"),
-        (lambda: lhs({"a": Between(1.0, 2.0, "cubic")}, 3), "linear or log"),
+        (lambda: grid({"a": Range(1.0, 2.0)}), "at least 2 points"),
+        (lambda: grid({"a": Range(1.0, 2.0, n=1)}), "at least 2 points"),
+        (lambda: grid({"a": Range(2.0, 1.0, n=3)}), "lower < upper"),
+        (lambda: lhs({"a": Range(1.0, 1.0)}, 3), "lower < upper"),
+        (lambda: lhs({"a": Range(-1.0, 1.0, "log")}, 3), "one sign"),
+        (lambda: lhs({"a": Range(1.0, np.inf)}, 3), "lower < upper"),
+        (lambda: lhs({"a": Range(1.0, 2.0, "cubic")}, 3), "linear or log"),
         (lambda: lhs({"a": [1.0, 2.0]}, 3), "lower and upper"),
         (lambda: sobol(AXES, 0), "n is 0"),
-        (lambda: listed({"a": [1.0, 2.0], "Ixx": [1.0]}), "a has 2, Ixx has 1"),
+        (lambda: paired({"a": [1.0, 2.0], "Ixx": [1.0]}), "a has 2, Ixx has 1"),
         (lambda: table({"a": np.ones(2), "Ixx": np.ones(3)}), "differ in length"),
-        (lambda: zipped(lhs(AXES, 3), listed({"B": [1.0, 2.0]})), "3 and 2 elements"),
+        (lambda: zipped(lhs(AXES, 3), paired({"B": [1.0, 2.0]})), "3 and 2 elements"),
         (lambda: zipped(lhs(AXES, 3), lhs(AXES, 3)), "'Ixx' is in two designs"),
         (lambda: product(), "no designs"),
-        (lambda: product(lhs(AXES, 3), listed({"a": [1.0]})), "'a' is in two designs"),
+        (lambda: product(lhs(AXES, 3), paired({"a": [1.0]})), "'a' is in two designs"),
     ],
 )
 def test_what_cannot_be_a_design_is_refused_in_words(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+@pytest.mark.parametrize(("old", "new"), [("Between", "Range"), ("listed", "paired")])
+def test_old_names_are_told_the_new_ones(old, new):
+    with pytest.warns(DeprecationWarning, match=new):
+        assert getattr(sweeps, old) is getattr(sweeps, new)

@@ -15,21 +15,21 @@ from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.validation.metrics import metrics
 from heli_jax.simulation.accumulate import accumulated
 from heli_jax.sweeps import (
-    Between,
+    Range,
     Reduce,
     Streaming,
     Trajectories,
     Trimmed,
     grid,
-    listed,
+    paired,
     product,
     sobol,
 )
 from heli_jax.sweeps.program import DIVERGED, OK, OUT_OF_RANGE
-from heli_jax.sweeps.reducers import HOWS
+from heli_jax.sweeps.reducers import REDUCERS
 
 ROLL = models.roll_on_stand
-AXES = {"Ixx": Between(0.02, 0.05, "log"), "If": Between(2e-4, 6e-4, "log")}
+AXES = {"Ixx": Range(0.02, 0.05, "log"), "If": Range(2e-4, 6e-4, "log")}
 
 
 def flown(model, record, **options):
@@ -39,7 +39,7 @@ def flown(model, record, **options):
 
 @pytest.mark.parametrize("solver", ["exact", "rk4", "Tsit5"])
 def test_every_reducer_is_what_numpy_makes_of_the_run(bench30, record, solver):
-    reduce = {how: Reduce(how, "roll") for how in HOWS}
+    reduce = {how: Reduce(how, "roll") for how in REDUCERS}
     found = sweep(ROLL, bench30, record, sobol(AXES, 5), reduce, solver=solver)
     measured = record.outputs["roll"]
     fly = flown(ROLL, record)
@@ -60,7 +60,7 @@ def test_every_reducer_is_what_numpy_makes_of_the_run(bench30, record, solver):
             "vaf": agreed.vaf,
             "tic": agreed.tic,
         }
-        assert set(wanted) == set(HOWS)
+        assert set(wanted) == set(REDUCERS)
         rtol = 1e-9 if solver == "exact" else 1e-6
         for how, value in wanted.items():
             np.testing.assert_allclose(found[how][k], value, rtol=rtol, atol=1e-9, err_msg=how)
@@ -151,7 +151,7 @@ def test_a_model_of_ones_own_with_direct_feedthrough(pushed):
     axes = {"lag": [0.25, 1.0, 4.0], "initial.p": [-1.0, 0.0, 2.0], "gain.u": [1.0, 2.0, 0.5]}
     axes |= {"offset.v": [0.0, 0.1, -0.2]}
     reduce = {"last": Reduce("final", "felt"), "rms": Reduce("rms", "felt")}
-    found = sweep(model, params, pushed, listed(axes), reduce)
+    found = sweep(model, params, pushed, paired(axes), reduce)
     for k in range(3):
         lag, x = axes["lag"][k], axes["initial.p"][k]
         u = axes["gain.u"][k] * pushed.inputs["u"] + 2.0 * (
@@ -167,7 +167,7 @@ def test_a_model_of_ones_own_with_direct_feedthrough(pushed):
 
 def test_the_inputs_may_come_later(bench30, record):
     found = sweep(
-        ROLL, bench30, record, listed({"delay": [0.0, 0.013, 0.1]}), {"p": Reduce("rms", "roll")}
+        ROLL, bench30, record, paired({"delay": [0.0, 0.013, 0.1]}), {"p": Reduce("rms", "roll")}
     )
     for k, late in enumerate([0.0, 0.013, 0.1]):
         run = simulate(ROLL, bench30, record, delay=jnp.asarray(late))
@@ -179,7 +179,7 @@ def test_a_seed_draws_the_disturbance(bench30, record):
     params = model.Params(
         **{**naming.asdict(bench30), "sigma_w": jnp.asarray(1.0), "tau_w": jnp.asarray(1.0)}
     )
-    design = product(listed({"seed": [4, 5]}), listed({"sigma_w": [0.0, 1.0]}))
+    design = product(paired({"seed": [4, 5]}), paired({"sigma_w": [0.0, 1.0]}))
     found = sweep(model, params, record, design, {"rms": Reduce("rms", "roll")})
     assert found.attrs["notes"] == []
     quiet = simulate(ROLL, bench30, record).outputs.roll
@@ -281,13 +281,13 @@ def test_exactly_the_bad_elements_are_flagged(bench30, record):
     impossible = np.arange(900, n, 1000)
     kick = np.zeros(n)
     good = sweep(
-        ROLL, bench30, record, listed({"Ixx": Ixx, "initial.phi": kick}),
+        ROLL, bench30, record, paired({"Ixx": Ixx, "initial.phi": kick}),
         {"rms": Reduce("rms", "roll")},
     )  # fmt: skip
     Ixx = Ixx.copy()
     Ixx[lost], Ixx[impossible], kick[huge] = np.nan, -0.03, 1e200
     found = sweep(
-        ROLL, bench30, record, listed({"Ixx": Ixx, "initial.phi": kick}),
+        ROLL, bench30, record, paired({"Ixx": Ixx, "initial.phi": kick}),
         {"rms": Reduce("rms", "roll")},
     )  # fmt: skip
     wanted = np.full(n, OK)
@@ -300,14 +300,14 @@ def test_exactly_the_bad_elements_are_flagged(bench30, record):
 
 def test_a_model_that_runs_away_is_flagged(pushed):
     model = own_model(linear=False)
-    design = listed({"lag": [0.5, -50.0, 1.0, -1000.0]})
+    design = paired({"lag": [0.5, -50.0, 1.0, -1000.0]})
     found = sweep(model, Rate(2.0, 0.5), pushed, design, {"end": Reduce("final", "p")})
     assert found["status"].values.tolist() == [OK, DIVERGED, OK, DIVERGED]
 
 
 def test_a_vehicle_that_cannot_be_is_out_of_range_however_it_flies(bench30, record):
     found = sweep(
-        ROLL, bench30, record, listed({"Ixx": [0.03, -1e-6]}), {"rms": Reduce("rms", "roll")}
+        ROLL, bench30, record, paired({"Ixx": [0.03, -1e-6]}), {"rms": Reduce("rms", "roll")}
     )
     assert found["status"].values.tolist() == [OK, OUT_OF_RANGE]
     assert np.isnan(found["rms"][1])
@@ -315,17 +315,17 @@ def test_a_vehicle_that_cannot_be_is_out_of_range_however_it_flies(bench30, reco
 
 def test_flights_of_one_name_are_told_apart(bench30, record):
     reduce = {"rms": Reduce("rms", "roll")}
-    found = sweep(ROLL, bench30, [record, record], listed({"Ixx": [0.03]}), reduce)
+    found = sweep(ROLL, bench30, [record, record], paired({"Ixx": [0.03]}), reduce)
     assert found["flight"].values.tolist() == [f"{record.name} ({k})" for k in (1, 2)]
 
 
 def test_results_stand_as_they_were_asked_for(bench30, record):
     reduce = {n: Reduce("rms", "roll") for n in ("z", "b", "a")}
-    assert list(sweep(ROLL, bench30, record, listed({"Ixx": [0.03]}), reduce)) == ["z", "b", "a"]
+    assert list(sweep(ROLL, bench30, record, paired({"Ixx": [0.03]}), reduce)) == ["z", "b", "a"]
 
 
 def test_an_axis_in_the_logarithm_says_so(bench30, record):
-    axes = {"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}
+    axes = {"Ixx": Range(0.02, 0.05, "log"), "a": Range(4.0, 6.0)}
     found = sweep(ROLL, bench30, record, sobol(axes, 4), {"rms": Reduce("rms", "roll")})
     assert found["Ixx"].attrs["scale"] == "log"
     assert "scale" not in found["a"].attrs
@@ -349,7 +349,7 @@ AHEAD = Condition(ahead=10.0)
 
 def test_helicopters_begin_in_a_trim_of_their_own(xcell):
     model, heavy = HELICOPTER, 100.0
-    design = listed({"m": [float(xcell.m), 1.2 * float(xcell.m), heavy]})
+    design = paired({"m": [float(xcell.m), 1.2 * float(xcell.m), heavy]})
     reduce = {
         "sinks": Reduce("final", "dz"), "turns": Reduce("peak", "roll"), "mode": Reduce("modes"),
     }  # fmt: skip
@@ -369,7 +369,7 @@ def test_helicopters_begin_in_a_trim_of_their_own(xcell):
 def test_the_pilot_holds_each_element_in_its_own_trim(xcell):
     model = HELICOPTER
     pilot = attitude_hold(model, xcell, trim(model, xcell, AHEAD))
-    design = listed({"m": [0.7 * float(xcell.m), float(xcell.m), 1.3 * float(xcell.m)]})
+    design = paired({"m": [0.7 * float(xcell.m), float(xcell.m), 1.3 * float(xcell.m)]})
     reduce = {n: Reduce("final", n) for n in ("roll_rate", "y", "z")}
     found = sweep(model, xcell, STILL, design, reduce, trimmed=Trimmed(AHEAD), pilot=pilot)
     assert not found["status"].any()

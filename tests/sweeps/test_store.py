@@ -11,8 +11,7 @@ import xarray as xr
 
 from heli_jax import Flight, models, sweep
 from heli_jax.errors import InputError
-from heli_jax.sweeps import Between, Reduce, listed, sobol
-from heli_jax.sweeps import chunks as pieces
+from heli_jax.sweeps import Range, Reduce, chunks, paired, sobol
 from heli_jax.sweeps import store as stores
 from heli_jax.sweeps.batching import split_for
 from heli_jax.sweeps.spec import job
@@ -20,7 +19,7 @@ from heli_jax.sweeps.summary import summary
 from heli_jax.sweeps.worker import Worker
 
 ROLL = models.roll_on_stand
-DESIGN = sobol({"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}, 300, seed=2)
+DESIGN = sobol({"Ixx": Range(0.02, 0.05, "log"), "a": Range(4.0, 6.0)}, 300, seed=2)
 REDUCE = {"rms": Reduce("rms", "roll"), "fit": Reduce("fit", "roll"), "mode": Reduce("modes")}
 
 
@@ -92,7 +91,7 @@ def test_the_summary_is_that_of_all_elements_however_it_is_read(bench30, short, 
     of = job(ROLL, bench30, short, DESIGN, REDUCE)
     at_once = summary(data, of, {})
     for elements in (1, 37, 299):
-        monkeypatch.setattr(pieces, "_ELEMENTS", elements)
+        monkeypatch.setattr(chunks, "_ELEMENTS", elements)
         assert summary(data, of, {}) == at_once
     used = (data["status"] == 0) & np.isfinite(data["rms"])
     found, wanted = at_once["results"]["rms"], data["rms"].values[used]
@@ -126,10 +125,10 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 3)
 import numpy as np
 from heli_jax import Flight, load_vehicle, models, sweep
-from heli_jax.sweeps import Between, Reduce, sobol
+from heli_jax.sweeps import Range, Reduce, sobol
 stick = np.repeat(np.random.default_rng(0).uniform(-3e-6, 3e-6, 20), 10)
 flight = Flight(dt=0.02, inputs={"x_roll": stick}, outputs={})
-design = sobol({"Ixx": Between(0.02, 0.05)}, 200)
+design = sobol({"Ixx": Range(0.02, 0.05)}, 200)
 found = [
     sweep(models.roll, load_vehicle(sys.argv[1]), flight, design, {"rms": Reduce("rms", "roll")},
           lanes=16, chunk=96, devices=jax.local_devices()[:k])["rms"].values.tobytes()
@@ -190,8 +189,8 @@ def test_resuming_what_never_began_begins_it(run, whole, tmp_path):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"design": sobol({"Ixx": Between(0.02, 0.05, "log")}, 300)}, "design"),
-        ({"design": sobol({"Ixx": Between(0.02, 0.05, "log"), "a": Between(4.0, 6.0)}, 301, 2)},
+        ({"design": sobol({"Ixx": Range(0.02, 0.05, "log")}, 300)}, "design"),
+        ({"design": sobol({"Ixx": Range(0.02, 0.05, "log"), "a": Range(4.0, 6.0)}, 301, 2)},
          "design.n was 300 and is 301"),
         ({"reduce": {"rms": Reduce("rms", "roll")}}, "reduce.fit"),
         ({"solver": "rk4"}, "solver was exact and is rk4"),
@@ -301,7 +300,7 @@ def test_a_store_that_is_no_store_is_refused(run, whole, tmp_path):
 
 def test_a_result_that_is_nowhere_a_number_is_finished_too(run, tmp_path):
     out = tmp_path / "nan"
-    design = listed({"Ixx": np.full(64, np.nan)})
+    design = paired({"Ixx": np.full(64, np.nan)})
     run(out, design=design, reduce={"rms": Reduce("rms", "roll")})
     found = xr.open_zarr(out / "sweep.zarr", consolidated=False, chunks=None)
     assert (found["status"] == 1).all()
@@ -315,7 +314,7 @@ def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
     import heli_jax.sweeps.batching as lanes
 
     def cut(n, **asked):
-        design = sobol({"Ixx": Between(0.02, 0.05)}, n)
+        design = sobol({"Ixx": Range(0.02, 0.05)}, n)
         wanted = job(ROLL, bench30, record, design, {"rms": Reduce("rms", "roll")})
         return split_for(wanted, devices=jax.local_devices()[:1], **asked)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from heli_jax.sweeps.chunks import pieces
+from heli_jax.sweeps.chunks import chunks_of
 
 WIDE = 30.0
 """factor over which numbers of one sign are drawn logarithmically"""
@@ -249,7 +249,7 @@ def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
     Numbers that no picture can hold are taken as infinite, or as zero.
     """
     parts = []
-    for which, piece in pieces(variable):
+    for which, piece in chunks_of(variable):
         first, last = np.searchsorted(elements, [which.start, which.stop])
         parts.append(piece[elements[first:last] - which.start].astype(np.float64))
     values = np.concatenate(parts) if parts else np.empty(0)
