@@ -1,5 +1,6 @@
 """Runs that a configuration describes and the project makes itself."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -349,7 +350,10 @@ def _stick(one: StickConfig, n: int, dt: float, rng: np.random.Generator) -> np.
     if one.kind == "3-2-1-1":
         return sticks.multistep_3211(n, dt, rng, one.step, one.pause)
     if one.kind == "sweep":
-        return sticks.sweep(n, dt, *one.band)
+        # Now the word for a parameter sweep alone.
+        warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
+    if one.kind in ("chirp", "sweep"):
+        return sticks.chirp(n, dt, *one.band)
     return np.zeros(n)
 
 

@@ -76,7 +76,7 @@ def test_start_wind_pilot_and_ground(made):
 
 def test_what_leaves_the_range_is_told(made):
     found = made(
-        inputs={"x_throttle": {"kind": "sweep", "amplitude": 0.8, "band": [0.2, 0.4]}},
+        inputs={"x_throttle": {"kind": "chirp", "amplitude": 0.8, "band": [0.2, 0.4]}},
         disturbance={"axis": "roll", "sigma_w": 0.1, "tau_w": 1.0},
     )
     notes = " / ".join(found.notes)

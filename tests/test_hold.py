@@ -27,7 +27,7 @@ def chirped(tmp_path_factory):
     del content["disturbance"]
     content["rls"] = None
     content["simulate"]["duration"] = 20  # 1000 samples, as elsewhere
-    content["simulate"]["inputs"]["x_roll"] |= {"kind": "sweep", "amplitude": 10.0}
+    content["simulate"]["inputs"]["x_roll"] |= {"kind": "chirp", "amplitude": 10.0}
     free = {"Ixx": {"start": 0.03}, "If": {"start": 2e-4}}
     content["fit"] = {"method": "output-error", "free": free}
     path = folder / "bench.yaml"

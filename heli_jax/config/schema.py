@@ -145,7 +145,7 @@ class DisturbanceConfig(_Strict):
 class StickConfig(_Strict):
     """How one input moves in a simulation."""
 
-    kind: Literal["random-steps", "3-2-1-1", "sweep", "neutral"] = "random-steps"
+    kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
     amplitude: Positive
     unit: str | None = None
     hold: tuple[Positive, Positive] = (0.3, 2.0)

@@ -19,116 +19,22 @@ import jax.numpy as jnp
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
 from heli_jax.dynamics import flybar
+from heli_jax.dynamics.helicopter_records import (
+    Attitude,
+    Corrections,
+    HelicopterInputs,
+    HelicopterOutputs,
+    HelicopterState,
+    Motion,
+)
 from heli_jax.dynamics.inflow import vortex_ring
 from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
 from heli_jax.naming import Scalar
 from heli_jax.numerics.sincos import sincos
 from heli_jax.vehicle import Helicopter
 
-
-class HelicopterState(NamedTuple):
-    x: Annotated[Scalar, "m", "position forward of the origin"]
-    y: Annotated[Scalar, "m", "position to the right"]
-    z: Annotated[Scalar, "m", "height"]
-    phi: Annotated[Scalar, "rad", "roll angle, right side down"]
-    theta: Annotated[Scalar, "rad", "pitch angle, nose up"]
-    psi: Annotated[Scalar, "rad", "yaw angle, nose right"]
-    dx: Annotated[Scalar, "m/s", "velocity along x"]
-    dy: Annotated[Scalar, "m/s", "velocity along y"]
-    dz: Annotated[Scalar, "m/s", "velocity upwards"]
-    dphi: Annotated[Scalar, "rad/s", "derivative of phi"]
-    dtheta: Annotated[Scalar, "rad/s", "derivative of theta"]
-    dpsi: Annotated[Scalar, "rad/s", "derivative of psi"]
-    beta_roll: Annotated[Scalar, "rad", "flybar angle, roll"]
-    dbeta_roll: Annotated[Scalar, "rad/s", "flybar rate, roll"]
-    beta_pitch: Annotated[Scalar, "rad", "flybar angle, pitch"]
-    dbeta_pitch: Annotated[Scalar, "rad/s", "flybar rate, pitch"]
-    Omega: Annotated[Scalar, "rad/s", "rotor speed"]
-
-
-class HelicopterInputs(NamedTuple):
-    x_roll: Annotated[Scalar, "m", "cyclic input displacement, roll"]
-    x_pitch: Annotated[Scalar, "m", "cyclic input displacement, pitch"]
-    x_yaw: Annotated[Scalar, "1", "yaw stick"]
-    x_throttle: Annotated[Scalar, "1", "throttle stick"]
-
-
-class HelicopterOutputs(NamedTuple):
-    roll: Annotated[Scalar, "rad", "roll angle"]
-    pitch: Annotated[Scalar, "rad", "pitch angle"]
-    yaw: Annotated[Scalar, "rad", "yaw angle"]
-    roll_rate: Annotated[Scalar, "rad/s", "roll rate"]
-    pitch_rate: Annotated[Scalar, "rad/s", "pitch rate"]
-    yaw_rate: Annotated[Scalar, "rad/s", "yaw rate"]
-    x: Annotated[Scalar, "m", "position forward of the origin"]
-    y: Annotated[Scalar, "m", "position to the right"]
-    z: Annotated[Scalar, "m", "height"]
-    dx: Annotated[Scalar, "m/s", "velocity along x"]
-    dy: Annotated[Scalar, "m/s", "velocity along y"]
-    dz: Annotated[Scalar, "m/s", "velocity upwards"]
-    rotor_speed: Annotated[Scalar, "rad/s", "rotor speed"]
-
-
-class Corrections(NamedTuple):
-    """What of the paper is corrected; each for itself."""
-
-    direction: bool = False
-    """eqs 2-3: thrust along the mast at any heading (printed, they hold near psi = 0)"""
-    rigid_body: bool = False
-    """eqs 5-7: body rates, their kinematics and the inertia coupling"""
-    reaction: bool = False
-    """eq. 7: the motor's torque counts once (printed, T_m and -Ir dOmega both act)"""
-    edgewise: bool = False
-    """eq. 8: speed in the plane of the rotor as a norm, in the shaft's frame"""
-    descent: bool = False
-    """eq. 9: flow through the rotor by exact kinematics (printed, one sign is wrong)"""
-    cyclic: bool = False
-    """eqs 10, 13: the cyclic pitch of eq. 11 in place of (x_roll + x_pitch)/L1"""
-    first_order_bar: bool = False
-    """eq. 12: the flybar averaged over a turn; its state has no rate"""
-    rotor_moment: bool = False
-    """eqs 14-15: blade-element theory's 1/8, and damping by the body's rate"""
-    tail: bool = False
-    """eq. 16: inflow of the tail rotor, and with it yaw damping"""
-    tied_torque: bool = False
-    """eqs 18-19: K_Tm is Ir K_throttle, so that rotor and fuselage agree about the motor"""
-    drag: bool = False
-    """eqs 2-4: drag of the fuselage by its equivalent areas Sx, Sy, Sz"""
-    dynamic_inflow: bool = False
-    """momentum theory with the inertia of the air (Carpenter and Fridovich, 1953): a state vi"""
-
-
 _ALL = Corrections(*[True] * len(Corrections._fields))._replace(dynamic_inflow=False)
 _VARIANTS = {"paper": Corrections(), "consistent": _ALL}
-
-
-class Attitude(NamedTuple):
-    """Sines and cosines of the angles."""
-
-    sphi: Scalar
-    cphi: Scalar
-    sth: Scalar
-    cth: Scalar
-    spsi: Scalar
-    cpsi: Scalar
-
-
-class Motion(NamedTuple):
-    """How the body turns and meets the air; body axes are forward, right, down."""
-
-    at: Attitude
-    dx: Scalar
-    """velocity relative to the air along x, y and z (up) [m/s]"""
-    dy: Scalar
-    dz: Scalar
-    u: Scalar
-    """the same in body axes [m/s]"""
-    v: Scalar
-    w: Scalar
-    p: Scalar
-    """rates of roll, pitch and yaw [rad/s]"""
-    q: Scalar
-    r: Scalar
 
 
 # Behind a barrier a number is computed once: without it XLA computes it again for each of the
@@ -232,10 +138,13 @@ def motion(how: Corrections, s: Any, u: Any) -> Motion:
     if hasattr(u, "wind_x"):
         dx, dy, dz = dx - u.wind_x, dy - u.wind_y, dz - u.wind_z
     # Turned by psi, theta and phi, one after another.
-    ahead, aside = dx * at.cpsi + dy * at.spsi, dy * at.cpsi - dx * at.spsi
-    below = ahead * at.sth - dz * at.cth
-    forward = ahead * at.cth + dz * at.sth
-    right, down = aside * at.cphi + below * at.sphi, below * at.cphi - aside * at.sphi
+    forward_speed, lateral_speed = dx * at.cpsi + dy * at.spsi, dy * at.cpsi - dx * at.spsi
+    below = forward_speed * at.sth - dz * at.cth
+    forward = forward_speed * at.cth + dz * at.sth
+    right, down = (
+        lateral_speed * at.cphi + below * at.sphi,
+        below * at.cphi - lateral_speed * at.sphi,
+    )
     p, q, r = s.dphi, s.dtheta, s.dpsi
     if how.rigid_body:
         p = s.dphi - s.dpsi * at.sth
@@ -246,9 +155,13 @@ def motion(how: Corrections, s: Any, u: Any) -> Motion:
 
 def _to_earth(at: Attitude, forward: Scalar, right: Scalar, down: Scalar) -> tuple[Scalar, ...]:
     """A vector in body axes along x, y and z (up)."""
-    aside, below = right * at.cphi - down * at.sphi, right * at.sphi + down * at.cphi
-    ahead, up = forward * at.cth + below * at.sth, forward * at.sth - below * at.cth
-    return ahead * at.cpsi - aside * at.spsi, ahead * at.spsi + aside * at.cpsi, up
+    lateral_speed, below = right * at.cphi - down * at.sphi, right * at.sphi + down * at.cphi
+    forward_speed, up = forward * at.cth + below * at.sth, forward * at.sth - below * at.cth
+    return (
+        forward_speed * at.cpsi - lateral_speed * at.spsi,
+        forward_speed * at.spsi + lateral_speed * at.cpsi,
+        up,
+    )
 
 
 class Cyclic(NamedTuple):
@@ -279,18 +192,26 @@ def flow(how: Corrections, p: Helicopter, s: Any, u: Any, m: Motion) -> aero.Flo
     has its largest blade angle on the right, where the blade advances in forward flight, that of
     roll at the nose, where it advances in flight to the left.
     """
-    ahead, aside, up = m.dx - p.hr * s.dtheta, m.dy + p.hr * s.dphi, m.dz - p.lr * s.dtheta
+    forward_speed, lateral_speed, up = (
+        m.dx - p.hr * s.dtheta,
+        m.dy + p.hr * s.dphi,
+        m.dz - p.lr * s.dtheta,
+    )
     if how.descent:
         W = -(m.w + p.lr * m.q)
     else:
-        W = up * m.at.cth - ahead * m.at.sth - (m.dy - p.hr * s.dphi) * m.at.sphi
+        W = up * m.at.cth - forward_speed * m.at.sth - (m.dy - p.hr * s.dphi) * m.at.sphi
     tilt = Cyclic((1.0 / p.L1) * u.x_roll, (1.0 / p.L1) * u.x_pitch)
     if how.cyclic:
         tilt = cyclic(p, s, u)
     if how.edgewise:
-        ahead, aside = m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
-        return aero.Flow(ahead**2 + aside**2, W, ahead * tilt.pitch - aside * tilt.roll)
-    speed = ahead * m.at.cth + aside * m.at.cphi + up * m.at.sth
+        forward_speed, lateral_speed = m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
+        return aero.Flow(
+            forward_speed**2 + lateral_speed**2,
+            W,
+            forward_speed * tilt.pitch - lateral_speed * tilt.roll,
+        )
+    speed = forward_speed * m.at.cth + lateral_speed * m.at.cphi + up * m.at.sth
     return aero.Flow(speed**2, W, speed * (tilt.roll + tilt.pitch))
 
 

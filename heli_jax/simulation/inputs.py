@@ -1,5 +1,7 @@
 """Stick inputs to excite a machine with; each function gives (N,) samples of unit amplitude."""
 
+import warnings
+
 import numpy as np
 
 
@@ -32,8 +34,14 @@ def multistep_3211(
     return u
 
 
-def sweep(n: int, dt: float, low: float, high: float) -> np.ndarray:
+def chirp(n: int, dt: float, low: float, high: float) -> np.ndarray:
     """A sine whose frequency rises exponentially from `low` to `high` [Hz] over the record."""
     t = np.arange(n) * dt
     growth = np.log(high / low) / max(t[-1], dt)
     return np.sin(2.0 * np.pi * low * np.expm1(growth * t) / growth)
+
+
+def sweep(n: int, dt: float, low: float, high: float) -> np.ndarray:
+    """Deprecated: the name that `chirp` had."""
+    warnings.warn("sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
+    return chirp(n, dt, low, high)

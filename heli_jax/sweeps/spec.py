@@ -1,8 +1,6 @@
 """A sweep as it was asked for, checked, and described so that another can be told from it."""
 
-import hashlib
-import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -13,14 +11,13 @@ from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.regular_file import read_regular
 from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import Design, digest, whole_seeds
+from heli_jax.sweeps.design import Design, whole_seeds
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]
@@ -124,7 +121,7 @@ class Job(NamedTuple):
             self.trimmed,
             self.streamed,
             self.simulated,
-            _linear(self.model, self.flights[index]),
+            linear_inputs_of(self.model, self.flights[index]),
         )
 
     @property
@@ -141,7 +138,7 @@ class Job(NamedTuple):
         return bool(kept) or self.trajectories is not None
 
 
-def _linear(model: Model, flight: Flight) -> tuple[str, ...]:
+def linear_inputs_of(model: Model, flight: Flight) -> tuple[str, ...]:
     return tuple(n for n in naming.names(model.Inputs) if flight.hold.get(n) == "linear")
 
 
@@ -308,55 +305,6 @@ def _check_results(
         )
 
 
-def described(one: Job) -> dict[str, Any]:
-    """What fixes the numbers of a sweep, as plain data; equal for two jobs that give the same."""
-    model = one.model
-    flights = [
-        {
-            "name": f.name,
-            "samples": f.n_samples,
-            "dt": f.dt,
-            "known": dict(f.known),
-            "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
-            **({"linear": list(linear)} if (linear := _linear(model, f)) else {}),
-        }
-        for f in one.flights
-    ]
-    kept = one.trajectories
-    return {
-        "model": model.name,
-        "source": _source(model.vector_field),
-        "vehicle": {n: v for n, v in one.params.items() if np.isfinite(v)},
-        "flights": flights,
-        "design": one.design.describe(),
-        "reduce": {n: _reducer(r) for n, r in one.reduce.items()},
-        "solver": one.solver,
-        "substeps": one.substeps,
-        "precision": one.precision,
-        "trajectories": None if kept is None else [list(kept.signals), kept.every],
-        "trimmed": None
-        if one.trimmed is None
-        else [
-            [float(v) for v in one.trimmed.condition],
-            list(one.trimmed.wind),
-            one.trimmed.sticks,
-        ],
-        "pilot": None
-        if one.pilot is None
-        else digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(one.pilot))}),
-    }
-
-
-def _reducer(one: Reduce) -> dict[str, Any]:
-    if isinstance(one.how, str):
-        found: dict[str, Any] = {"how": one.how}
-    else:
-        how = one.how.update if isinstance(one.how, reducers.Streaming) else one.how
-        found = {"how": getattr(how, "__qualname__", str(type(how))), "source": _source(how)}
-    found |= {k: v for k, v in (("signal", one.signal), ("input", one.input)) if v is not None}
-    return found | ({"gain": one.gain} if one.how == "margins" else {})
-
-
 def axis_unit(model: Model, name: str) -> str | None:
     """The SI unit of an axis; None where it has none, as a seed, or there is no such axis."""
     kind, _, of = name.partition(".")
@@ -387,39 +335,3 @@ def unread(one: Job) -> list[str]:
         return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
 
     return [n for n in axes if not reads(model, params, n) and not else_read(n)]
-
-
-def _source(function: Callable[..., Any]) -> str:
-    """A fingerprint of the file that a function comes from, where it is not one of ours: another
-    program gives other numbers."""
-    function = getattr(function, "func", function)
-    module = getattr(function, "__module__", "") or ""
-    if module.partition(".")[0] == "heli_jax":
-        return ""
-    try:
-        file = inspect.getsourcefile(function)
-        data = read_regular(file, "a module in Python", 10**7) if file else b""
-        return hashlib.sha256(data).hexdigest() if file else ""
-    except (TypeError, OSError, InputError):
-        return ""
-
-
-def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
-    """The keys in which two descriptions differ, each with what was and what is."""
-    found = []
-    for key in {**old, **new}:
-        a, b = old.get(key), new.get(key)
-        if a == b:
-            continue
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += differences(a, b, f"{above}{key}.")
-        else:
-            found.append(f"{above}{key} was {_short(a)} and is {_short(b)}")
-    return found
-
-
-def _short(value: Any) -> str:
-    if value is None:
-        return "not given"
-    text = str(value)
-    return text if len(text) <= 40 else text[:37] + "..."

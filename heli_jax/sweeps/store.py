@@ -20,8 +20,9 @@ from zarr.storage import MemoryStore
 
 from heli_jax.errors import InputError
 from heli_jax.regular_file import require_regular
+from heli_jax.sweeps.description import described, differences
 from heli_jax.sweeps.program import NOT_RUN
-from heli_jax.sweeps.spec import Job, described, differences
+from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}

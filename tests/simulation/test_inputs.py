@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from heli_jax.simulation.inputs import multistep_3211, random_steps, sweep
+from heli_jax.simulation import inputs
+from heli_jax.simulation.inputs import chirp, multistep_3211, random_steps
 
 
 def lengths(u):
@@ -34,10 +35,16 @@ def test_3211():
 
 def test_sweep_runs_from_low_to_high():
     n, dt, low, high = 20_000, 0.001, 0.5, 20.0
-    u = sweep(n, dt, low, high)
+    u = chirp(n, dt, low, high)
     assert u[0] == 0.0
     assert np.abs(u).max() == pytest.approx(1.0, abs=1e-3)
     up = np.flatnonzero((u[:-1] < 0) & (u[1:] >= 0)) * dt
     assert 1.0 / (up[-1] - up[-2]) == pytest.approx(high, rel=0.03)
     # Integral of an exponential frequency: (high - low) T / ln(high / low) turns in all.
     assert len(up) == pytest.approx((high - low) * n * dt / np.log(high / low), abs=2)
+
+
+def test_a_chirp_s_old_name_tells_the_new_one():
+    with pytest.warns(DeprecationWarning, match="chirp"):
+        u = inputs.sweep(50, 0.02, 0.5, 5.0)
+    np.testing.assert_array_equal(u, chirp(50, 0.02, 0.5, 5.0))
