@@ -33,7 +33,7 @@ def started(v, factor_ixx=2.0, factor_if=0.4):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_recovers_inertias_of_random_machines(seed, rate, stand):
     v = stable_geometry(seed)
-    flight = record(v, seed=seed, n=N if stand else 2000, dt=1.0 / rate, stand=stand)
+    flight = record(v, seed=seed, n=N if stand else 4000, dt=1.0 / rate, stand=stand)
     model = models.roll_on_stand if stand else models.roll
     found = fit(Problem(model, vehicle(v), [flight], started(v)))
     assert found.status == "converged"

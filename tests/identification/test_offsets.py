@@ -16,7 +16,7 @@ from heli_jax.naming import Scalar
 from tests.identification.bench import BENCH, amplitude_for, response, steps, vehicle
 
 FREE = {"Ixx": Free(0.05), "If": Free(5e-4)}
-DT, N = 0.02, 2000
+DT, N = 0.02, 4000
 
 
 def flown(seed: int, share: float) -> tuple[Flight, float]:

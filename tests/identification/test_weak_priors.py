@@ -143,7 +143,7 @@ def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
 def test_what_no_output_shows_does_no_harm():
     """The free roll of the paper: bias and initial angle are one; on the stand they are two."""
     for model, stand in ((models.roll, False), (models.roll_on_stand, True)):
-        flight = record(BENCH, seed=3, n=1000 if stand else 2000, stand=stand)
+        flight = record(BENCH, seed=3, n=1000 if stand else 4000, stand=stand)
         free = {"Ixx": Free(0.03), "If": Free(2e-4)}
         verdict = check(Problem(model, vehicle(BENCH), [flight], free)).verdict
         assert verdict.identifiable
