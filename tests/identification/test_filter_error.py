@@ -147,7 +147,7 @@ def test_outputs_of_different_quality_get_each_its_noise(bench30):
 
 def test_the_extended_filter_finds_a_nonlinear_machine(bench30):
     """Truth by Euler-Maruyama in NumPy; the stand's spring is a sine."""
-    n, fine = 800, 40
+    n, fine = 1500, 40
     A, B, *_ = (np.asarray(m) for m in matrices(BENCH, True))
     A = A.copy()
     A[1, 0] = 0.0
