@@ -8,7 +8,7 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.simulated_flights import simulated_at
+from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -82,11 +82,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     """
     z = start_vector(layout, data, problem)
     at_start = jax.device_get(simulated_at(layout, data, z))
-    bias = iter(at_start.biases)
-    simulated = [
-        {n: y + next(bias) for n, y in zip(names, run, strict=True)}
-        for run, names in zip(at_start.outputs, layout.outputs, strict=True)
-    ]
+    simulated = with_biases(layout, at_start)
     scaled, names = [], naming.names(layout.model.State)
     for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}

@@ -37,8 +37,8 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
     none = without_disturbance(search, optimum)
     alone = evaluate(layout, data, none.noise, none.best.z)
     if bool(np.isfinite(alone.r).all()) and not _corrects(alone, none.noise):
-        without = log_likelihood_of(search, none)
-        ratio = 2.0 * (log_likelihood_of(search, optimum) - without)
+        without = layout.estimator.log_likelihood(layout, data, none.noise, alone)
+        ratio = 2.0 * (layout.estimator.log_likelihood(layout, data, optimum.noise, e) - without)
         if not ratio > NO_DISTURBANCE:
             optimum, ratio = _from_nested(search, optimum, ratio, none, without)
         if bool(none.best.converged) and not ratio > NO_DISTURBANCE:

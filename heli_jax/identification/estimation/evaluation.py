@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.levenberg_marquardt import slopes
-from heli_jax.identification.estimation.simulated_flights import simulated_at
+from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
 _TAKES_PART = 1e-3
@@ -20,29 +20,20 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     at = slopes(layout, data, noise, z)
     shown = simulated_at(layout, data, z) if at.shown is None else at.shown
     found = jax.device_get((shown, at.innovations, at.r, at.J, *_named(layout, data, z)))
-    (outputs, biases, rms), *rest = found
-    bias = iter(biases)
-    simulated = tuple(
-        {n: y + next(bias) for n, y in zip(names, run, strict=True)}
-        for run, names in zip(outputs, layout.outputs, strict=True)
-    )
+    outputs, *rest = found
+    simulated = with_biases(layout, outputs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
     )
-    return Evaluation(simulated, raw, rms, *rest)
+    return Evaluation(simulated, raw, outputs.state_rms, *rest)
 
 
 def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
     """By flight and output the simulation (N,) with the bias, SI."""
-    outputs, biases, _ = jax.device_get(simulated_at(layout, data, z))
-    bias = iter(biases)
-    return tuple(
-        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
-        for run, names in zip(outputs, layout.outputs, strict=True)
-    )
+    return with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
 @eqx.filter_jit

@@ -21,7 +21,6 @@ from heli_jax.identification.estimation.estimator import (
     Residuals,
     measured_count,
     measured_signals,
-    signal_numbers,
     signals,
 )
 from heli_jax.identification.estimation.evaluation import evaluate
@@ -66,10 +65,6 @@ class FilterError(Estimator):
         """The innovations over their sd, and what makes their Jacobian Fisher's information."""
         by_flight = filtered_flights(layout, data, noise, u)
         return Residuals(_likelihood_rows(layout, data, noise, by_flight), None, by_flight)
-
-    def row_signals(self, layout: Layout, data: Data) -> np.ndarray:
-        """The innovations' rows; what follows belongs to all signals."""
-        return signal_numbers(layout, data)
 
     def one_program(self, layout: Layout) -> bool:
         """A filter takes longer to evaluate than a step to be called for."""

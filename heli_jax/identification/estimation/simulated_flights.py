@@ -148,3 +148,16 @@ def simulated_at(layout: Layout, data: Data, z: Array) -> SimulatedOutputs:
     """What is simulated at z, without any derivative."""
     u = unpack(layout, data, z)
     return shown_of(u, predict(layout, data, u))
+
+
+def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
+    """By flight and output what is simulated, (N,), with the bias, SI.
+
+    Args:
+        simulated: as NumPy arrays.
+    """
+    bias = iter(simulated.biases)
+    return tuple(
+        {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
+        for run, names in zip(simulated.outputs, layout.outputs, strict=True)
+    )
