@@ -97,6 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     info = command("info", _info, "signals, rates, duration and gaps of a log")
     info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
     info.add_argument("--time", metavar="NAME", help="the column of time stamps")
+    new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
+    new_model.add_argument("name", metavar="NAME", help="of the model and its module")
+    new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
     return parser
 
 
@@ -295,6 +298,19 @@ def _info(options: argparse.Namespace) -> int:
     from heli_jax.flights import describe_log
 
     output.print_info(describe_log(options.log, options.time))
+    return DONE
+
+
+def _new_model(options: argparse.Namespace) -> int:
+    from heli_jax.new_model import write_skeleton
+
+    written = write_skeleton(options.name, options.out)
+    for path in written:
+        print(path)
+    _say(
+        f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
+        f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"
+    )
     return DONE
 
 
