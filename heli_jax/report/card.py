@@ -15,6 +15,7 @@ from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.report import frequency
 from heli_jax.report.coherence import COHERENT, Coherence, coherences
+from heli_jax.report.frequency import FittedFlight
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -164,7 +165,7 @@ def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
     for s, flight in zip(fit.signals, flights, strict=False):
         here = {n: jnp.asarray(v) for n, v in flight.known.items()}
         params = naming.replace(fit.params, **here)
-        at = frequency.at_record(problem.model, params, s, fit)
+        at = frequency.at_record(FittedFlight(problem.model, params, fit, s))
         for (u, y), found in coherences(problem.model, params, at, s, fit).items():
             lines.append(_of_coherence(f"{u} to {y}, {s.flight}", found))
     return lines

@@ -15,6 +15,7 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
 from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
@@ -111,7 +112,8 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
     known = problem.training[i].known if i < len(problem.training) else {}
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    return _drawing(figures.bode, problem.model, params, fit, baseline, fit.signals[i])
+    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
+    return _drawing(figures.bode, flight, baseline)
 
 
 def render(
