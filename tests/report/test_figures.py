@@ -175,11 +175,11 @@ def test_bode_s_legend_title_and_subtitle_have_rows_of_their_own(sound):
     flight = FittedFlight(problem.model, fit.params, fit, fit.signals[0])
     with matplotlib.rc_context(style.STYLE):
         ax = figures.bode(flight, baseline)[0]
-        renderer = ax.figure.canvas.get_renderer()
+        ax.figure.canvas.draw()  # only now texts have their places
         [note] = [t for t in ax.texts if "record" in t.get_text()]
         # From below; the legend's words, for its box has an unseen margin.
         rows = [*ax.get_legend().get_texts()[:1], note, ax._left_title]
-        extents = [row.get_window_extent(renderer) for row in rows]
+        extents = [row.get_window_extent() for row in rows]
     assert ax.bbox.y1 < extents[0].y0
     for lower, upper in itertools.pairwise(extents):
         assert lower.y1 < upper.y0
