@@ -11,7 +11,7 @@ import pytest
 from heli_jax import numbers
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import tables
-from heli_jax.report.html import write_report
+from heli_jax.report.html import Analysis, write_report
 from heli_jax.vehicle import Constant
 from tests.report.conftest import SCRIPT
 
@@ -34,7 +34,8 @@ class Links(HTMLParser):
 def page(made, folder, **changes):
     fit, problem, baseline = made
     fit = dataclasses.replace(fit, **changes)
-    names = write_report(folder, fit, problem, baseline, f"bench {SCRIPT}", CONSTANTS)
+    analysis = Analysis(fit, problem, baseline)
+    names = write_report(folder, analysis, f"bench {SCRIPT}", CONSTANTS)
     return (folder / "report.html").read_text(encoding="utf-8"), names
 
 
@@ -128,7 +129,7 @@ def test_coloured_residuals_are_announced_before_the_numbers(sound, tmp_path):
 def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     fit, problem, _ = sound
     fit = dataclasses.replace(fit, status="not-converged", starts=fit.starts[:1])
-    names = write_report(tmp_path, fit, problem, None, "bench", {})
+    names = write_report(tmp_path, Analysis(fit, problem), "bench", {})
     assert "rls" not in names
     assert "starts" not in names
     text = words((tmp_path / "report.html").read_text(encoding="utf-8"))
