@@ -66,7 +66,7 @@ def write_report(
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
-    # One after the other: a figure's canvas and its SVG are let go before the next is drawn.
+    # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
         saved = style.save(draw, folder / name)
         if saved is not None:
@@ -89,7 +89,6 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     if supplementary.intervals is not None:
         drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
     shown = fit.signals[:MOST_FLIGHTS]
-    # The names' parts are numbered over all flights: they stay where more flights are shown.
     for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
         for output in s.measured:
             drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LIMIT_BYTES = 1_000_000_000
+"""of each file: more is none that a fit wrote, and would fill the memory"""
 
 
 class SavedFit(NamedTuple):
@@ -77,6 +78,7 @@ def load_fit(directory: str | Path) -> SavedFit:
     directory = Path(directory)
     content = _content(directory / "fit.json")
     try:
+        # Fixed ones are listed for who looks for them; they are no estimates.
         estimates = {
             n: _estimate(e) for n, e in content["parameters"].items() if not e.get("fixed", False)
         }
@@ -97,7 +99,7 @@ def load_fit(directory: str | Path) -> SavedFit:
             notes=tuple(content["notes"]),
             content=content,
         )
-    except (KeyError, TypeError, AttributeError) as e:
+    except (KeyError, TypeError, AttributeError) as e:  # a key is missing, or holds another kind
         raise InputError(
             f"{directory / 'fit.json'}: expected what heli-jax fit writes, got a file without a "
             f"usable {e}"
@@ -157,6 +159,7 @@ def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:
         raise InputError(f"{path}: expected the columns flight and time, got {head[:2]}")
+    # Flights lie one after the other; rows are told apart by name and not by place.
     for line in lines:
         rows.setdefault(line[0], []).append(line[1:])
     return tuple(
@@ -171,6 +174,7 @@ def _flight(
     table = np.array([[float(c) if c else math.nan for c in row] for row in cells])
     # A flight without some signal has an empty column there.
     columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
+    # What belongs to no output is an input: the file does not say which columns are.
     of_outputs = {f"{o}_{w}" for o in outputs for w in _OF_AN_OUTPUT}
     inputs = {n: v for n, v in columns.items() if n != "time" and n not in of_outputs}
     measured, simulated, _, innovations = (
