@@ -17,11 +17,12 @@ _SMALLEST = 0.1
 _AROUND = 16
 """corners of what is round"""
 _DIGITS = 4
-"""of a coordinate [m]: a tenth of a millimetre; every further one makes the page a tenth larger"""
+"""of a coordinate [m]: a tenth of a millimetre is more than a screen shows"""
 _LIGHT = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.1}
 _VIEWS = {
     "from the side": {"x": 0.3, "y": -1.9, "z": 0.5},
     "from behind": {"x": -1.9, "y": 0.0, "z": 0.6},
+    # Not straight from above: there plotly cannot tell which way is up.
     "from above": {"x": -0.01, "y": 0.0, "z": 2.3},
     "three-quarter": {"x": -1.3, "y": -1.3, "z": 0.9},
 }
@@ -212,6 +213,7 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
         "aspectratio": dict(zip("xyz", np.round(ratio, 5).tolist(), strict=True)),
         "camera": {"eye": _VIEWS["three-quarter"]},
         "dragmode": "orbit",
+        # A constant: what the reader has turned stays so while frames are played.
         "uirevision": "kept",
     }
     titles = {"x": "x forward [m]", "y": "y to the right [m]", "z": "height z [m]"}
@@ -225,7 +227,7 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
             "zeroline": False,
             **(mirrored if name == "y" else {"nticks": 7}),
         }
-    # Without transitions: plotly would turn the machine's corners along straight lines.
+    # Without transitions: a frame is a moment of the run, and nothing was computed between two.
     at_once = {"mode": "immediate", "transition": {"duration": 0}}
     # redraw: meshes do not move without.
     play = {**at_once, "frame": {"duration": pace, "redraw": True}, "fromcurrent": True}

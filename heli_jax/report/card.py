@@ -53,23 +53,21 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     # With process noise estimated, a simulation departs from the record even with the true
     # parameters: the gates apply to the prediction one step ahead, and the simulation informs.
     filtered = estimator.process_noise
-    for name, m in fit.metrics.items():
-        lines += _of_agreement(name, m, "simulated", judged=not filtered)
-    for name, m in fit.one_step.items():
-        lines += _of_agreement(name, m, "one step ahead", judged=True)
-    for name, m in fit.validation.items():
-        lines += _of_agreement(name, m, "held out, simulated", judged=not filtered)
-    for name, m in fit.one_step_validation.items():
-        lines += _of_agreement(name, m, "held out, one step ahead", judged=True)
+    sources = (
+        (fit.metrics, "simulated", not filtered),
+        (fit.one_step, "one step ahead", True),
+        (fit.validation, "held out, simulated", not filtered),
+        (fit.one_step_validation, "held out, one step ahead", True),
+    )
+    for metrics, source, judged in sources:
+        for name, m in metrics.items():
+            lines += _of_agreement(name, m, source, judged=judged)
     for output in fit.adequacy.judged:
         if output.against_disturbance is not None:
             remark = "a simulation knows no disturbance: compared with what the estimated one makes"
             of, ratio = f"{output.output}, simulated", output.against_disturbance
             lines.append(_most("error power over expected", of, ratio, "", EXPECTED, remark))
-    what = f"whiteness of {estimator.errors} (p)"
-    for name, w in fit.whiteness.items():
-        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
-        lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
+    lines += _of_whiteness(fit, f"whiteness of {estimator.errors} (p)")
     lines += _of_excitation(problem, fit)
     return tuple(lines)
 
@@ -160,6 +158,14 @@ def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[G
         return lines
     remark = "a simulation does not know the disturbance: see its error over what is expected"
     return [line._replace(gate="", passed=None, remark=remark) for line in lines]
+
+
+def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
+    lines = []
+    for name, w in fit.whiteness.items():
+        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
+        lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
+    return lines
 
 
 def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:

@@ -64,6 +64,7 @@ def coherences(
     """
     dt = float(signals.times[1] - signals.times[0])
     memory = frequency.memory(model, params, at, dt * signals.times.size)
+    # One that stands still explains nothing, and its rounding would count as an input to take out.
     moving = [n for n, u in signals.inputs.items() if np.std(u) > 0]
     results: dict[tuple[str, str], Coherence | str] = {
         (u, y): "the input does not move"
@@ -82,6 +83,7 @@ def coherences(
         for u in moving:
             j = naming.names(model.Inputs).index(u)
             H = _sampled(matrices, i, j, dt, record.omega)
+            # What the model expects of the input as it was logged.
             H = H * frequency.nuisance_factor(fit, u, record.omega)
             results[u, y] = _coherence(record, moving.index(u), H)
     return results
@@ -138,8 +140,10 @@ def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
     power = np.sum(np.abs(alone) ** 2, axis=1)
     # The power that the output owes to this input: where the model expects no response, noise may
     # have its way, and a plain mean over frequencies would be that of the noise.
+    # Infinite where a pole lies on the unit circle at one of the frequencies: that one is left out.
     weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
     total = float(np.sum(np.abs(record.simulated) ** 2))
+    # By Parseval the sums over frequencies are powers, with the same factor above and below.
     share = float(np.sum(weights)) / total if total > 0 else 0.0
     # The simulated output has neither noise nor disturbance: its coherence is what could be seen.
     value, expected = (

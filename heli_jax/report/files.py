@@ -63,11 +63,7 @@ def fit_json(
             },
             "nuisance": {n: _parameter(e) for n, e in fit.nuisance.items()},
             "noise_sd": fit.noise,
-            "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
-            "validation": {n: m._asdict() for n, m in fit.validation.items()},
-            "validation_free_run": {n: m._asdict() for n, m in fit.validation_free_run.items()},
-            "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
-            "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
+            **_metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
             "intervals": _intervals(supplementary.intervals),
@@ -75,6 +71,7 @@ def fit_json(
             "unknowns": fit.unknowns,
             "aic": fit.aic,
             "bic": fit.bic,
+            # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
             "baseline_rls": _baseline(baseline),
@@ -88,6 +85,16 @@ def fit_json(
             "seed": fit.seed,
         }
     )
+
+
+def _metrics(fit: Fit) -> dict[str, Any]:
+    return {
+        "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
+        "validation": {n: m._asdict() for n, m in fit.validation.items()},
+        "validation_free_run": {n: m._asdict() for n, m in fit.validation_free_run.items()},
+        "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
+        "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
+    }
 
 
 def _adequacy(adequacy: Adequacy) -> dict[str, Any]:
@@ -234,6 +241,7 @@ def _holds(flight: Flight) -> dict[str, dict[str, str]]:
 
 
 def _source(flight: Flight) -> dict[str, Any]:
+    # A flight that was given in memory: `null`, so that nobody looks for a file.
     if flight.source is None:
         return {"path": None, "sha256": None, "flight": flight.name}
     return {
@@ -283,14 +291,16 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
             for what in ("measured", "simulated", "residual", "innovation")
             if (what != "innovation" or s.innovations is not None) and f"{n}_{what}" not in names
         ]
-    parts = []
-    for s in signals:
-        columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
-        for output, measured in s.measured.items():
-            columns[f"{output}_measured"] = measured
-            columns[f"{output}_simulated"] = s.simulated[output]
-            columns[f"{output}_residual"] = s.residual(output)
-            if s.innovations is not None:
-                columns[f"{output}_innovation"] = s.innovations[output]
-        parts.append(columns)
-    write_table(path, stacked(parts, names))
+    write_table(path, stacked([_columns(s) for s in signals], names))
+
+
+def _columns(s: Signals) -> dict[str, Any]:
+    """The columns of one flight by their names."""
+    columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
+    for output, measured in s.measured.items():
+        columns[f"{output}_measured"] = measured
+        columns[f"{output}_simulated"] = s.simulated[output]
+        columns[f"{output}_residual"] = s.residual(output)
+        if s.innovations is not None:
+            columns[f"{output}_innovation"] = s.innovations[output]
+    return columns

@@ -133,18 +133,25 @@ def responses(
     both[:n, :n], both[:n, n] = A, B[:, j]
     held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
 
-    def along(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-        if not np.isfinite(A).all():
-            return np.full(points.shape, np.nan, complex)
-        # A system of equations at each frequency: the polynomials of a transfer function lose
-        # digits with every further state.
-        x = np.linalg.solve(points[:, None, None] * np.eye(n) - A, b[None, :, None])
-        return (C[i] @ x)[:, 0] + D[i, j]
+    def response(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return _transfer(points, A, b, C[i], D[i, j])
 
     return (
-        lambda omega: along(1j * omega, A, B[:, j]),
-        lambda omega: along(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
+        lambda omega: response(1j * omega, A, B[:, j]),
+        lambda omega: response(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
     )
+
+
+def _transfer(
+    points: np.ndarray, A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float
+) -> np.ndarray:
+    """c (s I - A)^-1 b + d (k,) at points s (k,); NaN where A is not finite."""
+    if not np.isfinite(A).all():
+        return np.full(points.shape, np.nan, complex)
+    # A system of equations at each frequency: the polynomials of a transfer function lose digits
+    # with every further state.
+    x = np.linalg.solve(points[:, None, None] * np.eye(len(A)) - A, b[None, :, None])
+    return (c @ x)[:, 0] + d
 
 
 def memory(

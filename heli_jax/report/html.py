@@ -25,7 +25,7 @@ MOST_FLIGHTS = 6
 
 
 _GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
-"""what figures' names begin with: the template asks for them by it"""
+# The template asks for figures by what their names begin with: no group may begin another's name.
 
 
 class Analysis(NamedTuple):
@@ -120,6 +120,7 @@ def _parts(flights: list[str]) -> list[str]:
 
 
 def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
+    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
     def draw() -> Figure | None:
         axes = function(*args, **options)
         return axes[0].figure if axes else None  # type: ignore[return-value]
@@ -129,6 +130,7 @@ def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any
 
 def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     """The frequency response of the flight that the baseline saw, with what is known of it."""
+    # The first flight where there is no baseline.
     i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
     # What the flight states of the vehicle goes before the estimates, as in the fit.
     known = problem.training[i].known if i < len(problem.training) else {}

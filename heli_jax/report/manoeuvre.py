@@ -62,10 +62,12 @@ def sticks(run: Trajectory, model: Model, *, figure: Figure | None = None) -> Pa
     groups = _by_unit(model.Inputs, list(naming.names(model.Inputs)))
     rotor = _APART in naming.names(model.Outputs)
     axes = _panels(len(groups) + rotor, figure)
+    # strict=False: the last of the axes is the rotor's, which is an output.
     for ax, (unit, names) in zip(axes, groups, strict=False):
         values = {n: np.asarray(getattr(run.inputs, n)) for n in names}
         if unit == "m":
             unit, values = _short(values)
+        # Held from its sample to the next, as the simulation has it.
         _lines(ax, run.times, values, drawstyle="steps-post")
         kind = "wind" if names[0].startswith("wind") else "sticks"
         ax.set_ylabel(style.label(kind if len(names) > 1 else names[0], unit))

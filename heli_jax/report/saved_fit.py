@@ -134,6 +134,7 @@ def _intervals(
     estimates: Mapping[str, Estimate], saved: Mapping[str, Any] | None
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """By parameter and method; the Gaussian ones alone where no others were asked for."""
+    # null in fit.json where no other method was asked for: the estimates hold the Gaussian ones.
     if saved is not None:
         return {
             name: {method: (_number(ends[0]), _number(ends[1])) for method, ends in by.items()}
@@ -149,12 +150,14 @@ def _intervals(
 def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
+    # An output may have been measured in the flights held out alone.
     outputs = [
         *content["metrics"],
         *(n for n in content["validation"] if n not in content["metrics"]),
     ]
     rows: dict[str, list[list[str]]] = {}
     text = read_regular(path, "the signals.csv of a run directory", _LIMIT_BYTES).decode("utf-8")
+    # A reader, not split(","): flights' names come from files and may hold commas.
     lines = csv.reader(text.splitlines())
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:

@@ -34,6 +34,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    # Powers of ten only below 0.001 and from 10000 on.
     "axes.formatter.limits": (-3, 4),
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
@@ -55,6 +56,7 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
     # Without a salt the ids in an SVG are random, and two runs of one fit differ in every figure.
     "svg.hashsalt": "heli_jax",
+    # A fifth of a pixel: nobody sees it, and noisy lines lose many of their points.
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
@@ -73,7 +75,8 @@ _DPI = 110
 
 
 def figure(height: float, width: float = WIDTH) -> Figure:
-    """An empty figure with its own canvas; no pyplot, no global state."""
+    """An empty figure with its own canvas."""
+    # Without pyplot, which keeps every figure alive in a global list, and is not for threads.
     drawing = Figure(figsize=(width, height))
     FigureCanvasAgg(drawing)
     return drawing
@@ -191,6 +194,7 @@ def plain_log_ticks(axis: Axis) -> None:
     subs = (1.0, 2.0, 5.0) if high < 3e3 * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    # Ticks without labels between 1, 2 and 5 would be taken for a linear division.
     axis.set_minor_locator(NullLocator())
 
 

@@ -101,7 +101,6 @@ def _good(run: Trajectory) -> np.ndarray:
 def _finite(run: Trajectory) -> Trajectory:
     """The run up to where it ceases to be finite; two samples at least."""
     good = _good(run)
-    # Two, for what is drawn takes its sample time and its limits from them.
     return run if good.all() else run.first(max(2, int(np.argmin(good))))
 
 
@@ -132,10 +131,12 @@ def _flight(run: Trajectory, params: Any, number: int, first: bool) -> markupsaf
         config=_SETTINGS,
         include_plotlyjs=first,
         full_html=False,
+        # Several flights on a page would else all begin at once.
         auto_play=False,
         default_height="620px",
         # Its checks take seconds; a test holds that the figure is one of plotly's.
         validate=False,
+        # plotly's own ids are random; the same run shall give the same page.
         div_id=f"flight{number}",
     )
     return markupsafe.Markup(text)

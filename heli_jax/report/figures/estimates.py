@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.result import Fit, StartRow
 from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.style import legend_above, subtitle
@@ -27,24 +28,31 @@ def correlation_matrix(verdict: Verdict, *, figure: Figure | None = None) -> Pan
     # Two colours of equal weight, told apart with every common kind of colour blindness.
     ax.pcolormesh(r, cmap="PuOr", vmin=-1.0, vmax=1.0, edgecolors="white", linewidth=1.5)
     ax.set_aspect("equal")
+    _name_cells(ax, names)
+    _write_correlations(ax, r)
+    ax.set_title("Correlation of the estimates", loc="left")
+    if verdict.undetermined:
+        subtitle(ax, "directions that are not identifiable are left out")
+    return (ax,)
+
+
+def _name_cells(ax: Axes, names: tuple[str, ...]) -> None:
     # The first parameter on top, as a matrix is read; pcolormesh counts from below.
     ax.invert_yaxis()
-    centres = np.arange(n) + 0.5
+    centres = np.arange(len(names)) + 0.5
     ax.set_xticks(centres, names, rotation=35 if max(map(len, names)) > 4 else 0)
     ax.set_yticks(centres, names)
     ax.grid(visible=False)
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
-    size = 8.5 if n < 9 else 6.0
-    for i in range(n):
-        for j in range(n):
-            color = "white" if abs(r[i, j]) > 0.6 else "black"  # to be read on a dark cell
-            text = _correlation(float(r[i, j]), i == j)
-            ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
-    ax.set_title("Correlation of the estimates", loc="left")
-    if verdict.undetermined:
-        subtitle(ax, "directions that are not identifiable are left out")
-    return (ax,)
+
+
+def _write_correlations(ax: Axes, r: np.ndarray) -> None:
+    size = 8.5 if len(r) < 9 else 6.0
+    for (i, j), value in np.ndenumerate(r):
+        color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
+        text = _correlation(float(value), i == j)
+        ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
 
 
 def _correlation(r: float, diagonal: bool) -> str:
@@ -83,6 +91,7 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> 
         ax.margins(y=0.25)
         style.plain_log_ticks(ax.yaxis)
     else:
+        # More room above, where the optima's names stand.
         middle = 0.5 * (top + low)
         ax.set_ylim(middle - 0.9 * span, middle + 1.1 * span)
         # The cost itself, not its difference from a number that stands elsewhere on the axis.
@@ -158,13 +167,7 @@ def intervals(comparison: Intervals, fit: Fit, *, figure: Figure | None = None) 
                 ax.plot(by_method[m], [-k, -k], "|-", color=_METHODS[m][1], lw=2.2, ms=9)
         ax.axvline(estimate.value, color=style.GREY, lw=0.8, ls=":")
         if name in comparison.profiles:
-            profile = comparison.profiles[name]
-            # A deviance of 9 is three standard deviations: further out lies what sets no interval.
-            near = profile.deviance < 9.0
-            # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.
-            fall = 1.0 - np.exp(-0.5 * profile.deviance[near])
-            height = 0.2 - (len(present) - 1) * fall
-            ax.plot(profile.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)
+            _draw_likelihood(ax, comparison.profiles[name], len(present))
         ax.set_yticks([-k for k in range(len(present))], [_METHODS[m][0] for m in present])
         ax.tick_params(axis="y", labelleft=name == names[0])
         ax.set_ylim(-len(present) + 0.4, 0.6)
@@ -172,3 +175,11 @@ def intervals(comparison: Intervals, fit: Fit, *, figure: Figure | None = None) 
         ax.set_xlabel(style.label(name, estimate.unit))
     axes[0].set_title("95 % intervals", loc="left")
     return tuple(axes)
+
+
+def _draw_likelihood(ax: Axes, profile: Profile, rows: int) -> None:
+    # A deviance of 9 is three standard deviations: further out lies what sets no interval.
+    near = profile.deviance < 9.0
+    # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.
+    height = 0.2 - (rows - 1) * (1.0 - np.exp(-0.5 * profile.deviance[near]))
+    ax.plot(profile.values[near], height, color=style.VERMILLION, lw=0.8, alpha=0.6)

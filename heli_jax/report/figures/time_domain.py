@@ -1,6 +1,7 @@
 """Figures over time: an output with its residual and inputs, and the coefficients of the RLS."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heli_jax import naming
@@ -70,16 +71,7 @@ def rls_history(baseline: Baseline, *, figure: Figure | None = None) -> Panels:
         (axes[1], range(n, history.shape[1]), [f"b{i}" for i in range(history.shape[1] - n)]),
     )
     for ax, columns, names in groups:
-        ax.set_ylim(*_settled_range(history[:, list(columns)]))
-        for k, (column, name) in enumerate(zip(columns, names, strict=True)):
-            dashes = "-" if k < len(style.CYCLE) else "--"
-            color = style.CYCLE[k % len(style.CYCLE)]
-            # The first samples, with P(0) = 1e12 I, throw coefficients over many powers of ten.
-            inside = np.clip(history[:, column], *_widened(ax.get_ylim()))
-            line(ax, t, inside, color=color, ls=dashes, label=name)
-        ax.legend(
-            loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0
-        )
+        _draw_coefficients(ax, t, history[:, list(columns)], names)
     axes[0].set_title(f"RLS coefficients over the record, order {n}", loc="left")
     subtitle(
         axes[0], f"{baseline.input} to {baseline.output}; scaled to the second half of the record"
@@ -90,6 +82,19 @@ def rls_history(baseline: Baseline, *, figure: Figure | None = None) -> Panels:
     axes[1].set_xlabel("time [s]")
     axes[0].set_xlim(0.0, max(t[-1], baseline.dt))
     return axes
+
+
+def _draw_coefficients(ax: Axes, t: np.ndarray, values: np.ndarray, names: list[str]) -> None:
+    """Columns of values (N, k) over t (N,), by their names."""
+    ax.set_ylim(*_settled_range(values))
+    for k, name in enumerate(names):
+        # A high order has more coefficients than the palette has colours.
+        dashes = "-" if k < len(style.CYCLE) else "--"
+        color = style.CYCLE[k % len(style.CYCLE)]
+        # The first samples, with P(0) = 1e12 I, throw coefficients over many powers of ten.
+        inside = np.clip(values[:, k], *_widened(ax.get_ylim()))
+        line(ax, t, inside, color=color, ls=dashes, label=name)
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0)
 
 
 def _settled_range(values: np.ndarray) -> tuple[float, float]:

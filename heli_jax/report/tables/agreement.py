@@ -16,6 +16,7 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
     """The same metrics for fit, held-out flights and RLS, output by output."""
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
     rows = []
+    # An output may have been measured in the flights held out alone.
     for output in dict.fromkeys([*fit.metrics, *fit.validation]):
         if output in fit.metrics:
             rows.append(_agreement(output, "fit, simulated", fit.metrics[output]))
@@ -32,6 +33,7 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
             one_step = fit.one_step_validation[output]
             rows.append(_agreement(output, "held out, one step ahead", one_step))
         if baseline is not None and baseline.output == output:
+            # With its flight, since it saw that one alone and the fit all.
             rows.append(_agreement(output, f"RLS ({baseline.flight})", baseline.metrics))
     return Table(head, rows)
 
@@ -71,6 +73,7 @@ def acceptance(lines: tuple[Gate, ...]) -> Table:
 
 def residuals(fit: Fit, problem: Problem) -> Table:
     """Noise and whiteness of every flight and output."""
+    # strict=False: behind the signals of the fitted flights come those held out, without noise.
     stated = {
         f"{s.flight}/{name}": sd
         for s, f in zip(fit.signals, problem.training, strict=False)
@@ -89,6 +92,7 @@ def residuals(fit: Fit, problem: Problem) -> Table:
                 "yes" if w.white else "no",
                 number(w.p_value, 2),
                 percent(w.outside, 1),
+                # With a minus sign, not a hyphen, as everywhere on the page.
                 f"{w.lag1:+.3f}".replace("-", "−"),
             )
         )

@@ -92,23 +92,6 @@ def verdict(fit: Fit) -> Table:
     """The verdict's numbers at the start values and at the estimates."""
     before, after = fit.verdict_before, fit.verdict
     n = len(after.names)
-
-    def singular(v: Verdict) -> str:
-        return ", ".join(number(float(s), 3) for s in v.singular_values)
-
-    def pairs(v: Verdict) -> str:
-        # Five digits: beyond 0.99 it is the last ones that count.
-        cells = [f"{p.first}, {p.second}: {p.correlation:+.5f}" for p in v.pairs]
-        return "; ".join(cells).replace("-", "−") or "none"
-
-    def null(v: Verdict) -> str:
-        # Components below 0.005 would be printed as 0.00: the direction does not have them.
-        cells = [
-            ", ".join(f"{n} {x:+.2f}" for n, x in d.items() if abs(x) > 0.005)
-            for d in v.null_directions
-        ]
-        return "; ".join(cells).replace("-", "−") or "none"
-
     rows = [
         ("rank", f"{before.rank} of {n}", f"{after.rank} of {n}"),
         (
@@ -117,11 +100,34 @@ def verdict(fit: Fit) -> Table:
             f"{after.rank_without_priors} of {n}",
         ),
         ("condition number", number(before.condition, 3), number(after.condition, 3)),
-        ("singular values", singular(before), singular(after)),
-        ("strong pairs (correlation beyond 0.99)", pairs(before), pairs(after)),
-        ("directions that are not identifiable (log parameters)", null(before), null(after)),
+        ("singular values", _singular_values(before), _singular_values(after)),
+        ("strong pairs (correlation beyond 0.99)", _pairs(before), _pairs(after)),
+        (
+            "directions that are not identifiable (log parameters)",
+            _null_directions(before),
+            _null_directions(after),
+        ),
     ]
     return Table(("", "at the start values", "at the estimates"), rows)
+
+
+def _singular_values(v: Verdict) -> str:
+    return ", ".join(number(float(s), 3) for s in v.singular_values)
+
+
+def _pairs(v: Verdict) -> str:
+    # Five digits: beyond 0.99 it is the last ones that count.
+    cells = [f"{p.first}, {p.second}: {p.correlation:+.5f}" for p in v.pairs]
+    return "; ".join(cells).replace("-", "−") or "none"
+
+
+def _null_directions(v: Verdict) -> str:
+    # Components of up to 0.005 would be printed as 0.00: the direction does not have them.
+    cells = [
+        ", ".join(f"{n} {x:+.2f}" for n, x in d.items() if abs(x) > 0.005)
+        for d in v.null_directions
+    ]
+    return "; ".join(cells).replace("-", "−") or "none"
 
 
 def starts(fit: Fit) -> Table:

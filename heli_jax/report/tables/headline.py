@@ -40,6 +40,7 @@ def adequate(fit: Fit) -> str:
 def _determined(fit: Fit) -> Headline:
     """The status in words: what the data determine, and whether that may be believed."""
     v, names = fit.verdict, tuple(fit.estimates)
+    # Before all else: what is said at a point that is no optimum holds for that point alone.
     if fit.status == "not-converged":
         text = "the optimiser stopped before an optimum; the numbers below are where it stopped"
         return Headline("bad", "not converged", text)
@@ -48,11 +49,13 @@ def _determined(fit: Fit) -> Headline:
         text = f"the data do not determine {listed(missing or list(v.names))}"
         return Headline("bad", "converged, not identifiable", text)
     resting = bool(v.resting)
+    # The sentence must not credit the data with what a prior contributed.
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {listed(names)}"
     doubts = [
         ("the intervals are too narrow", fit.narrow),
         ("the residuals are not white", fit.coloured and not fit.white),
+        # Widened though each residual is white by itself: then several outputs err together.
         ("residuals of outputs are correlated", fit.coloured and fit.white),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
@@ -65,6 +68,7 @@ def _determined(fit: Fit) -> Headline:
 
 def warnings(fit: Fit) -> list[str]:
     """What a reader has to know before the numbers."""
+    # Whiteness first: the template takes the first one for it where residuals are not white.
     note = whiteness_note(fit)
     return ([note] if note else []) + list(fit.notes)
 

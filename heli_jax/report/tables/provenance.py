@@ -48,6 +48,7 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
 
 def _holds(flight: Flight) -> dict[str, str]:
     """By input what it is taken to do between samples, and why."""
+    # Only what was read off the log has a reason; the rest was stated in the configuration.
     return {
         n: f"{hold} ({flight.hold_reason.get(n, 'as stated')})" for n, hold in flight.hold.items()
     }
