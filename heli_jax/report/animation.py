@@ -227,6 +227,18 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
             "zeroline": False,
             **(mirrored if name == "y" else {"nticks": 7}),
         }
+    return {
+        "height": 620,
+        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
+        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
+        "scene": scene,
+        "uirevision": "kept",
+        **_controls(names, pace),
+    }
+
+
+def _controls(names: dict[str, str], pace: float) -> dict[str, Any]:
+    """Buttons that play and turn, and a slider over the frames."""
     # Without transitions: a frame is a moment of the run, and nothing was computed between two.
     at_once = {"mode": "immediate", "transition": {"duration": 0}}
     # redraw: meshes do not move without.
@@ -243,13 +255,9 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
         {"label": name, "method": "relayout", "args": [{"scene.camera": {"eye": eye}}]}
         for name, eye in _VIEWS.items()
     ]
+    # Both rows of buttons lie outside the scene: over it they would take the mouse from it.
     row = {"type": "buttons", "direction": "right", "yanchor": "top", "showactive": False}
     return {
-        "height": 620,
-        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
-        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
-        "scene": scene,
-        "uirevision": "kept",
         "updatemenus": [
             {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 30}},
             {**row, "buttons": views, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},

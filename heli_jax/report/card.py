@@ -62,11 +62,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     for metrics, source, judged in sources:
         for name, m in metrics.items():
             lines += _of_agreement(name, m, source, judged=judged)
-    for output in fit.adequacy.judged:
-        if output.against_disturbance is not None:
-            remark = "a simulation knows no disturbance: compared with what the estimated one makes"
-            of, ratio = f"{output.output}, simulated", output.against_disturbance
-            lines.append(_most("error power over expected", of, ratio, "", EXPECTED, remark))
+    lines += _of_disturbance(fit)
     lines += _of_whiteness(fit, f"whiteness of {estimator.errors} (p)")
     lines += _of_excitation(problem, fit)
     return tuple(lines)
@@ -158,6 +154,16 @@ def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[G
         return lines
     remark = "a simulation does not know the disturbance: see its error over what is expected"
     return [line._replace(gate="", passed=None, remark=remark) for line in lines]
+
+
+def _of_disturbance(fit: Fit) -> list[Gate]:
+    lines = []
+    for output in fit.adequacy.judged:
+        if output.against_disturbance is not None:
+            remark = "a simulation knows no disturbance: compared with what the estimated one makes"
+            of, ratio = f"{output.output}, simulated", output.against_disturbance
+            lines.append(_most("error power over expected", of, ratio, "", EXPECTED, remark))
+    return lines
 
 
 def _of_whiteness(fit: Fit, what: str) -> list[Gate]:

@@ -155,7 +155,13 @@ def label(name: str, unit: str | None) -> str:
 
 
 def subtitle(ax: Axes, text: str, *, raised: bool = False) -> None:
-    """A quiet line between the title and the axes; `raised` over a legend that lies there."""
+    """A quiet line between the title and the axes.
+
+    Args:
+        ax: where; it has its title.
+        text: of the line.
+        raised: whether it lies over a legend (`legend_above`), the title over both.
+    """
     row = _POINTS * ROW if raised else 0.0
     ax.set_title(ax.get_title("left"), loc="left", pad=19 + row)
     ax.annotate(

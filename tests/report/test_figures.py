@@ -141,12 +141,12 @@ def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
     from tests.identification.bench import BENCH, record
 
     flight = record(BENCH, seed=3, n=6000, noise=1e-5)
-    found = frequency.empirical(flight.inputs["x_roll"], flight.outputs["roll"], 0.02, 4.0)
-    assert isinstance(found, frequency.Empirical)
-    assert found.segments >= frequency.SEGMENTS
-    clear = (found.coherence > 0.9) & (found.omega > 2.0) & (found.omega < 10.0)
+    response = frequency.empirical(flight.inputs["x_roll"], flight.outputs["roll"], 0.02, 4.0)
+    assert isinstance(response, frequency.Empirical)
+    assert response.segments >= frequency.SEGMENTS
+    clear = (response.coherence > 0.9) & (response.omega > 2.0) & (response.omega < 10.0)
     _, sampled = frequency.responses(models.roll_on_stand, bench30, "roll", "x_roll", 0.02)
-    ratio = found.H[clear] / sampled(found.omega[clear])
+    ratio = response.H[clear] / sampled(response.omega[clear])
     assert clear.sum() > 5
     assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.1)
     assert np.median(np.degrees(np.angle(ratio))) == pytest.approx(0.0, abs=8.0)
@@ -166,8 +166,8 @@ def test_bode_says_why_the_record_is_missing(sound):
     s = s._replace(inputs={"x_roll": np.zeros_like(s.times)})
     axes = figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline)
     assert len(axes) == 2
-    said = " ".join(t.get_text() for t in axes[0].texts)
-    assert "no empirical response: the input does not move" in said
+    notes = " ".join(t.get_text() for t in axes[0].texts)
+    assert "no empirical response: the input does not move" in notes
 
 
 def test_bode_s_legend_title_and_subtitle_have_rows_of_their_own(sound):

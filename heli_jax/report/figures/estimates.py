@@ -86,16 +86,7 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> 
     if not ok.all():
         ax.plot(x[~ok], shown[~ok], "X", ms=7, color=style.VERMILLION, label="failed")
     _number_optima(ax, rows, x, shown)
-    if logarithmic:
-        ax.set_yscale("log")
-        ax.margins(y=0.25)
-        style.plain_log_ticks(ax.yaxis)
-    else:
-        # More room above, where the optima's names stand.
-        middle = 0.5 * (top + low)
-        ax.set_ylim(middle - 0.9 * span, middle + 1.1 * span)
-        # The cost itself, not its difference from a number that stands elsewhere on the axis.
-        ax.ticklabel_format(axis="y", useOffset=False)
+    _scale_cost(ax, 0.5 * (top + low), span, logarithmic=logarithmic)
     ax.set_xlim(0.4, len(rows) + 0.6)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=16))
     ax.set_xlabel("start, sorted by cost")
@@ -105,6 +96,18 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> 
         subtitle(ax, "starts that ended without a finite cost are drawn on top")
     legend_above(ax, raised=not finite.all())
     return (ax,)
+
+
+def _scale_cost(ax: Axes, middle: float, span: float, *, logarithmic: bool) -> None:
+    if logarithmic:
+        ax.set_yscale("log")
+        ax.margins(y=0.25)
+        style.plain_log_ticks(ax.yaxis)
+    else:
+        # More room above, where the optima's names stand.
+        ax.set_ylim(middle - 0.9 * span, middle + 1.1 * span)
+        # The cost itself, not its difference from a number that stands elsewhere on the axis.
+        ax.ticklabel_format(axis="y", useOffset=False)
 
 
 def _cost_range(cost: np.ndarray) -> tuple[float, float]:

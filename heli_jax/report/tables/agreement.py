@@ -5,7 +5,7 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
-from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.identification.validation.metrics import Metrics, Whiteness, diverges
 from heli_jax.numbers import NOTHING, number, percent
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.style import pretty
@@ -83,18 +83,13 @@ def residuals(fit: Fit, problem: Problem) -> Table:
     for name, w in fit.whiteness.items():
         output = name.rsplit("/", 1)[-1]  # a flight's name may hold slashes as well
         unit = pretty(naming.unit(problem.model.Outputs, output))
-        rows.append(
-            (
-                name,
-                number(fit.noise.get(name), 3),
-                number(stated.get(name), 3),
-                unit,
-                "yes" if w.white else "no",
-                number(w.p_value, 2),
-                percent(w.outside, 1),
-                # With a minus sign, not a hyphen, as everywhere on the page.
-                f"{w.lag1:+.3f}".replace("-", "−"),
-            )
-        )
+        sd = number(fit.noise.get(name), 3), number(stated.get(name), 3)
+        rows.append((name, *sd, unit, *_whiteness(w)))
     head = ("flight/output", "residual sd", "stated sd", "unit", "white", "p", "lags outside")
     return Table((*head, "at one sample"), rows)
+
+
+def _whiteness(w: Whiteness) -> tuple[str, ...]:
+    # With a minus sign, not a hyphen, as everywhere on the page.
+    lag1 = f"{w.lag1:+.3f}".replace("-", "−")
+    return ("yes" if w.white else "no", number(w.p_value, 2), percent(w.outside, 1), lag1)

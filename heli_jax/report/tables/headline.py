@@ -52,6 +52,15 @@ def _determined(fit: Fit) -> Headline:
     # The sentence must not credit the data with what a prior contributed.
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {listed(names)}"
+    doubtful = _doubts(fit)
+    if doubtful:
+        text += f", but {listed(doubtful)}"
+    return Headline("warning" if doubtful or resting else "good", "converged", text)
+
+
+def _doubts(fit: Fit) -> list[str]:
+    """What a reader has to know of estimates that are determined."""
+    v = fit.verdict
     doubts = [
         ("the intervals are too narrow", fit.narrow),
         ("the residuals are not white", fit.coloured and not fit.white),
@@ -60,10 +69,7 @@ def _determined(fit: Fit) -> Headline:
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
-    doubtful = [words for words, is_so in doubts if is_so]
-    if doubtful:
-        text += f", but {listed(doubtful)}"
-    return Headline("warning" if doubtful or resting else "good", "converged", text)
+    return [words for words, is_so in doubts if is_so]
 
 
 def warnings(fit: Fit) -> list[str]:
