@@ -60,10 +60,10 @@ class FitRun:
         Raises:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
-        from heli_jax.report.html import drawings  # matplotlib: slow
+        from heli_jax.report.html import Analysis, drawings  # matplotlib: slow
         from heli_jax.report.style import styled
 
-        draw = drawings(self.fit, self.problem, self.baseline, self.supplementary)
+        draw = drawings(Analysis(self.fit, self.problem, self.baseline, self.supplementary))
         figure = styled(draw[name]) if name in draw else None
         if figure is None:
             raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
@@ -254,7 +254,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     Raises:
         InputError: `out` exists or cannot be written to.
     """
-    from heli_jax.report.html import write_report as write_page  # matplotlib: slow
+    from heli_jax.report.html import Analysis  # matplotlib: slow
+    from heli_jax.report.html import write_report as write_page
 
     out = Path(out)
     run_directory.require_free(out)
@@ -265,7 +266,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         files.write_signals(folder / "signals.csv", run.fit.signals)
         started = time.perf_counter()
         title = run.config.path.stem
-        write_page(folder, run.fit, run.problem, run.baseline, title, vehicle.constants, extra)
+        analysis = Analysis(run.fit, run.problem, run.baseline, extra)
+        write_page(folder, analysis, title, vehicle.constants)
         run.fit.timing["report"] = time.perf_counter() - started
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)

@@ -15,26 +15,33 @@ _PATH_POINTS = 2000
 _SMALLEST = 0.1
 """rotor diameter over the length of the path: a smaller machine is drawn larger"""
 _AROUND = 16
+"""corners of what is round"""
 _DIGITS = 4
+"""of a coordinate [m]: a tenth of a millimetre is more than a screen shows"""
 _LIGHT = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.1}
 _VIEWS = {
     "from the side": {"x": 0.3, "y": -1.9, "z": 0.5},
     "from behind": {"x": -1.9, "y": 0.0, "z": 0.6},
+    # Not straight from above: there plotly cannot tell which way is up.
     "from above": {"x": -0.01, "y": 0.0, "z": 2.3},
     "three-quarter": {"x": -1.3, "y": -1.3, "z": 0.9},
 }
 
 type Points = Float[np.ndarray, "n 3"]
 
+# States and parameters are records of a model, which may be a user's own class: annotated Any.
+
 
 def frames_of(n: int) -> np.ndarray:
     """Which of n samples are shown: all, or at most `MOST_FRAMES` evenly among them."""
+    # Rounded, not truncated: the first and the last sample are among them.
     return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_FRAMES))).astype(int))
 
 
 def size_of(run: Trajectory, R: float) -> float:
     """How many times its size the machine is drawn, so that it can be seen on a long path."""
     path = _path(run.states)
+    # Whole numbers: the page says 'drawn 3 times its size'.
     length = float(np.max(np.ptp(path, axis=0)))
     return float(np.ceil(max(1.0, _SMALLEST * length / (2.0 * R))))
 
@@ -48,8 +55,13 @@ def attitude(states: Any) -> Rotation:
 def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
     """A shape in body axes (forward, right, down) in the figure: forward, left and up.
 
-    Those are right-handed, as a figure wants it; x, y and z, with y to the right, are not.
+    Args:
+        shape: points [m].
+        turn: of the body.
+        at: (3,) position of the body's origin in the figure [m].
     """
+    # Forward, left and up are right-handed, as plotly takes its axes to be; forward, right and up
+    # are not, and the machine would be its mirror image.
     return turn.apply(shape) * np.array([1.0, -1.0, -1.0]) + at
 
 
@@ -58,12 +70,14 @@ def animation(run: Trajectory, params: Any) -> dict[str, Any]:
 
     `run` is of a whole helicopter with NumPy arrays, `params` its Helicopter.
     """
+    # Plain data and not plotly's objects, which check every value of every frame: seconds.
     path, turns = _path(run.states), attitude(run.states)
     R = float(params.R)
     size = size_of(run, R)
     pod, disk, outline = (size * p for p in (_pod(R), _disk(params), _outline(params)))
     shown = frames_of(path.shape[0])
 
+    # The frames hold points alone: colours and faces stay those of the traces that they move.
     def moving(k: int) -> list[dict[str, Any]]:
         flown = path[shown[shown <= k]]
         parts = [placed(p, turns[k], path[k]) for p in (pod, disk, outline)]
@@ -75,7 +89,7 @@ def animation(run: Trajectory, params: Any) -> dict[str, Any]:
     shadow[:, 2] = bounds[0, 2] + 0.005 * np.ptp(bounds[:, 2])  # on the floor it would be cut
     still = np.unique(np.linspace(0, path.shape[0] - 1, _PATH_POINTS).astype(int))
     line = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "showlegend": False}
-    # Traces 2 to 5 are those that the frames move.
+    # Traces 2 to 5 are those that the frames move; shadow and path, 0 and 1, stay.
     first = moving(int(shown[0]))
     data = [
         {**line, **_xyz(shadow[still]), "line": {"color": "#C4C4C4", "width": 3}},
@@ -88,6 +102,7 @@ def animation(run: Trajectory, params: Any) -> dict[str, Any]:
     times = np.asarray(run.times)[shown]
     frames = [{"name": str(k), "data": moving(int(k)), "traces": [2, 3, 4, 5]} for k in shown]
     names = {f["name"]: f"{t:.2f}" for f, t in zip(frames, times, strict=True)}
+    # [ms], so that the flight is played as fast as it was flown.
     pace = 1000.0 * float(times[-1] - times[0]) / max(1, len(times) - 1)
     return {"data": data, "layout": _layout(bounds, names, pace), "frames": frames}
 
@@ -101,6 +116,7 @@ def _path(states: Any) -> Points:
 def _xyz(points: Points) -> dict[str, list[float | None]]:
     """Columns of a trace; NaN, which breaks a line, as None."""
     columns = np.round(points, _DIGITS).T.tolist()
+    # JSON has no NaN; v != v is true of NaN alone.
     return {
         name: [None if v != v else v for v in column]
         for name, column in zip("xyz", columns, strict=True)
@@ -129,6 +145,8 @@ def _pod(R: float) -> Points:
 
 
 def _pod_faces() -> np.ndarray:
+    # Points 0 and 1 are the ends, then ring by ring, as `_pod` lays them; two triangles for each
+    # field between two rings.
     faces, here, rings = [], np.arange(_AROUND), 5
     after = (here + 1) % _AROUND
     for ring in range(rings - 1):
@@ -153,6 +171,7 @@ def _disk_faces() -> np.ndarray:
 
 
 def _hub(p: Any) -> np.ndarray:
+    # Never within the fuselage, however little a vehicle's file says that it lies above.
     return np.array([-float(p.lr), 0.0, -max(float(p.hr), 0.3 * float(p.R))])
 
 
@@ -183,15 +202,18 @@ def _bounds(path: Points, margin: float) -> Float[np.ndarray, "2 3"]:
 
 def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str, Any]:
     """`names` are the frames' with their times as text, `pace` the time between two [ms]."""
+    # One scale for all three axes: attitude angles are to be seen as they are.
     spans = bounds[1] - bounds[0]
     ratio = spans / np.max(spans) * 1.5
     y = _ticks(-bounds[1, 1], -bounds[0, 1])
+    # The figure's axis points left: its labels say y to the right.
     mirrored = {"tickvals": (-y).tolist(), "ticktext": [f"{v:g}" for v in y]}
     scene: dict[str, Any] = {
         "aspectmode": "manual",
         "aspectratio": dict(zip("xyz", np.round(ratio, 5).tolist(), strict=True)),
         "camera": {"eye": _VIEWS["three-quarter"]},
         "dragmode": "orbit",
+        # A constant: what the reader has turned stays so while frames are played.
         "uirevision": "kept",
     }
     titles = {"x": "x forward [m]", "y": "y to the right [m]", "z": "height z [m]"}
@@ -205,7 +227,21 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
             "zeroline": False,
             **(mirrored if name == "y" else {"nticks": 7}),
         }
+    return {
+        "height": 620,
+        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
+        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
+        "scene": scene,
+        "uirevision": "kept",
+        **_controls(names, pace),
+    }
+
+
+def _controls(names: dict[str, str], pace: float) -> dict[str, Any]:
+    """Buttons that play and turn, and a slider over the frames."""
+    # Without transitions: a frame is a moment of the run, and nothing was computed between two.
     at_once = {"mode": "immediate", "transition": {"duration": 0}}
+    # redraw: meshes do not move without.
     play = {**at_once, "frame": {"duration": pace, "redraw": True}, "fromcurrent": True}
     jump = {**at_once, "frame": {"duration": 0, "redraw": True}}
     steps = [
@@ -219,13 +255,9 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
         {"label": name, "method": "relayout", "args": [{"scene.camera": {"eye": eye}}]}
         for name, eye in _VIEWS.items()
     ]
+    # Both rows of buttons lie outside the scene: over it they would take the mouse from it.
     row = {"type": "buttons", "direction": "right", "yanchor": "top", "showactive": False}
     return {
-        "height": 620,
-        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
-        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
-        "scene": scene,
-        "uirevision": "kept",
         "updatemenus": [
             {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 30}},
             {**row, "buttons": views, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},
@@ -241,6 +273,7 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
 
 def _ticks(low: float, high: float) -> np.ndarray:
     """About five round numbers between two."""
+    # 1, 2 or 5 times a power of ten, at most eight of them; + 0.0 turns -0 into 0.
     step = 10.0 ** np.floor(np.log10((high - low) / 5.0))
     step *= next(f for f in (1.0, 2.0, 5.0, 10.0) if (high - low) / (f * step) <= 7.0)
     return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1.0) + 0.0

@@ -15,6 +15,7 @@ from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.report import frequency
 from heli_jax.report.coherence import COHERENT, Coherence, coherences
+from heli_jax.report.frequency import FittedFlight
 
 CRAMER_RAO, INSENSITIVITY, COHERENCE = 20.0, 10.0, COHERENT
 """Tischler and Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -22,6 +23,7 @@ CORRELATION = 0.9
 """Klein and Morelli, Aircraft System Identification (2006)"""
 THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
+# Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
 
 
@@ -44,59 +46,55 @@ class Gate(NamedTuple):
 def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     """Every line: parameters, their relations, agreement, whiteness, excitation."""
     lines: list[Gate] = []
-    for name, one in fit.estimates.items():
-        lines += _of_parameter(name, one)
+    for name, estimate in fit.estimates.items():
+        lines += _of_parameter(name, estimate)
     lines += _of_relations(fit)
     estimator = estimator_of(fit.method)
+    # With process noise estimated, a simulation departs from the record even with the true
+    # parameters: the gates apply to the prediction one step ahead, and the simulation informs.
     filtered = estimator.process_noise
-    for name, m in fit.metrics.items():
-        lines += _of_agreement(name, m, "simulated", judged=not filtered)
-    for name, m in fit.one_step.items():
-        lines += _of_agreement(name, m, "one step ahead", judged=True)
-    for name, m in fit.validation.items():
-        lines += _of_agreement(name, m, "held out, simulated", judged=not filtered)
-    for name, m in fit.one_step_validation.items():
-        lines += _of_agreement(name, m, "held out, one step ahead", judged=True)
-    for one in fit.adequacy.judged:
-        if one.against_disturbance is not None:
-            said = "a simulation knows no disturbance: judged against what the estimated one makes"
-            of, ratio = f"{one.output}, simulated", one.against_disturbance
-            lines.append(_most("error power over expected", of, ratio, "", EXPECTED, said))
-    what = estimator.errors
-    for name, w in fit.whiteness.items():
-        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
-        gate = Gate(
-            f"whiteness of {what} (p)", name, w.p_value, "", "at least 0.01", w.white, remark
-        )
-        lines.append(gate)
+    sources = (
+        (fit.metrics, "simulated", not filtered),
+        (fit.one_step, "one step ahead", True),
+        (fit.validation, "held out, simulated", not filtered),
+        (fit.one_step_validation, "held out, one step ahead", True),
+    )
+    for metrics, source, judged in sources:
+        for name, m in metrics.items():
+            lines += _of_agreement(name, m, source, judged=judged)
+    lines += _of_disturbance(fit)
+    lines += _of_whiteness(fit, f"whiteness of {estimator.errors} (p)")
     lines += _of_excitation(problem, fit)
     return tuple(lines)
 
 
 def failed(lines: tuple[Gate, ...]) -> tuple[Gate, ...]:
     """The gates that are not passed."""
-    return tuple(one for one in lines if one.passed is False)
+    return tuple(gate for gate in lines if gate.passed is False)  # None passed nothing, nor failed
 
 
 def summary(lines: tuple[Gate, ...]) -> str:
     """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`."""
-    asked, lost = [one for one in lines if one.passed is not None], failed(lines)
-    text = f"{len(asked) - len(lost)} of {len(asked)} gates passed"
-    if lost:
-        text += "; failed: " + ", ".join(f"{one.what} of {one.of} ({shown(one)})" for one in lost)
+    asked, missed = [gate for gate in lines if gate.passed is not None], failed(lines)
+    text = f"{len(asked) - len(missed)} of {len(asked)} gates passed"
+    if missed:
+        words = (f"{gate.what} of {gate.of} ({shown(gate)})" for gate in missed)
+        text += "; failed: " + ", ".join(words)
     return text
 
 
-def shown(one: Gate) -> str:
+def shown(gate: Gate) -> str:
     """The value as text."""
-    if math.isnan(one.value):
+    if math.isnan(gate.value):
         return "none"
-    text = f"{one.value:.3g}"
-    return f"{text} {one.unit}" if one.unit else text
+    text = f"{gate.value:.3g}"
+    return f"{text} {gate.unit}" if gate.unit else text
 
 
 def _most(what: str, of: str, value: float, unit: str, most: float, remark: str = "") -> Gate:
     gate = f"at most {most:g}{f' {unit}' if unit else ''}"
+    # A NaN compares as False, and so fails. bool(): `failed` asks for False itself, which NumPy's
+    # own is not.
     return Gate(what, of, value, unit, gate, bool(value <= most), remark)
 
 
@@ -105,26 +103,28 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
     return Gate(what, of, value, unit, gate, bool(value >= least), remark)
 
 
-def _of_parameter(name: str, one: Estimate) -> list[Gate]:
+def _of_parameter(name: str, estimate: Estimate) -> list[Gate]:
     def share(sd: float | None) -> float:
-        return 100.0 * abs(sd / one.value) if sd is not None and one.value else math.nan
+        # An estimate of exactly zero has no relative deviation.
+        return 100.0 * abs(sd / estimate.value) if sd is not None and estimate.value else math.nan
 
-    remark = "" if one.sd is not None else "the data do not determine it"
-    wider = one.sd is not None and one.sd != one.sd_white
+    remark = "" if estimate.sd is not None else "the data do not determine it"
+    wider = estimate.sd is not None and estimate.sd != estimate.sd_white
     lines = [
         _most(
             "Cramér-Rao",
             name,
-            share(one.sd),
+            share(estimate.sd),
             "%",
             CRAMER_RAO,
-            remark or ("allows for coloured residuals" if wider else ""),
+            remark or ("allows for autocorrelated residuals" if wider else ""),
         ),
-        _most("insensitivity", name, share(one.sd_alone), "%", INSENSITIVITY, remark),
+        # Tischler's insensitivity: the sd that it would have were all other parameters known.
+        _most("insensitivity", name, share(estimate.sd_alone), "%", INSENSITIVITY, remark),
     ]
-    if one.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
-        said = "how much of what is known came from the prior"
-        lines.append(Gate("prior share", name, 100 * one.prior_share, "%", "", None, said))
+    if estimate.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
+        remark = "share of the prior in the posterior precision"
+        lines.append(Gate("prior share", name, 100 * estimate.prior_share, "%", "", None, remark))
     return lines
 
 
@@ -139,46 +139,69 @@ def _of_relations(fit: Fit) -> list[Gate]:
     return lines
 
 
-def _of_agreement(name: str, m: Metrics, how: str, *, judged: bool) -> list[Gate]:
-    of = f"{name}, {how}"
+def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[Gate]:
+    of = f"{name}, {source}"
     lines = [
         _least("VAF", of, m.vaf, "", VAF),
         _least("NRMSE fit", of, m.nrmse_fit_percent, "%", NRMSE_FIT),
         _most("Theil coefficient", of, m.tic, "", THEIL),
         _most("Theil bias part", of, m.bias, "", THEIL_PART),
         _most("Theil variance part", of, m.variance, "", THEIL_PART),
+        # What is left to covariance is no fault: ideally all of the error is.
         Gate("Theil covariance part", of, m.covariance, "", "", None),
     ]
     if judged:
         return lines
-    said = "a simulation does not know the disturbance: see its error over what is expected"
-    return [one._replace(gate="", passed=None, remark=said) for one in lines]
+    remark = "a simulation does not know the disturbance: see its error over what is expected"
+    return [line._replace(gate="", passed=None, remark=remark) for line in lines]
 
 
-def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
-    """Coherence, asked for where the model says that the output follows the input, and told
-    elsewhere."""
+def _of_disturbance(fit: Fit) -> list[Gate]:
     lines = []
-    # In the order of the signals.
-    flights = (*problem.training, *(f for f in problem.flights if f.hold_out))
-    for s, flight in zip(fit.signals, flights, strict=False):
-        here = {n: jnp.asarray(v) for n, v in flight.known.items()}
-        params = naming.replace(fit.params, **here)
-        at = frequency.at_record(problem.model, params, s, fit)
-        for (u, y), found in coherences(problem.model, params, at, s, fit).items():
-            lines.append(_of_coherence(f"{u} to {y}, {s.flight}", found))
+    for output in fit.adequacy.judged:
+        if output.against_disturbance is not None:
+            remark = "a simulation knows no disturbance: compared with what the estimated one makes"
+            of, ratio = f"{output.output}, simulated", output.against_disturbance
+            lines.append(_most("error power over expected", of, ratio, "", EXPECTED, remark))
     return lines
 
 
-def _of_coherence(of: str, found: Coherence | str) -> Gate:
-    if isinstance(found, str):
-        return Gate("coherence", of, math.nan, "", "", None, found)
-    said = f"weighted by the expected response, {found.segments} segments"
-    what = "partial coherence" if found.others else "coherence"
-    if not found.asked:
-        said = f"not asked: the model puts {found.share:.0%} of this output down to this input"
-    elif found.expected < COHERENCE:
-        said = f"not asked: in the simulation it is {found.expected:.2g} too"
+def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
+    lines = []
+    for name, w in fit.whiteness.items():
+        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
+        lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
+    return lines
+
+
+def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
+    """Coherence, asked for where the model says that the output follows the input, and stated
+    elsewhere."""
+    lines = []
+    # In the order of the signals: the fitted flights first.
+    flights = (*problem.training, *(f for f in problem.flights if f.hold_out))
+    for s, flight in zip(fit.signals, flights, strict=False):
+        constants = {n: jnp.asarray(v) for n, v in flight.known.items()}
+        params = naming.replace(fit.params, **constants)
+        at = frequency.at_record(FittedFlight(problem.model, params, fit, s))
+        for (u, y), coherence in coherences(problem.model, params, at, s, fit).items():
+            lines.append(_of_coherence(f"{u} to {y}, {s.flight}", coherence))
+    return lines
+
+
+def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
+    if isinstance(coherence, str):
+        return Gate("coherence", of, math.nan, "", "", None, coherence)
+    remark = f"weighted by the expected response, {coherence.segments} segments"
+    what = "partial coherence" if coherence.others else "coherence"
+    if not coherence.asked:
+        remark = (
+            f"not asked: the model puts {coherence.share:.0%} of this output down to this input"
+        )
+    elif coherence.expected < COHERENCE:
+        # A simulation has no noise: what it lacks is the segments' doing (leakage, a memory longer
+        # than one of them, a nonlinear machine), and no measurement could have more.
+        remark = f"not asked: in the simulation it is {coherence.expected:.2g} too"
     else:
-        return _least(what, of, found.value, "", COHERENCE, said)
-    return Gate(what, of, found.value, "", "", None, said)
+        return _least(what, of, coherence.value, "", COHERENCE, remark)
+    return Gate(what, of, coherence.value, "", "", None, remark)

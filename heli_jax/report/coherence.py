@@ -28,6 +28,9 @@ _ROUNDING = 1e-20
 """of a signal's power: less is what rounding leaves where others explain all of it"""
 
 
+# Parameters of a model are a class of the user's own: they are annotated Any.
+
+
 class Coherence(NamedTuple):
     """One input and one output of a record."""
 
@@ -61,26 +64,29 @@ def coherences(
     """
     dt = float(signals.times[1] - signals.times[0])
     memory = frequency.memory(model, params, at, dt * signals.times.size)
+    # One that stands still explains nothing, and its rounding would count as an input to take out.
     moving = [n for n, u in signals.inputs.items() if np.std(u) > 0]
-    found: dict[tuple[str, str], Coherence | str] = {
+    results: dict[tuple[str, str], Coherence | str] = {
         (u, y): "the input does not move"
         for u in signals.inputs
         for y in signals.measured
         if u not in moving
     }
+    # Linearised once for all pairs of input and output: it traces the whole model.
     matrices = [np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices]
     for y in signals.measured:
         record = _spectra(signals, moving, y, dt, memory)
         if isinstance(record, str):
-            found |= {(u, y): record for u in moving}
+            results |= {(u, y): record for u in moving}
             continue
         i = naming.names(model.Outputs).index(y)
         for u in moving:
             j = naming.names(model.Inputs).index(u)
             H = _sampled(matrices, i, j, dt, record.omega)
+            # What the model expects of the input as it was logged.
             H = H * frequency.nuisance_factor(fit, u, record.omega)
-            found[u, y] = _coherence(record, moving.index(u), H)
-    return found
+            results[u, y] = _coherence(record, moving.index(u), H)
+    return results
 
 
 class _Spectra(NamedTuple):
@@ -121,6 +127,7 @@ def _spectra(
 
 def _detrended(pieces: np.ndarray) -> np.ndarray:
     """Segments (..., n) less the straight line that fits each best."""
+    # About the middle of a segment, so that mean and slope are orthogonal: two projections.
     t = np.linspace(-1.0, 1.0, pieces.shape[-1])
     slopes = (pieces @ t / (t @ t))[..., None]
     return pieces - pieces.mean(axis=-1, keepdims=True) - slopes * t
@@ -131,9 +138,14 @@ def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
     others = np.delete(record.inputs, j, axis=2)
     alone = _without(others, record.inputs[:, :, j])
     power = np.sum(np.abs(alone) ** 2, axis=1)
+    # The power that the output owes to this input: where the model expects no response, noise may
+    # have its way, and a plain mean over frequencies would be that of the noise.
+    # Infinite where a pole lies on the unit circle at one of the frequencies: that one is left out.
     weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
     total = float(np.sum(np.abs(record.simulated) ** 2))
+    # By Parseval the sums over frequencies are powers, with the same factor above and below.
     share = float(np.sum(weights)) / total if total > 0 else 0.0
+    # The simulated output has neither noise nor disturbance: its coherence is what could be seen.
     value, expected = (
         _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)
         for y in (record.measured, record.simulated)
@@ -158,6 +170,8 @@ def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.nd
 
     Source: Bendat and Piersol, Random Data (2010), chapter 7.
     """
+    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
+    # the pilot moves two sticks together.
     left_u, left_y = _without(others, u), _without(others, y)
     uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
     uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
@@ -170,6 +184,7 @@ def _without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
     """x (k, segments) less its projection on the others (k, segments, inputs)."""
     if not others.shape[2]:
         return x
+    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
     gains = np.linalg.pinv(others) @ x[:, :, None]
     return x - (others @ gains)[:, :, 0]
 
@@ -181,6 +196,7 @@ def _sampled(
     linearised model is not finite."""
     A, B, C, D = matrices
     n = A.shape[0]
+    # exp [[A, b], [0, 0]] dt = [[Ad, bd], [0, 1]] (Van Loan 1978): A may have integrators.
     both = np.zeros((n + 1, n + 1))
     both[:n, :n], both[:n, n] = A, B[:, j]
     if not (np.isfinite(both).all() and np.isfinite(C[i]).all()):

@@ -34,7 +34,15 @@ def fit_json(
     baseline: Baseline | None,
     supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> dict[str, Any]:
-    """A fit as plain data for fit.json; what is not a finite number is null."""
+    """A fit as plain data for fit.json; what is not a finite number is null.
+
+    Args:
+        fit: the fit.
+        problem: what was fitted.
+        baseline: the recursive least squares, where there is one.
+        supplementary: model selection and further intervals, where they were asked for.
+    """
+    # Keys are a public format: programs read them, and `load_fit`. Old ones stay.
     whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
     return _plain(
         {
@@ -55,11 +63,7 @@ def fit_json(
             },
             "nuisance": {n: _parameter(e) for n, e in fit.nuisance.items()},
             "noise_sd": fit.noise,
-            "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
-            "validation": {n: m._asdict() for n, m in fit.validation.items()},
-            "validation_free_run": {n: m._asdict() for n, m in fit.validation_free_run.items()},
-            "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
-            "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
+            **_metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
             "intervals": _intervals(supplementary.intervals),
@@ -67,6 +71,7 @@ def fit_json(
             "unknowns": fit.unknowns,
             "aic": fit.aic,
             "bic": fit.bic,
+            # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
             "baseline_rls": _baseline(baseline),
@@ -82,10 +87,21 @@ def fit_json(
     )
 
 
-def _adequacy(found: Adequacy) -> dict[str, Any]:
+def _metrics(fit: Fit) -> dict[str, Any]:
     return {
-        **found._asdict(),
-        "judged": [one._asdict() for one in found.judged],
+        "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
+        "validation": {n: m._asdict() for n, m in fit.validation.items()},
+        "validation_free_run": {n: m._asdict() for n, m in fit.validation_free_run.items()},
+        "one_step": {n: m._asdict() for n, m in fit.one_step.items()},
+        "one_step_validation": {n: m._asdict() for n, m in fit.one_step_validation.items()},
+    }
+
+
+def _adequacy(adequacy: Adequacy) -> dict[str, Any]:
+    return {
+        **adequacy._asdict(),
+        "judged": [output._asdict() for output in adequacy.judged],
+        # The limits of this version: a later one may have others.
         "against": {
             "explained_at_least": EXPLAINED,
             "or_other_than_white_noise_at_most": NEARLY_WHITE,
@@ -109,18 +125,19 @@ def _choice(choice: Choice | None) -> dict[str, Any] | None:
     }
 
 
-def _intervals(found: Intervals | None) -> dict[str, Any] | None:
-    if found is None:
+def _intervals(comparison: Intervals | None) -> dict[str, Any] | None:
+    if comparison is None:
         return None
     content: dict[str, Any] = {
-        "by_parameter": found.by_parameter,
-        "profiles": {n: p._asdict() for n, p in found.profiles.items()},
-        "sentences": list(found.sentences),
+        "by_parameter": comparison.by_parameter,
+        "profiles": {n: p._asdict() for n, p in comparison.profiles.items()},
+        "sentences": list(comparison.sentences),
     }
-    if found.bootstrap is not None:
-        content["bootstrap_failures"] = found.bootstrap.failures
-    if found.posterior is not None:
-        p = found.posterior
+    # Of replicates and draws the counts and diagnostics alone: themselves they are megabytes.
+    if comparison.bootstrap is not None:
+        content["bootstrap_failures"] = comparison.bootstrap.failures
+    if comparison.posterior is not None:
+        p = comparison.posterior
         content["nuts"] = {
             "rhat": p.rhat,
             "effective": p.effective,
@@ -132,10 +149,11 @@ def _intervals(found: Intervals | None) -> dict[str, Any] | None:
 
 def whiteness_note(fit: Fit) -> str:
     """Why the intervals cannot be taken at their word; empty where the residuals are white."""
-    coloured = [name for name, w in fit.whiteness.items() if not w.white]
-    if not coloured:
+    not_white = [name for name, w in fit.whiteness.items() if not w.white]
+    if not not_white:
         return ""
-    worst = max((fit.whiteness[n] for n in coloured), key=lambda w: abs(w.lag1))
+    # By the correlation at one sample, which is the number that the sentence gives.
+    worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
     what = estimator_of(fit.method).errors
     if fit.coloured:
         consequence = (
@@ -146,7 +164,7 @@ def whiteness_note(fit: Fit) -> str:
     else:
         consequence = "The intervals count every sample as news and are too narrow."
     return (
-        f"The {what} of {', '.join(coloured)} are not white (autocorrelation {worst.lag1:+.2f} "
+        f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
         f"at one sample, {worst.outside:.0%} of the lags outside the 99 % band): a disturbance or "
         f"dynamics that the model lacks is in them. {consequence}"
     )
@@ -159,6 +177,7 @@ def _parameter(e: Estimate) -> dict[str, Any]:
 def _fixed(problem: Problem) -> dict[str, Any]:
     """The parameters a user might look for that were not free: those that flights replace."""
     names = {n for f in problem.flights for n in f.known}
+    # A list, since each flight may have a value of its own; null where it has none.
     return {
         n: {"value": [f.known.get(n) for f in problem.flights], "fixed": True}
         for n in sorted(names)
@@ -170,6 +189,7 @@ def _combinations(verdict: Verdict) -> list[dict[str, Any]]:
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:
+    # The covariance and the correlation have no names of their own: `names` is their order.
     return {
         "text": verdict.text,
         "identifiable": verdict.identifiable,
@@ -199,6 +219,7 @@ def _baseline(b: Baseline | None) -> dict[str, Any] | None:
         "order": b.order,
         "forgetting": b.forgetting,
         "theta": b.theta,
+        # JSON has no complex numbers: real and imaginary part.
         "poles": [[float(p.real), float(p.imag)] for p in b.poles],
         "continuous": {
             "num": b.continuous_num,
@@ -220,6 +241,7 @@ def _holds(flight: Flight) -> dict[str, dict[str, str]]:
 
 
 def _source(flight: Flight) -> dict[str, Any]:
+    # A flight that was given in memory: `null`, so that nobody looks for a file.
     if flight.source is None:
         return {"path": None, "sha256": None, "flight": flight.name}
     return {
@@ -239,7 +261,7 @@ def _plain(value: Any) -> Any:
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
         return [_plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
+    if isinstance(value, bool | np.bool_):  # before int: True is one
         return bool(value)
     if isinstance(value, int | np.integer):
         return int(value)
@@ -250,6 +272,7 @@ def _plain(value: Any) -> Any:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write plain data, readable and strict (no NaN)."""
+    # Python would write NaN, which JSON does not have and other languages refuse to read.
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -258,6 +281,7 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
 
     A flight without some signal has empty cells there.
     """
+    # The columns of all flights, in the order in which they first appear.
     names = ["flight", "time"]
     for s in signals:
         names += [n for n in s.inputs if n not in names]
@@ -267,14 +291,16 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
             for what in ("measured", "simulated", "residual", "innovation")
             if (what != "innovation" or s.innovations is not None) and f"{n}_{what}" not in names
         ]
-    parts = []
-    for s in signals:
-        here: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
-        for output, measured in s.measured.items():
-            here[f"{output}_measured"] = measured
-            here[f"{output}_simulated"] = s.simulated[output]
-            here[f"{output}_residual"] = s.residual(output)
-            if s.innovations is not None:
-                here[f"{output}_innovation"] = s.innovations[output]
-        parts.append(here)
-    write_table(path, stacked(parts, names))
+    write_table(path, stacked([_columns(s) for s in signals], names))
+
+
+def _columns(s: Signals) -> dict[str, Any]:
+    """The columns of one flight by their names."""
+    columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
+    for output, measured in s.measured.items():
+        columns[f"{output}_measured"] = measured
+        columns[f"{output}_simulated"] = s.simulated[output]
+        columns[f"{output}_residual"] = s.residual(output)
+        if s.innovations is not None:
+            columns[f"{output}_innovation"] = s.innovations[output]
+    return columns

@@ -23,11 +23,14 @@ from heli_jax.simulation.simulate import substeps_for
 
 type Response = Callable[[np.ndarray], np.ndarray]
 
+# Parameters of a model are a class of the user's own: they are annotated Any.
+
 SEGMENTS = 8
 """fewer half-overlapping segments than this make no average"""
 SHORTEST = 64
 """samples of a segment at least: fewer resolve nothing"""
 _LONGEST = 4096
+"""samples of a segment at most, unless the memory asks for more: further ones average better"""
 _MEMORIES = 16
 """in a record at least, so that segments of one are enough for an average"""
 
@@ -44,25 +47,57 @@ class Empirical(NamedTuple):
     segments: int
 
 
+class FittedFlight(NamedTuple):
+    """A model at one of the flights that it was fitted to."""
+
+    model: Model
+    params: Any
+    """its parameters, of this flight"""
+    fit: Fit
+    """what knows the gains and the time shift of the inputs"""
+    signals: Signals
+
+
 def log_grid(low: float, high: float, n: int = 900) -> np.ndarray:
-    """Frequencies (n,) [rad/s], equally spaced in the logarithm."""
+    """Frequencies (n,) [rad/s], equally spaced in the logarithm.
+
+    Args:
+        low: the first one [rad/s].
+        high: the last one [rad/s].
+        n: how many.
+    """
     return np.geomspace(low, high, n)
 
 
 def nuisance_factor(fit: Fit, input: str, omega: np.ndarray) -> np.ndarray:
-    """The estimated gain and delay of an input as a factor (k,); 1 where neither was estimated."""
+    """The estimated gain and delay of an input as a factor (k,); 1 where neither was estimated.
+
+    Args:
+        fit: what may have estimated them.
+        input: the input's name.
+        omega: (k,) [rad/s]
+    """
+    # A shift [s] is common to all inputs, a gain belongs to one.
     gain, shift = fit.nuisance.get(f"gain {input}"), fit.nuisance.get("time_shift")
     factor = np.full(omega.shape, 1.0 if gain is None else gain.value, complex)
     return factor if shift is None else factor * np.exp(-1j * omega * shift.value)
 
 
-def at_record(model: Model, params: Any, signals: Signals, fit: Fit) -> OperatingPoint:
+def at_record(flight: FittedFlight) -> OperatingPoint:
     """Where the model is linearised for a record, with the gains that were estimated."""
-    named = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
-    gains = {n: one.value for n, one in named.items() if one is not None}
+    signals = flight.signals
+    # What acts is gain times what was logged: the mean of the log would be another point.
+    estimates = {n: flight.fit.nuisance.get(f"gain {n}") for n in signals.inputs}
+    gains = {n: gain.value for n, gain in estimates.items() if gain is not None}
     dt = float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
     return operating_point(
-        model, params, signals.inputs, signals.measured, dt, substeps=substeps_for(dt), gains=gains
+        flight.model,
+        flight.params,
+        signals.inputs,
+        signals.measured,
+        dt,
+        substeps=substeps_for(dt),
+        gains=gains,
     )
 
 
@@ -77,27 +112,46 @@ def responses(
     """H(i omega) and Hd(e^{i omega dt}) of the model linearised about a point, as functions.
 
     The second holds the input over each sample: this, and not the first, is what a sampled record
-    can show. One linearisation serves both, and NumPy evaluates them: a figure is no reason to
-    compile.
+    can show.
+
+    Args:
+        model: what is linearised.
+        params: its parameters.
+        output: the output's name.
+        input: the input's name.
+        dt: sample time [s].
+        at: about which point.
     """
+    # One linearisation serves both, and NumPy evaluates them: a figure is no reason to compile.
     A, B, C, D = (np.asarray(M) for M in linearize(model, params, at.state, at.inputs).matrices)
     i = naming.names(model.Outputs).index(output)
     j = naming.names(model.Inputs).index(input)
     n = A.shape[0]
+    # The exponential of [[A, b], [0, 0]] dt is [[Ad, bd], [0, 1]]: no inverse of A, which an
+    # integrator does not have (Van Loan 1978).
     both = np.zeros((n + 1, n + 1))
     both[:n, :n], both[:n, n] = A, B[:, j]
     held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
 
-    def along(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-        if not np.isfinite(A).all():
-            return np.full(points.shape, np.nan, complex)
-        x = np.linalg.solve(points[:, None, None] * np.eye(n) - A, b[None, :, None])
-        return (C[i] @ x)[:, 0] + D[i, j]
+    def response(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return _transfer(points, A, b, C[i], D[i, j])
 
     return (
-        lambda omega: along(1j * omega, A, B[:, j]),
-        lambda omega: along(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
+        lambda omega: response(1j * omega, A, B[:, j]),
+        lambda omega: response(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
     )
+
+
+def _transfer(
+    points: np.ndarray, A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float
+) -> np.ndarray:
+    """c (s I - A)^-1 b + d (k,) at points s (k,); NaN where A is not finite."""
+    if not np.isfinite(A).all():
+        return np.full(points.shape, np.nan, complex)
+    # A system of equations at each frequency: the polynomials of a transfer function lose digits
+    # with every further state.
+    x = np.linalg.solve(points[:, None, None] * np.eye(len(A)) - A, b[None, :, None])
+    return (c @ x)[:, 0] + d
 
 
 def memory(
@@ -108,12 +162,19 @@ def memory(
     About an operating point a mode that is remembered for more than a sixteenth of the record's
     `duration` [s] counts as an integrator as well: the drift of a hovering helicopter has time
     constants of minutes, and within a segment it is a trend, which is taken out.
+
+    Args:
+        model: what is linearised.
+        params: its parameters.
+        at: about which point.
+        duration: of the record [s].
     """
     A = np.asarray(linearize(model, params, at.state, at.inputs).matrices.A)
     if not np.isfinite(A).all():
         return 0.0
     size = np.abs(np.linalg.eigvals(A))
     least = 0.0 if at.state is None else _MEMORIES * 4.0 / duration
+    # The eigenvalue of an integrator is zero but for rounding, and that against the largest one.
     size = size[(size > 1e-6 * np.max(size, initial=0.0)) & (size >= least)]
     return 4.0 / float(size.min()) if size.size else 0.0
 
@@ -121,16 +182,24 @@ def memory(
 def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
     """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
     z = np.exp(1j * omega * baseline.dt)
+    # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):
         return np.polyval(baseline.num, z) / np.polyval(baseline.den, z)
 
 
 def _needed(dt: float, memory: float) -> int:
+    # A power of two, for the Fourier transform.
     return max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
 
 
 def segment_length(samples: int, dt: float, memory: float) -> int:
-    """Samples of a segment: eight fit in the record, unless the memory [s] asks for longer ones."""
+    """Samples of a segment: eight fit in the record, unless the memory asks for longer ones.
+
+    Args:
+        samples: of the record.
+        dt: between two of them [s].
+        memory: how long the machine remembers its input [s].
+    """
     most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
     return max(_needed(dt, memory), most)
 
@@ -138,8 +207,14 @@ def segment_length(samples: int, dt: float, memory: float) -> int:
 def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
     """Welch's cross-spectrum over the input's spectrum, or why the record does not allow it.
 
-    `memory` [s] is how long the machine remembers its input: a segment must not be shorter.
+    Args:
+        u: the input (N,).
+        y: the output (N,).
+        dt: sample time [s].
+        memory: how long the machine remembers its input [s].
     """
+    # A segment shorter than the memory answers to what the stick did before it began: the average
+    # is then biased, however many segments there are.
     if not np.std(u) > 0:
         return "the input does not move"
     if np.isnan(y).any():
@@ -149,9 +224,13 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     segments = 1 + (u.size - length) // (length // 2)
     if segments < SEGMENTS:
         least = needed * dt * (SEGMENTS + 1) / 2
-        return f"expected {SEGMENTS} segments of {needed * dt:.3g} s, a record of {least:.3g} s"
+        return (
+            f"expected {SEGMENTS} half-overlapping segments of {needed * dt:.3g} s, a record of "
+            f"{least:.3g} s; got {u.size * dt:.3g} s"
+        )
     omega, Suu, Syy, Suy = spectra(u, y, dt, length)
-    # Where the input has no power the quotient is rounding alone, and at zero the trend was taken.
+    # Where the input has no power the quotient is rounding alone, and of zero frequency the
+    # segments' straight lines left nothing.
     useful = (omega > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
     omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
     return Empirical(omega, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), Suu, segments)
@@ -161,4 +240,5 @@ def phase(H: np.ndarray) -> np.ndarray:
     """Unwrapped phase (k,) [deg], begun between -270 and 90."""
     unwrapped = np.degrees(np.unwrap(np.angle(H)))
     first = unwrapped[0] if unwrapped.size else 0.0
+    # Less 1e-6, so that rounding does not send a response that begins at +90 down to -270.
     return unwrapped - 360.0 * np.ceil((first - 90.0 - 1e-6) / 360.0)

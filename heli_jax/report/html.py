@@ -15,12 +15,26 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
 from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
+
+
+_GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
+# The template asks for figures by what their names begin with: no group may begin another's name.
+
+
+class Analysis(NamedTuple):
+    """A fit, and all that its report is made of."""
+
+    fit: Fit
+    problem: Problem
+    baseline: Baseline | None = None
+    supplementary: SupplementaryAnalyses = SupplementaryAnalyses()
 
 
 class Picture(NamedTuple):
@@ -33,40 +47,44 @@ class Picture(NamedTuple):
 
 
 def write_report(
-    directory: Path,
-    fit: Fit,
-    problem: Problem,
-    baseline: Baseline | None,
-    title: str,
-    vehicle_constants: Mapping[str, Constant],
-    supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
+    directory: Path, analysis: Analysis, title: str, vehicle_constants: Mapping[str, Constant]
 ) -> list[str]:
     """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
 
     The page refers to nothing outside itself. Whatever comes from logs and configurations is
     escaped.
+
+    Args:
+        directory: where; it exists.
+        analysis: the fit and what belongs to it.
+        title: of the page.
+        vehicle_constants: the vehicle file's, by name.
+
+    Raises:
+        OSError: the directory cannot be written to.
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {}
-    for name, draw in drawings(fit, problem, baseline, supplementary).items():
-        drawn = style.save(draw, folder / name)
-        if drawn is not None:
-            data = base64.b64encode(drawn[1]).decode("ascii")
-            pictures[name] = Picture(name, drawn[0], data)
-    made = list(pictures.values())
-    page = render(fit, problem, baseline, title, vehicle_constants, made, supplementary)
+    pictures = []
+    # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
+    for name, draw in drawings(analysis).items():
+        saved = style.save(draw, folder / name)
+        if saved is not None:
+            # In the page itself, as base64: a report is one file, to be mailed or archived, and a
+            # browser opens it from anywhere.
+            picture_title, svg = saved
+            pictures.append(Picture(name, picture_title, base64.b64encode(svg).decode("ascii")))
+    page = render(analysis, title, vehicle_constants, pictures)
     (directory / "report.html").write_text(page, encoding="utf-8")
-    return list(pictures)
+    return [picture.name for picture in pictures]
 
 
 type Draw = Callable[[], Figure | None]
 
 
-def drawings(
-    fit: Fit, problem: Problem, baseline: Baseline | None, supplementary: SupplementaryAnalyses
-) -> dict[str, Draw]:
+def drawings(analysis: Analysis) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
+    fit, problem, baseline, supplementary = analysis
     model, drawings = problem.model, {}
     if supplementary.intervals is not None:
         drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
@@ -74,6 +92,7 @@ def drawings(
     for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
         for output in s.measured:
             drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
+            # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
                 drawings[f"residual{part}_{output}"] = _drawing(
                     figures.residual_correlation, s, output, together=len(fit.whiteness)
@@ -92,15 +111,18 @@ def _parts(flights: list[str]) -> list[str]:
     """What tells the flights' file names apart; nothing where there is one flight."""
     if len(flights) == 1:
         return [""]
+    # Names come from logs and may hold slashes, and two may be equal but for what is left out: the
+    # number keeps their files apart.
     return [
         f"_{i + 1}_{re.sub('[^A-Za-z0-9]+', '-', f).strip('-')[:40]}".rstrip("_")
         for i, f in enumerate(flights)
     ]
 
 
-def _drawing(function: Callable[..., figures.Panels], *args: Any, **how: Any) -> Draw:
+def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
+    # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
     def draw() -> Figure | None:
-        axes = function(*args, **how)
+        axes = function(*args, **options)
         return axes[0].figure if axes else None  # type: ignore[return-value]
 
     return draw
@@ -108,22 +130,31 @@ def _drawing(function: Callable[..., figures.Panels], *args: Any, **how: Any) ->
 
 def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     """The frequency response of the flight that the baseline saw, with what is known of it."""
+    # The first flight where there is no baseline.
     i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
+    # What the flight states of the vehicle goes before the estimates, as in the fit.
     known = problem.training[i].known if i < len(problem.training) else {}
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
-    return _drawing(figures.bode, problem.model, params, fit, baseline, fit.signals[i])
+    flight = FittedFlight(problem.model, params, fit, fit.signals[i])
+    return _drawing(figures.bode, flight, baseline)
 
 
 def render(
-    fit: Fit,
-    problem: Problem,
-    baseline: Baseline | None,
+    analysis: Analysis,
     title: str,
     vehicle_constants: Mapping[str, Constant],
     pictures: list[Picture],
-    supplementary: SupplementaryAnalyses = SupplementaryAnalyses(),
 ) -> str:
-    """The page as text."""
+    """The page as text.
+
+    Args:
+        analysis: the fit and what belongs to it.
+        title: of the page.
+        vehicle_constants: the vehicle file's, by name.
+        pictures: the figures that were drawn.
+    """
+    fit, problem, baseline, supplementary = analysis
+    # Once: it takes spectra of every pair of signals.
     lines = card.card(problem, fit)
     return filled(
         "report.html.j2",
@@ -155,17 +186,6 @@ def render(
         versions=tables.pairs(versions()),
         timing=tables.pairs(fit.timing, " s"),
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
-        pictures={
-            group: [p for p in pictures if p.name.startswith(group)]
-            for group in (
-                "response",
-                "residual",
-                "bode",
-                "correlation",
-                "starts",
-                "rls",
-                "intervals",
-            )
-        },
+        pictures={group: [p for p in pictures if p.name.startswith(group)] for group in _GROUPS},
         NOT_DETERMINED=tables.NOT_DETERMINED,
     )

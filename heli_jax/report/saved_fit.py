@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LIMIT_BYTES = 1_000_000_000
+"""of each file: more is none that a fit wrote, and would fill the memory"""
 
 
 class SavedFit(NamedTuple):
@@ -77,6 +78,7 @@ def load_fit(directory: str | Path) -> SavedFit:
     directory = Path(directory)
     content = _content(directory / "fit.json")
     try:
+        # Fixed ones are listed for who looks for them; they are no estimates.
         estimates = {
             n: _estimate(e) for n, e in content["parameters"].items() if not e.get("fixed", False)
         }
@@ -97,7 +99,7 @@ def load_fit(directory: str | Path) -> SavedFit:
             notes=tuple(content["notes"]),
             content=content,
         )
-    except (KeyError, TypeError, AttributeError) as e:
+    except (KeyError, TypeError, AttributeError) as e:  # a key is missing, or holds another kind
         raise InputError(
             f"{directory / 'fit.json'}: expected what heli-jax fit writes, got a file without a "
             f"usable {e}"
@@ -132,6 +134,7 @@ def _intervals(
     estimates: Mapping[str, Estimate], saved: Mapping[str, Any] | None
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """By parameter and method; the Gaussian ones alone where no others were asked for."""
+    # null in fit.json where no other method was asked for: the estimates hold the Gaussian ones.
     if saved is not None:
         return {
             name: {method: (_number(ends[0]), _number(ends[1])) for method, ends in by.items()}
@@ -147,16 +150,19 @@ def _intervals(
 def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
+    # An output may have been measured in the flights held out alone.
     outputs = [
         *content["metrics"],
         *(n for n in content["validation"] if n not in content["metrics"]),
     ]
     rows: dict[str, list[list[str]]] = {}
     text = read_regular(path, "the signals.csv of a run directory", _LIMIT_BYTES).decode("utf-8")
+    # A reader, not split(","): flights' names come from files and may hold commas.
     lines = csv.reader(text.splitlines())
     head = next(lines, [])
     if head[:2] != ["flight", "time"]:
         raise InputError(f"{path}: expected the columns flight and time, got {head[:2]}")
+    # Flights lie one after the other; rows are told apart by name and not by place.
     for line in lines:
         rows.setdefault(line[0], []).append(line[1:])
     return tuple(
@@ -171,6 +177,7 @@ def _flight(
     table = np.array([[float(c) if c else math.nan for c in row] for row in cells])
     # A flight without some signal has an empty column there.
     columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
+    # What belongs to no output is an input: the file does not say which columns are.
     of_outputs = {f"{o}_{w}" for o in outputs for w in _OF_AN_OUTPUT}
     inputs = {n: v for n, v in columns.items() if n != "time" and n not in of_outputs}
     measured, simulated, _, innovations = (

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
+from numpy.typing import ArrayLike
 
 # Okabe and Ito's palette: told apart with every common kind of colour blindness, and in grey.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -33,10 +34,12 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    # Powers of ten only below 0.001 and from 10000 on.
     "axes.formatter.limits": (-3, 4),
     "axes.formatter.use_mathtext": False,
     "axes.unicode_minus": True,
-    "text.parse_math": False,  # names come from logs
+    # Names come from logs: a dollar sign in one is no formula, and half a formula is an error.
+    "text.parse_math": False,
     "grid.color": "#E4E4E4",
     "grid.linewidth": 0.6,
     "xtick.color": "#333333",
@@ -49,8 +52,11 @@ STYLE: dict[Any, Any] = {
     "lines.solid_joinstyle": "round",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
+    # Letters as outlines: the page looks the same where DejaVu is not installed.
     "svg.fonttype": "path",
+    # Without a salt the ids in an SVG are random, and two runs of one fit differ in every figure.
     "svg.hashsalt": "heli_jax",
+    # A fifth of a pixel: nobody sees it, and noisy lines lose many of their points.
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
@@ -59,25 +65,41 @@ WIDTH = 7.4
 """width of a figure [inch]"""
 MOST_POINTS = 2000
 """points of a drawn line at most: about three for each pixel of a page's width"""
+TOP = 0.5
+"""margin above the first panel [inch]: a title and a row below it"""
+ROW = 15.0 / 72.0
+"""height of a row between title and axes [inch]: a subtitle or a legend"""
+_POINTS = 72.0
+"""in an inch"""
 _DPI = 110
 
 
 def figure(height: float, width: float = WIDTH) -> Figure:
-    """An empty figure with its own canvas; no pyplot, no global state."""
-    made = Figure(figsize=(width, height))
-    FigureCanvasAgg(made)
-    return made
+    """An empty figure with its own canvas."""
+    # Without pyplot, which keeps every figure alive in a global list, and is not for threads.
+    drawing = Figure(figsize=(width, height))
+    FigureCanvasAgg(drawing)
+    return drawing
 
 
-def place(made: Figure, panels: int, *, right: float = 0.2, gap: float = 0.2) -> None:
-    """Margins and gaps between panels in inches.
+def place(
+    drawing: Figure, panels: int, *, right: float = 0.2, gap: float = 0.2, top: float = TOP
+) -> None:
+    """Margins and gaps between panels.
 
-    Fixed, for a layout engine draws every tick twice more and takes half the report's time.
+    Args:
+        drawing: the figure.
+        panels: how many there are below each other.
+        right: margin at the right [inch].
+        gap: between two panels [inch].
+        top: margin above the first panel [inch].
     """
-    width, height = made.get_size_inches()
-    left, top, bottom = 0.82, 0.5, 0.48
+    # Fixed, for a layout engine draws every tick twice more and takes half the report's time.
+    width, height = drawing.get_size_inches()
+    left, bottom = 0.82, 0.48
+    # matplotlib takes margins as parts of the figure, and gaps as parts of a panel's height.
     each = (height - top - bottom - gap * (panels - 1)) / panels
-    made.subplots_adjust(
+    drawing.subplots_adjust(
         left=left / width,
         right=1.0 - right / width,
         top=1.0 - top / height,
@@ -87,14 +109,20 @@ def place(made: Figure, panels: int, *, right: float = 0.2, gap: float = 0.2) ->
 
 
 def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most `most` (>= 4) points of a line (N,): the lowest and the highest of each bin.
+    """At most `most` points of a line: the lowest and the highest of each bin.
 
     No peak is lost, and the first and the last point stay.
+
+    Args:
+        x: (N,), ascending.
+        y: (N,)
+        most: points to keep, 4 at least.
     """
+    # Not every k-th sample: that aliases an oscillation and misses spikes.
     n = y.size
     if n <= most:
         return x, y
-    bins = (most - 2) // 2
+    bins = (most - 2) // 2  # two points each, and the two ends
     edges = np.linspace(0, n, bins + 1).astype(int)
     low = [a + int(np.argmin(y[a:b])) for a, b in itertools.pairwise(edges)]
     high = [a + int(np.argmax(y[a:b])) for a, b in itertools.pairwise(edges)]
@@ -102,9 +130,16 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.n
     return x[keep], y[keep]
 
 
-def line(ax: Axes, x: np.ndarray, y: np.ndarray, **how: Any) -> None:
-    """Draw a line of any length, thinned."""
-    ax.plot(*thinned(np.asarray(x), np.asarray(y)), **how)
+def line(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
+    """Draw a line of any length, thinned.
+
+    Args:
+        ax: where.
+        x: (N,), ascending.
+        y: (N,)
+        **line_style: as of matplotlib's `plot`.
+    """
+    ax.plot(*thinned(np.asarray(x), np.asarray(y)), **line_style)
 
 
 def pretty(unit: str | None) -> str:
@@ -119,13 +154,20 @@ def label(name: str, unit: str | None) -> str:
     return f"{name} [{pretty(unit)}]" if unit is not None else name
 
 
-def subtitle(ax: Axes, text: str) -> None:
-    """A quiet line between the title and the axes."""
-    ax.set_title(ax.get_title("left"), loc="left", pad=19)
+def subtitle(ax: Axes, text: str, *, raised: bool = False) -> None:
+    """A quiet line between the title and the axes.
+
+    Args:
+        ax: where; it has its title.
+        text: of the line.
+        raised: whether it lies over a legend (`legend_above`), the title over both.
+    """
+    row = _POINTS * ROW if raised else 0.0
+    ax.set_title(ax.get_title("left"), loc="left", pad=19 + row)
     ax.annotate(
         text,
         (0, 1),
-        xytext=(0, 6),
+        xytext=(0, 6 + row),
         xycoords="axes fraction",
         textcoords="offset points",
         fontsize=8,
@@ -135,8 +177,11 @@ def subtitle(ax: Axes, text: str) -> None:
 
 def legend_above(ax: Axes, *, raised: bool = False) -> None:
     """A legend on top of the axes at the right, where no data are; `raised` beside the title
-    where a subtitle lies between."""
-    up = ScaledTranslation(0.0, (15.0 if raised else 0.0) / 72.0, ax.figure.dpi_scale_trans)
+    where a subtitle lies between.
+
+    Beside a title is room for two or three entries; more belong below a raised subtitle.
+    """
+    up = ScaledTranslation(0.0, ROW if raised else 0.0, ax.figure.dpi_scale_trans)
     ax.legend(
         loc="lower right",
         bbox_to_anchor=(1.005, 1.0),
@@ -151,9 +196,11 @@ def legend_above(ax: Axes, *, raised: bool = False) -> None:
 def plain_log_ticks(axis: Axis) -> None:
     """0.1, 0.2, 0.5, 1 on a logarithmic axis, powers where they are far from one."""
     low, high = axis.get_view_interval()
+    # Over more than three and a half decades the labels of 2 and 5 would overlap.
     subs = (1.0, 2.0, 5.0) if high < 3e3 * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    # Ticks without labels between 1, 2 and 5 would be taken for a linear division.
     axis.set_minor_locator(NullLocator())
 
 
@@ -166,13 +213,14 @@ def styled(draw: Callable[[], Figure | None]) -> Figure | None:
 def svg(draw: Callable[[], Figure | None]) -> tuple[str, bytes] | None:
     """Draw a figure in the style: its first title and the SVG; None where there is none."""
     with matplotlib.rc_context(STYLE):
-        made = draw()
-        return None if made is None else (made.axes[0].get_title("left"), _svg(made))
+        drawn = draw()
+        return None if drawn is None else (drawn.axes[0].get_title("left"), _svg(drawn))
 
 
-def _svg(made: Figure) -> bytes:
+def _svg(drawn: Figure) -> bytes:
     buffer = io.BytesIO()
-    made.savefig(buffer, format="svg", metadata={"Date": None})
+    # Without a date: the same fit gives the same file.
+    drawn.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
 
@@ -181,11 +229,12 @@ def save(draw: Callable[[], Figure | None], path: Path) -> tuple[str, bytes] | N
 
     Returns its first title and the SVG; None where there was nothing to draw.
     """
+    # Saving reads the settings again (fonts, the SVG's salt): it belongs inside the context too.
     with matplotlib.rc_context(STYLE):
-        made = draw()
-        if made is None:
+        drawn = draw()
+        if drawn is None:
             return None
-        data = _svg(made)
-        made.savefig(path.with_suffix(".png"), dpi=_DPI)
+        data = _svg(drawn)
+        drawn.savefig(path.with_suffix(".png"), dpi=_DPI)
     path.with_suffix(".svg").write_bytes(data)
-    return made.axes[0].get_title("left"), data
+    return drawn.axes[0].get_title("left"), data

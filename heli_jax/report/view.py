@@ -2,7 +2,7 @@
 
 import base64
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from heli_jax.analysis.trim import is_full_nonlinear
 from heli_jax.dynamics.model import Model
 from heli_jax.report import manoeuvre, style
 from heli_jax.report.animation import animation, size_of
+from heli_jax.report.figures import Panels
 from heli_jax.report.html import MOST_FLIGHTS, Picture
 from heli_jax.report.page import filled
 from heli_jax.simulation.trajectory import Trajectory
@@ -28,6 +29,9 @@ _SETTINGS = {
     "showSendToCloud": False,
     "plotlyServerURL": "",
 }
+
+
+# Parameters of a model are a class of the user's own: they are annotated Any.
 
 
 class Shown(NamedTuple):
@@ -53,6 +57,14 @@ def write_view(
 
     It refers to nothing outside itself, and titles and names are escaped.
 
+    Args:
+        path: of the page.
+        runs: by their names; the first `MOST_FLIGHTS` are drawn.
+        model: what was simulated.
+        params: its parameters.
+        title: of the page.
+        notes: sentences that stand before the figures.
+
     Raises:
         OSError: the place cannot be written to.
     """
@@ -61,8 +73,10 @@ def write_view(
     for name, whole_run in list(runs.items())[:MOST_FLIGHTS]:
         run = _finite(whole_run)
         flight, size = None, 1.0
+        # Of two samples one may still not be finite: figures leave it out, a 3D scene cannot.
         if whole and _good(run).all():
-            first = all(one.flight is None for one in shown)
+            # plotly's program is 4 MB: the first figure brings it for all.
+            first = all(other.flight is None for other in shown)
             flight = _flight(run, params, len(shown) + 1, first)
             size = size_of(run, float(params.R))
         shown.append(Shown(name, _pictures(run, model), flight, size))
@@ -91,31 +105,38 @@ def _finite(run: Trajectory) -> Trajectory:
 
 
 def _pictures(run: Trajectory, model: Model) -> list[Picture]:
-    found = []
+    pictures = []
     for function in (manoeuvre.motion, manoeuvre.sticks):
-        drawn = style.svg(functools.partial(_figure, function, run, model))
-        if drawn is not None:
-            data = base64.b64encode(drawn[1]).decode("ascii")
-            found.append(Picture(function.__name__, drawn[0], data))
-    return found
+        saved = style.svg(functools.partial(_figure, function, run, model))
+        if saved is not None:
+            title, svg = saved
+            data = base64.b64encode(svg).decode("ascii")
+            pictures.append(Picture(function.__name__, title, data))
+    return pictures
 
 
-def _figure(function: Any, run: Trajectory, model: Model) -> Figure:
-    return function(run, model)[0].figure
+def _figure(
+    function: Callable[[Trajectory, Model], Panels], run: Trajectory, model: Model
+) -> Figure | None:
+    figure = function(run, model)[0].figure
+    return figure if isinstance(figure, Figure) else None
 
 
 def _flight(run: Trajectory, params: Any, number: int, first: bool) -> markupsafe.Markup:
     """The 3D figure; the first one brings plotly's own program with it."""
-    import plotly.io
+    import plotly.io  # not at the start: only this page needs it, and it takes its time
 
     text = plotly.io.to_html(
         animation(run, params),
         config=_SETTINGS,
         include_plotlyjs=first,
         full_html=False,
+        # Several flights on a page would else all begin at once.
         auto_play=False,
         default_height="620px",
+        # Its checks take seconds; a test holds that the figure is one of plotly's.
         validate=False,
+        # plotly's own ids are random; the same run shall give the same page.
         div_id=f"flight{number}",
     )
     return markupsafe.Markup(text)

@@ -10,7 +10,7 @@ from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.methods import METHODS, Method
 from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.report.card import card
-from heli_jax.report.html import write_report
+from heli_jax.report.html import Analysis, write_report
 from tests.identification.bench import BENCH, record, vehicle
 
 
@@ -65,7 +65,7 @@ def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     by = intervals(found, profiles=[], runs=40).by_parameter["Ixx"]
     assert by["bootstrap"][0] < BENCH["Ixx"] < by["bootstrap"][1]
     assert {g.passed for g in card(problem, found) if g.what.startswith("Cramer")} <= {True, None}
-    write_report(tmp_path, found, problem, None, "differences", {})
+    write_report(tmp_path, Analysis(found, problem), "differences", {})
     assert "least squares on differences" in (tmp_path / "report.html").read_text()
 
 

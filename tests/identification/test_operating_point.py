@@ -14,6 +14,7 @@ from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.excitation import sampling
 from heli_jax.identification.validation.operating_point import operating_point
 from heli_jax.report import figures, frequency
+from heli_jax.report.frequency import FittedFlight
 from tests.dynamics import whole_helicopter as oracle
 
 N, DT = 500, 0.04
@@ -51,7 +52,7 @@ NO_NUISANCE = SimpleNamespace(nuisance={})
 def test_the_response_of_a_hovering_helicopter_is_that_of_hover(xcell, hovering):
     # At zero throttle, where the rotor stands still, it is nothing at all.
     model = models.helicopter("consistent")
-    at = frequency.at_record(model, xcell, signals({"z": np.zeros(N)}), NO_NUISANCE)
+    at = frequency.at_record(FittedFlight(model, xcell, NO_NUISANCE, signals({"z": np.zeros(N)})))
     assert at.words == "the trim in hover"
     H, _ = frequency.responses(model, xcell, "z", "x_throttle", DT, at)
     assert abs(hovering(1.0)) > 10.0
@@ -89,9 +90,8 @@ def test_a_record_of_forward_flight_is_linearised_there(xcell):
 
 def test_the_figure_says_where(xcell):
     model = models.helicopter("consistent")
-    axes = figures.bode(
-        model, xcell, NO_NUISANCE, None, signals({"z": np.zeros(N)}), output="z", input="x_throttle"
-    )
+    flight = FittedFlight(model, xcell, NO_NUISANCE, signals({"z": np.zeros(N)}))
+    axes = figures.bode(flight, None, output="z", input="x_throttle")
     said = " ".join(t.get_text() for t in axes[0].texts)
     assert "linearised about the trim in hover" in said
 

@@ -13,24 +13,25 @@ IXX, IF = Free(0.05, 0.001, 1.0), Free(5e-4, 1e-6, 1e-2)
 SCRIPT = "<script>alert(1)</script>"
 
 
-def _made(free, **how):
+def _fitted(free, **options):
     source = Source("/logs/<b>bench</b>.csv", "ab" * 32, ("stick: <i>mm</i> to m",))
-    flight = record(BENCH, seed=1, n=1000, dt=0.05, source=source, **how)
+    flight = record(BENCH, seed=1, n=1000, dt=0.05, source=source, **options)
     problem = Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
-    found = fit(problem)
-    [row] = found.starts
+    result = fit(problem)
+    [row] = result.starts
+    # One start is no waterfall: a second one that failed.
     other = row._replace(cost=40.0 * row.cost, converged=False, optimum=0)
-    found = dataclasses.replace(found, starts=(row, other))
-    return found, problem, baseline(problem.model, problem.vehicle, flight)
+    result = dataclasses.replace(result, starts=(row, other))
+    return result, problem, baseline(problem.model, problem.vehicle, flight)
 
 
 @pytest.fixture(scope="session")
 def sound():
     """Fit, problem and baseline where the data determine both parameters."""
-    return _made({"Ixx": IXX, "If": IF}, name=SCRIPT)
+    return _fitted({"Ixx": IXX, "If": IF}, name=SCRIPT)
 
 
 @pytest.fixture(scope="session")
-def lost():
+def not_identifiable():
     """The same where the data determine two ratios of three parameters."""
-    return _made({"Ixx": IXX, "If": IF, "a": Free(5.0, 1.0, 20.0)})
+    return _fitted({"Ixx": IXX, "If": IF, "a": Free(5.0, 1.0, 20.0)})

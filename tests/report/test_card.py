@@ -17,15 +17,15 @@ def test_a_sound_fit_passes(sound):
         "Theil covariance part", "whiteness of residuals (p)", "coherence",
     } == asked  # fmt: skip
     by = {(g.what, g.of): g for g in lines}
-    for name, one in fit.estimates.items():
-        assert one.sd is not None
-        assert math.isclose(by["Cramér-Rao", name].value, 100 * one.sd / one.value)
+    for name, estimate in fit.estimates.items():
+        assert estimate.sd is not None
+        assert math.isclose(by["Cramér-Rao", name].value, 100 * estimate.sd / estimate.value)
         # Known others can only help.
         assert by["insensitivity", name].value <= by["Cramér-Rao", name].value * (1 + 1e-9)
 
 
-def test_what_is_not_determined_fails(lost):
-    fit, problem, _ = lost
+def test_what_is_not_determined_fails(not_identifiable):
+    fit, problem, _ = not_identifiable
     gone = failed(card(problem, fit))
     assert {("Cramér-Rao", n) for n in fit.estimates} <= {(g.what, g.of) for g in gone}
     assert any(g.what == "condition number" for g in gone)

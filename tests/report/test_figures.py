@@ -1,5 +1,7 @@
 """Figures: nothing empty, no peak lost, bands where they belong, curves on one phase branch."""
 
+import itertools
+
 import matplotlib
 import matplotlib.image
 import numpy as np
@@ -13,6 +15,7 @@ from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.fit import Signals, StartRow
 from heli_jax.identification.validation.metrics import lags_for
 from heli_jax.report import figures, frequency, style
+from heli_jax.report.frequency import FittedFlight
 
 
 def noise_signals(n=900, inputs=("x_roll",), seed=0):
@@ -75,7 +78,7 @@ def test_every_figure_has_something_in_it(sound, tmp_path):
     drawn = {
         "response": figures.response(s, "roll", problem.model),
         "residual": figures.residual_correlation(s, "roll"),
-        "bode": figures.bode(problem.model, fit.params, fit, baseline, s),
+        "bode": figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline),
         "matrix": figures.correlation_matrix(fit.verdict),
         "starts": figures.waterfall(fit.starts),
         "rls": figures.rls_history(baseline),
@@ -138,12 +141,12 @@ def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
     from tests.identification.bench import BENCH, record
 
     flight = record(BENCH, seed=3, n=6000, noise=1e-5)
-    found = frequency.empirical(flight.inputs["x_roll"], flight.outputs["roll"], 0.02, 4.0)
-    assert isinstance(found, frequency.Empirical)
-    assert found.segments >= frequency.SEGMENTS
-    clear = (found.coherence > 0.9) & (found.omega > 2.0) & (found.omega < 10.0)
+    response = frequency.empirical(flight.inputs["x_roll"], flight.outputs["roll"], 0.02, 4.0)
+    assert isinstance(response, frequency.Empirical)
+    assert response.segments >= frequency.SEGMENTS
+    clear = (response.coherence > 0.9) & (response.omega > 2.0) & (response.omega < 10.0)
     _, sampled = frequency.responses(models.roll_on_stand, bench30, "roll", "x_roll", 0.02)
-    ratio = found.H[clear] / sampled(found.omega[clear])
+    ratio = response.H[clear] / sampled(response.omega[clear])
     assert clear.sum() > 5
     assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.1)
     assert np.median(np.degrees(np.angle(ratio))) == pytest.approx(0.0, abs=8.0)
@@ -161,10 +164,26 @@ def test_bode_says_why_the_record_is_missing(sound):
     fit, problem, baseline = sound
     s = fit.signals[0]
     s = s._replace(inputs={"x_roll": np.zeros_like(s.times)})
-    axes = figures.bode(problem.model, fit.params, fit, baseline, s)
+    axes = figures.bode(FittedFlight(problem.model, fit.params, fit, s), baseline)
     assert len(axes) == 2
-    said = " ".join(t.get_text() for t in axes[0].texts)
-    assert "no empirical response: the input does not move" in said
+    notes = " ".join(t.get_text() for t in axes[0].texts)
+    assert "no empirical response: the input does not move" in notes
+
+
+def test_bode_s_legend_title_and_subtitle_have_rows_of_their_own(sound):
+    fit, problem, baseline = sound
+    flight = FittedFlight(problem.model, fit.params, fit, fit.signals[0])
+    with matplotlib.rc_context(style.STYLE):
+        ax = figures.bode(flight, baseline)[0]
+        ax.figure.canvas.draw()  # only now texts have their places
+        [note] = [t for t in ax.texts if "record" in t.get_text()]
+        # From below; the legend's words, for its box has an unseen margin.
+        rows = [*ax.get_legend().get_texts()[:1], note, ax._left_title]
+        extents = [row.get_window_extent() for row in rows]
+    assert ax.bbox.y1 < extents[0].y0
+    for lower, upper in itertools.pairwise(extents):
+        assert lower.y1 < upper.y0
+    assert extents[-1].y1 < ax.figure.bbox.y1
 
 
 def test_phase_begins_on_one_branch():

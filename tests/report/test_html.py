@@ -11,7 +11,7 @@ import pytest
 from heli_jax import numbers
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import tables
-from heli_jax.report.html import write_report
+from heli_jax.report.html import Analysis, write_report
 from heli_jax.vehicle import Constant
 from tests.report.conftest import SCRIPT
 
@@ -23,18 +23,19 @@ class Links(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.found, self.tags = [], []
+        self.addresses, self.tags = [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        self.found += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "action")]
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "action")]
 
 
-def page(made, folder, **changes):
-    fit, problem, baseline = made
+def page(analysed, folder, **changes):
+    fit, problem, baseline = analysed
     fit = dataclasses.replace(fit, **changes)
-    names = write_report(folder, fit, problem, baseline, f"bench {SCRIPT}", CONSTANTS)
+    analysis = Analysis(fit, problem, baseline)
+    names = write_report(folder, analysis, f"bench {SCRIPT}", CONSTANTS)
     return (folder / "report.html").read_text(encoding="utf-8"), names
 
 
@@ -50,8 +51,8 @@ def sound_page(sound, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def lost_page(lost, tmp_path_factory):
-    return page(lost, tmp_path_factory.mktemp("lost"))[0]
+def not_identifiable_page(not_identifiable, tmp_path_factory):
+    return page(not_identifiable, tmp_path_factory.mktemp("not_identifiable"))[0]
 
 
 def test_page_holds_everything_itself(sound_page):
@@ -60,9 +61,9 @@ def test_page_holds_everything_itself(sound_page):
     assert "http" not in text
     assert "@import" not in text
     assert "url(" not in text
-    assert all(v.startswith(("data:image/svg+xml;base64,", "#")) for v in links.found)
+    assert all(v.startswith(("data:image/svg+xml;base64,", "#")) for v in links.addresses)
     assert links.tags.count("img") == len(names) == 6
-    anchors = {v[1:] for v in links.found if v.startswith("#")}
+    anchors = {v[1:] for v in links.addresses if v.startswith("#")}
     assert anchors <= set(re.findall(r'id="([^"]+)"', text))
     for name in names:
         assert (folder / "figures" / f"{name}.svg").stat().st_size > 2000
@@ -90,22 +91,22 @@ def test_paper_s_factor_is_told(sound_page):
     assert "cyclic_moment" in words(sound_page[0])
 
 
-def test_undetermined_parameters_have_no_numbers(lost, lost_page):
-    fit = lost[0]
+def test_undetermined_parameters_have_no_numbers(not_identifiable, not_identifiable_page):
+    fit = not_identifiable[0]
     assert "✗ converged, not identifiable: the data do not determine Ixx, If and a" in words(
-        lost_page
+        not_identifiable_page
     )
     for row in tables.parameters(fit).rows:
         assert row[1] == "not determined"
         assert row[2:5] == ("–",) * 3
     for name, e in fit.estimates.items():
         for text in (numbers.number(e.value, k) for k in (4, 5, 6)):
-            assert text not in words(lost_page), name
-    assert "a/Ixx" in words(lost_page)
+            assert text not in words(not_identifiable_page), name
+    assert "a/Ixx" in words(not_identifiable_page)
 
 
-def test_combinations_stand_beside_the_baseline(lost, sound):
-    for fit, _, baseline in (lost, sound):
+def test_combinations_stand_beside_the_baseline(not_identifiable, sound):
+    for fit, _, baseline in (not_identifiable, sound):
         rows = {row[0]: row for row in tables.baseline_ratios(fit, baseline).rows}
         assert set(rows) == {"a/Ixx", "a/If"}
         for row in rows.values():
@@ -128,7 +129,7 @@ def test_coloured_residuals_are_announced_before_the_numbers(sound, tmp_path):
 def test_a_fit_without_baseline_and_not_converged(sound, tmp_path):
     fit, problem, _ = sound
     fit = dataclasses.replace(fit, status="not-converged", starts=fit.starts[:1])
-    names = write_report(tmp_path, fit, problem, None, "bench", {})
+    names = write_report(tmp_path, Analysis(fit, problem), "bench", {})
     assert "rls" not in names
     assert "starts" not in names
     text = words((tmp_path / "report.html").read_text(encoding="utf-8"))

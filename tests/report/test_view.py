@@ -43,17 +43,17 @@ def xcell(vehicles_folder):
 
 
 @pytest.mark.parametrize(
-    ("angle", "part", "wanted"),
+    ("angle", "part", "expected"),
     [
         ("theta", [1, 0, 0], [np.cos(0.3), 0, np.sin(0.3)]),  # nose up
         ("phi", [0, 1, 0], [0, -np.cos(0.3), -np.sin(0.3)]),  # right side down
         ("psi", [1, 0, 0], [np.cos(0.3), -np.sin(0.3), 0]),  # nose right; the figure's y is left
     ],
 )
-def test_the_shape_turns_as_the_machine_does(angle, part, wanted):
+def test_the_shape_turns_as_the_machine_does(angle, part, expected):
     states = SimpleNamespace(**{"phi": 0.0, "theta": 0.0, "psi": 0.0, angle: 0.3})
     shape = animation.placed(np.array([part], float), animation.attitude(states), np.zeros(3))
-    np.testing.assert_allclose(shape[0], wanted, atol=1e-12)
+    np.testing.assert_allclose(shape[0], expected, atol=1e-12)
 
 
 def test_the_mast_points_where_the_thrust_does(xcell):
@@ -73,35 +73,35 @@ def test_frames_follow_the_run(xcell):
 
     t = 0.02 * np.arange(1000)
     run = flown(1000, x=2.0 * t, y=0.5 * t, z=0.1 * t, phi=0.2 * np.sin(t))
-    made = animation.animation(run, xcell)
-    go.Figure(made)  # plotly knows every name in it
-    assert len(made["frames"]) == animation.MOST_FRAMES
-    scene = made["layout"]["scene"]
+    figure = animation.animation(run, xcell)
+    go.Figure(figure)  # plotly knows every name in it
+    assert len(figure["frames"]) == animation.MOST_FRAMES
+    scene = figure["layout"]["scene"]
     spans = {a: np.ptp(scene[f"{a}axis"]["range"]) for a in "xyz"}
     ratio = {a: scene["aspectratio"][a] / spans[a] for a in "xyz"}
     assert ratio["x"] == pytest.approx(ratio["y"], rel=1e-3)
     assert ratio["x"] == pytest.approx(ratio["z"], rel=1e-3)
-    last = made["frames"][-1]
-    steps = made["layout"]["sliders"][0]["steps"]
+    last = figure["frames"][-1]
+    steps = figure["layout"]["sliders"][0]["steps"]
     assert (steps[-1]["label"], steps[-1]["args"][0]) == ("19.98", [last["name"]])
-    assert len({f["name"] for f in made["frames"]}) == len(steps)
+    assert len({f["name"] for f in figure["frames"]}) == len(steps)
     path = last["data"][0]
     assert (path["x"][-1], path["y"][-1]) == pytest.approx((2 * t[-1], -0.5 * t[-1]), abs=1e-3)
-    assert len(made["frames"][10]["data"][0]["x"]) == 11
+    assert len(figure["frames"][10]["data"][0]["x"]) == 11
     low, high = scene["yaxis"]["range"]
     for at, text in zip(scene["yaxis"]["tickvals"], scene["yaxis"]["ticktext"], strict=True):
         assert low <= at <= high
         assert float(text) == pytest.approx(-at)
-    disk = np.array([made["data"][4][a] for a in "xyz"]).T
+    disk = np.array([figure["data"][4][a] for a in "xyz"]).T
     radius = np.linalg.norm(disk[1:] - disk[0], axis=1)
     assert radius == pytest.approx(animation.size_of(run, float(xcell.R)) * float(xcell.R), 1e-3)
 
 
 @pytest.mark.parametrize("n", [2, 3, 199, 200, 201, 5000])
 def test_frames_thin_the_record(n):
-    found = animation.frames_of(n)
-    assert (found[0], found[-1]) == (0, n - 1)
-    assert found.size == min(n, animation.MOST_FRAMES)
+    frames = animation.frames_of(n)
+    assert (frames[0], frames[-1]) == (0, n - 1)
+    assert frames.size == min(n, animation.MOST_FRAMES)
 
 
 def test_figures_show_everything_and_shade_what_was_left():
@@ -129,8 +129,8 @@ def test_page_holds_everything_itself_and_escapes(tmp_path, xcell):
     write_view(path, {SCRIPT: run, "two": run}, HELICOPTER, xcell, f"x {SCRIPT}", [note])
     text = path.read_text(encoding="utf-8")
     links = Links(text)
-    assert links.found
-    assert all(v.startswith("data:image/svg+xml;base64,") for v in links.found)
+    assert links.addresses
+    assert all(v.startswith("data:image/svg+xml;base64,") for v in links.addresses)
     assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=[\"']?https?:", text)
     assert "<script>alert(1)</script>" not in text
     assert f"<title>x {SCRIPT.replace('<', '&lt;').replace('>', '&gt;')}</title>" in text

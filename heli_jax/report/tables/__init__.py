@@ -1,0 +1,43 @@
+"""What the report's page says, as words and as rows of text; the page itself is the template."""
+
+from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals
+from heli_jax.report.tables.baseline import baseline_facts, baseline_ratios
+from heli_jax.report.tables.estimates import (
+    Nuisances,
+    combinations,
+    intervals,
+    nuisances,
+    parameters,
+    starts,
+    verdict,
+)
+from heli_jax.report.tables.headline import Headline, adequate, headline, model_remark, warnings
+from heli_jax.report.tables.provenance import Origin, constants, origins
+from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
+
+__all__ = [
+    "NOT_DETERMINED",
+    "Headline",
+    "Nuisances",
+    "Origin",
+    "Table",
+    "acceptance",
+    "adequate",
+    "agreement",
+    "baseline_facts",
+    "baseline_ratios",
+    "choice",
+    "combinations",
+    "constants",
+    "headline",
+    "intervals",
+    "model_remark",
+    "nuisances",
+    "origins",
+    "pairs",
+    "parameters",
+    "residuals",
+    "starts",
+    "verdict",
+    "warnings",
+]

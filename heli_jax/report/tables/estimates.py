@@ -1,0 +1,149 @@
+"""Tables of the estimates: values and intervals, what the data determine, where starts led."""
+
+import math
+from typing import NamedTuple
+
+from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.result import Estimate, Fit
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.numbers import NOTHING, measured, number, percent, relative
+from heli_jax.report.style import pretty
+from heli_jax.report.tables.table import NOT_DETERMINED, Table
+
+
+def parameters(fit: Fit) -> Table:
+    """The free parameters; where the data do not determine one, that is said in place of it."""
+    head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
+    rows = [_estimate(n, e) for n, e in fit.estimates.items()]
+    if fit.coloured:
+        # What the sd would be if residuals were white, so that the price of their autocorrelation
+        # can be seen.
+        rows = [
+            (*row, NOTHING if e.sd_white is None else measured(e.sd_white, e.sd_white)[0])
+            for row, e in zip(rows, fit.estimates.values(), strict=True)
+        ]
+        return Table((*head, "prior share", "at bound", "sd if white"), rows)
+    return Table((*head, "prior share", "at bound"), rows)
+
+
+def _estimate(name: str, e: Estimate) -> tuple[str, ...]:
+    start, share = number(e.start, 5), percent(e.prior_share, 0)
+    bound = "yes" if e.at_bound else "no"
+    # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
+    if e.sd is None or e.lower95 is None or e.upper95 is None:
+        return (name, NOT_DETERMINED, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    interval = f"{low} to {high}"
+    share_sd = relative(e.sd, e.value)
+    return (name, value, sd, share_sd, interval, pretty(e.unit), start, share, bound)
+
+
+class Nuisances(NamedTuple):
+    """Gains, time shifts and biases; initial states apart, for there may be many."""
+
+    shown: Table
+    folded: Table
+
+
+def nuisances(fit: Fit) -> Nuisances:
+    """What was estimated beside the parameters."""
+    head = ("unknown", "estimate", "sd", "95 % interval", "unit")
+    rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
+    folded = [row for n, row in rows.items() if "/initial " in n]
+    return Nuisances(
+        Table(head, [row for n, row in rows.items() if "/initial " not in n]), Table(head, folded)
+    )
+
+
+def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
+    if e.sd is None or e.lower95 is None or e.upper95 is None:
+        return (name, NOT_DETERMINED, NOTHING, NOTHING, pretty(e.unit))
+    value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
+    return (name, value, sd, f"{low} to {high}", pretty(e.unit))
+
+
+def combinations(fit: Fit) -> Table:
+    """What the data do determine where they do not determine every parameter."""
+    rows = []
+    for c in fit.verdict.combinations:
+        value, low, high, sd = measured(c.sd, c.value, c.lower95, c.upper95)
+        rows.append((c.name, value, sd, relative(c.sd, c.value), f"{low} to {high}"))
+    return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
+
+
+def intervals(comparison: Intervals, fit: Fit) -> Table:
+    """95 % intervals by parameter and method."""
+    methods = ("gaussian", "profile", "bootstrap", "nuts")
+    present = [m for m in methods if any(m in by for by in comparison.by_parameter.values())]
+    rows = []
+    for name, by_method in comparison.by_parameter.items():
+        cells = []
+        for m in present:
+            # All to the digits of the Gaussian sd, so that the ends can be compared by eye.
+            ends = by_method.get(m, (math.nan, math.nan))
+            low, high, _ = measured(fit.estimates[name].sd, *ends)
+            cells.append(f"{low} to {high}" if m in by_method else NOTHING)
+        rows.append((name, *cells, pretty(fit.estimates[name].unit)))
+    heads = {"gaussian": "Gaussian", "nuts": "NUTS"}
+    return Table(("parameter", *(heads.get(m, m) for m in present), "unit"), rows)
+
+
+def verdict(fit: Fit) -> Table:
+    """The verdict's numbers at the start values and at the estimates."""
+    before, after = fit.verdict_before, fit.verdict
+    n = len(after.names)
+    rows = [
+        ("rank", f"{before.rank} of {n}", f"{after.rank} of {n}"),
+        (
+            "rank without priors",
+            f"{before.rank_without_priors} of {n}",
+            f"{after.rank_without_priors} of {n}",
+        ),
+        ("condition number", number(before.condition, 3), number(after.condition, 3)),
+        ("singular values", _singular_values(before), _singular_values(after)),
+        ("strong pairs (correlation beyond 0.99)", _pairs(before), _pairs(after)),
+        (
+            "directions that are not identifiable (log parameters)",
+            _null_directions(before),
+            _null_directions(after),
+        ),
+    ]
+    return Table(("", "at the start values", "at the estimates"), rows)
+
+
+def _singular_values(v: Verdict) -> str:
+    return ", ".join(number(float(s), 3) for s in v.singular_values)
+
+
+def _pairs(v: Verdict) -> str:
+    # Five digits: beyond 0.99 it is the last ones that count.
+    cells = [f"{p.first}, {p.second}: {p.correlation:+.5f}" for p in v.pairs]
+    return "; ".join(cells).replace("-", "−") or "none"
+
+
+def _null_directions(v: Verdict) -> str:
+    # Components of up to 0.005 would be printed as 0.00: the direction does not have them.
+    cells = [
+        ", ".join(f"{n} {x:+.2f}" for n, x in d.items() if abs(x) > 0.005)
+        for d in v.null_directions
+    ]
+    return "; ".join(cells).replace("-", "−") or "none"
+
+
+def starts(fit: Fit) -> Table:
+    """Where every start led."""
+    names = list(fit.starts[0].start) if fit.starts else []
+    missing = {*fit.verdict.undetermined, *fit.verdict.without_effect}
+    rows = [
+        (
+            str(i + 1),
+            *(number(s.start[n], 4) for n in names),
+            *(NOT_DETERMINED if n in missing else number(s.end[n], 6) for n in names),
+            number(s.cost, 7),
+            str(s.steps),
+            f"optimum {s.optimum}" if s.converged else "failed",
+        )
+        for i, s in enumerate(fit.starts)
+    ]
+    ends = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
+    return Table(("", *ends, "cost", "steps", "led to"), rows)

@@ -1,0 +1,93 @@
+"""The verdict in one line, and what a reader has to know before the numbers."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
+from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Fit
+from heli_jax.report.files import adequate_unjudged, whiteness_note
+from heli_jax.vehicle import of_helicopter
+
+
+class Headline(NamedTuple):
+    """The verdict in one line."""
+
+    level: str
+    """good, warning or bad"""
+    word: str
+    text: str
+
+
+def headline(fit: Fit) -> Headline:
+    """Did the optimiser arrive; what do the data determine; is the model adequate."""
+    level, word, text = _determined(fit)
+    if not fit.adequate:
+        worst = fit.adequacy.less_than_mean or level == "bad"
+        level = "bad" if worst else "warning"
+    if fit.adequacy.doubtful and level == "good":
+        level = "warning"
+    return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
+
+
+def adequate(fit: Fit) -> str:
+    """`yes`, `no (...)`; what stopped before an optimum and looks adequate was not judged."""
+    return "not judged" if adequate_unjudged(fit) else fit.adequacy.summary
+
+
+def _determined(fit: Fit) -> Headline:
+    """The status in words: what the data determine, and whether that may be believed."""
+    v, names = fit.verdict, tuple(fit.estimates)
+    # Before all else: what is said at a point that is no optimum holds for that point alone.
+    if fit.status == "not-converged":
+        text = "the optimiser stopped before an optimum; the numbers below are where it stopped"
+        return Headline("bad", "not converged", text)
+    if fit.status == "not-identifiable":
+        missing = [n for n in v.names if n in v.undetermined or n in v.without_effect]
+        text = f"the data do not determine {listed(missing or list(v.names))}"
+        return Headline("bad", "converged, not identifiable", text)
+    resting = bool(v.resting)
+    # The sentence must not credit the data with what a prior contributed.
+    who = "the data and the priors together" if resting else "the data"
+    text = f"{who} determine {listed(names)}"
+    doubtful = _doubts(fit)
+    if doubtful:
+        text += f", but {listed(doubtful)}"
+    return Headline("warning" if doubtful or resting else "good", "converged", text)
+
+
+def _doubts(fit: Fit) -> list[str]:
+    """What a reader has to know of estimates that are determined."""
+    v = fit.verdict
+    doubts = [
+        ("the intervals are too narrow", fit.narrow),
+        ("the residuals are not white", fit.coloured and not fit.white),
+        # Widened though each residual is white by itself: then several outputs err together.
+        ("residuals of outputs are correlated", fit.coloured and fit.white),
+        ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
+        ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
+    ]
+    return [words for words, is_so in doubts if is_so]
+
+
+def warnings(fit: Fit) -> list[str]:
+    """What a reader has to know before the numbers."""
+    # Whiteness first: the template takes the first one for it where residuals are not white.
+    note = whiteness_note(fit)
+    return ([note] if note else []) + list(fit.notes)
+
+
+def model_remark(problem: Problem) -> str:
+    """Why an inertia found here is a number of the paper's model; empty for other models."""
+    # A model with parameters of its own need not have the paper's equations 14 and 15.
+    if not of_helicopter(problem.model.Params):
+        return ""
+    factor = float(np.asarray(problem.vehicle.cyclic_moment))
+    return (
+        "Ixx and If are numbers of the paper's model, not of the machine: eqs 14-15 have the "
+        f"factor 1/2 (cyclic_moment, here {factor:g}) where blade-element theory averaged over a "
+        "turn gives 1/8 for two blades, and the inertia that is found grows and shrinks with it. "
+        "Compare an estimate with a weighed or swung inertia only with that in mind."
+    )
