@@ -28,7 +28,7 @@ def estimates_of(
     """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns, and
     their intervals reach `quantiles` (q,) deviations to either side."""
     unknowns = unknowns_of(problem, layout, e)
-    references = references_of(problem, layout, unknowns)
+    references = references_of(problem, unknowns)
     norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
     sds = deviations(e.J)
     known = (norms > 0) & np.isfinite(sds)
