@@ -43,7 +43,7 @@ from heli_jax.identification.uncertainty.estimates import (
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
-from heli_jax.identification.validation.adequacy import Adequacy, assess
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import (
@@ -293,8 +293,8 @@ def _hold_notes(
     if not bool(settled.best.converged):
         return []
     sd = {n: one.sd for n, one in named.items() if one.sd is not None}
-    at = (search.layout, search.data, settled.noise, settled.best.z)
-    return other_hold(problem, *at, e, sd, in_doubt=True)
+    at = Solution(search.layout, search.data, settled.noise, settled.best.z)
+    return other_hold(problem, at, e, sd, in_doubt=True)
 
 
 def _correlation_notes(together: dict[str, float]) -> list[str]:
@@ -316,7 +316,8 @@ def _adequacy(
         Record(s.flight, flight.dt, s.measured, s.simulated)
         for s, flight in zip(signals, problem.training, strict=True)
     )
-    return assess(problem, params, records, pooled_metrics(signals), white, against, unknowns)
+    evidence = Evidence(records, pooled_metrics(signals), white, against, unknowns)
+    return assess(problem, params, evidence)
 
 
 def _disturbance_notes(ratio: float | None) -> list[str]:

@@ -26,6 +26,7 @@ from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
     Noise,
+    Solution,
     layout_of,
     unpack,
 )
@@ -71,7 +72,7 @@ def check(problem: Problem) -> Check:
     runs = tuple(s.simulated for s in signals_of(e, problem.training))
     notes = excitation.notes(problem, runs, begin.noise.sd)
     lost = (*verdict.undetermined, *verdict.without_effect)
-    notes += other_hold(problem, *begin[:4], e, skip=lost)
+    notes += other_hold(problem, Solution(*begin[:4]), e, skip=lost)
     scales = unpack(begin.layout, begin.data, begin.z).scales
     guessed = tuple(
         f"{label}/{name}"
