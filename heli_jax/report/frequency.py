@@ -60,10 +60,9 @@ def at_record(model: Model, params: Any, signals: Signals, fit: Fit) -> Operatin
     """Where the model is linearised for a record, with the gains that were estimated."""
     named = {n: fit.nuisance.get(f"gain {n}") for n in signals.inputs}
     gains = {n: one.value for n, one in named.items() if one is not None}
+    inputs = {n: gains.get(n, 1.0) * np.asarray(u) for n, u in signals.inputs.items()}
     dt = float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
-    return operating_point(
-        model, params, signals.inputs, signals.measured, dt, substeps=substeps_for(dt), gains=gains
-    )
+    return operating_point(model, params, inputs, signals.measured, dt, substeps=substeps_for(dt))
 
 
 def responses(

@@ -231,29 +231,34 @@ def _moves_against(name: str, records: tuple[Record, ...]) -> bool:
 
     A disturbance knows nothing of the inputs. So the slope of the measured on the simulated output
     is 1 but for what chance makes of the two, whose autocorrelations say how much that is
-    (Bartlett, 1935). In a record of a few swings of the disturbance that is little known, and the
-    slope may well be below zero. Where an input has the wrong sign and the parameters keep theirs,
-    the filter takes the response for disturbance and the simulation shrinks: the slope is then
-    several times below -1.
+    (Bartlett, 1935).
     """
-    # The disturbance's part of the output is d = y - m, so the slope of y on m is 1 + d'm / m'm:
-    # what is tested is d'm, with the variance that two independent signals of their
-    # autocorrelations give it.
+    # Where an input has the wrong sign and the parameters keep theirs, the filter takes the
+    # response for disturbance and the simulation shrinks: the slope is then several times below
+    # -1. A slope that is merely negative tells nothing in a record of a few swings.
     product, power, variance = 0.0, 0.0, 0.0
     for r in records:
         if name not in r.measured or not np.isfinite(r.simulated[name]).all():
             continue
-        y, m = r.measured[name], r.simulated[name]
-        d, m = np.where(np.isnan(y), 0.0, y - m - np.nanmean(y - m)), m - m.mean()
-        lags = max(1, y.size // 5)
-        # Bartlett's window: without it the sum over the lags can be negative, and no variance.
-        window = 1.0 - np.arange(lags + 1) / (lags + 1)
-        both = window * autocorrelation(d, lags) * autocorrelation(m, lags)
-        product, power = product + float(d @ m), power + float(m @ m)
-        variance += float(d @ d) * float(m @ m) * (both[0] + 2.0 * both[1:].sum()) / y.size
+        covariance, own_power, chance = _covariance_by_chance(r.measured[name], r.simulated[name])
+        product, power, variance = product + covariance, power + own_power, variance + chance
     if not (power > 0 and variance > 0):
         return False
     return 1.0 + product / power < _TURNED and product / variance**0.5 < _FIVE_PERCENT
+
+
+def _covariance_by_chance(y: np.ndarray, m: np.ndarray) -> tuple[float, float, float]:
+    """Of the disturbance's part d = y - m of an output: d'm, m'm, and the variance that d'm has
+    where the two are independent."""
+    # The slope of y on m is 1 + d'm / m'm.
+    d, m = np.where(np.isnan(y), 0.0, y - m - np.nanmean(y - m)), m - m.mean()
+    lags = max(1, y.size // 5)
+    # Bartlett's window: without it the sum over the lags can be negative, and no variance.
+    window = 1.0 - np.arange(lags + 1) / (lags + 1)
+    both = window * autocorrelation(d, lags) * autocorrelation(m, lags)
+    power = float(m @ m)
+    chance = float(d @ d) * power * (both[0] + 2.0 * both[1:].sum()) / y.size
+    return float(d @ m), power, chance
 
 
 def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, float]:
@@ -267,34 +272,33 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
         noise = float(np.average(noises, weights=sizes))
     if not np.isfinite(residual):
         return float("nan"), float("nan")
+    # The guess of the noise may exceed a residual that is noise alone.
     other = max(residual - noise, 0.0)
     rest = max(total - min(noise, residual), 1e-300)
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
 def _reason(output: OutputAdequacy) -> str:
-    if not np.isfinite(output.vaf):
-        return f"The simulated {output.output} is not finite: nothing of it is explained."
-    if output.vaf < 0:
+    name, vaf, ratio = output.output, output.vaf, output.against_disturbance
+    if not np.isfinite(vaf):
+        return f"The simulated {name} is not finite: nothing of it is explained."
+    if vaf < 0:
         return (
-            f"Driven by the inputs alone, the model follows {output.output} worse than its mean "
-            f"does (VAF {output.vaf:.3g}): its parameters mean little. Are the columns, signs and "
-            "units the right ones, and the start values near?"
+            f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
+            f"{vaf:.3g}): its parameters mean little. Are the columns, signs and units the right "
+            "ones, and the start values near?"
         )
-    if output.against_disturbance is not None and output.against_disturbance > EXPECTED:
+    if ratio is not None and ratio > EXPECTED:
         return (
-            f"The simulated {output.output} misses the measured one by "
-            f"{output.against_disturbance**0.5:.2g} times what the estimated disturbance explains "
-            f"(VAF {output.vaf:.3g})."
+            f"The simulated {name} misses the measured one by {ratio**0.5:.2g} times what the "
+            f"estimated disturbance explains (VAF {vaf:.3g})."
         )
-    if output.against_disturbance is not None:
+    if ratio is not None:
         return (
-            f"The innovations of {output.output} are far from white (autocorrelation "
-            f"{output.lag1:+.2f} at one sample) and its simulation explains little (VAF "
-            f"{output.vaf:.3g})."
+            f"The innovations of {name} are far from white (autocorrelation {output.lag1:+.2f} "
+            f"at one sample) and its simulation explains little (VAF {vaf:.3g})."
         )
     return (
-        f"The model explains {output.explained:.0%} of what in {output.output} is not white noise, "
-        f"expected at least {EXPLAINED:.0%} (VAF {output.vaf:.3g}); the acceptance card asks for a "
-        "VAF of 0.9."
+        f"The model explains {output.explained:.0%} of what in {name} is not white noise, expected "
+        f"at least {EXPLAINED:.0%} (VAF {vaf:.3g}); the acceptance card asks for a VAF of 0.9."
     )

@@ -94,6 +94,7 @@ def _white_sd(e: Evaluation, q: int) -> np.ndarray:
 
 def _feeds_through(problem: Problem) -> bool:
     """Whether an input acts on an output at once, without the dynamics."""
+    # At the start values and zero inputs: a term that vanishes there is taken for none.
     return bool(np.any(np.asarray(jacobians(problem.model, problem.start_params()).D)))
 
 
@@ -147,8 +148,7 @@ def _sentence(
     changes: dict[str, tuple[float, float]],
 ) -> list[str]:
     """What would change; `changes` by name, SI and in sds."""
-    large = [n for n, (_, sds) in changes.items() if sds > 1.0]
-    large = sorted(large, key=lambda n: -changes[n][1])
+    large = sorted((n for n in changes if changes[n][1] > 1.0), key=lambda n: -changes[n][1])
     if not large:
         return []
     taken = dict.fromkeys(
@@ -168,6 +168,7 @@ def _sentence(
 
 
 def _changed(name: str, value: float, change: float, sds: float) -> str:
+    # Relative to a shift of nearly zero a change would be any percentage.
     if name == "time_shift":
         share = f"{1e3 * change:+.2g} ms"
     else:
