@@ -113,8 +113,8 @@ def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
     # From the axes of the ground to those of the heading, which a trim speaks of.
     forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
     # Records of hover drift: their trim would be called one of forward flight.
-    speeds = [float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz)]
-    return Condition(*speeds, psi) if any(speeds) else HOVER
+    forward, lateral, up = (float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz))
+    return Condition(forward, lateral, up, psi) if forward or lateral or up else HOVER
 
 
 def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
