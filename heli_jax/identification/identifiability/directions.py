@@ -50,9 +50,9 @@ def projected(J: np.ndarray, nuisances: np.ndarray, smallest: float | None = Non
     # With the nuisances first, the lower right corner is what they cannot explain.
     if smallest is None or k == 0:
         return R[k : k + q, k:]
-    S, shown = R[:, k:], _span(R[:, :k], smallest)
+    S, spanned = R[:, k:], _span(R[:, :k], smallest)
     for _ in range(2):  # the second time takes off what rounding left the first time
-        S = S - shown @ (shown.T @ S)
+        S = S - spanned @ (spanned.T @ S)
     return S
 
 

@@ -1,6 +1,6 @@
 """Where a fit starts: the unknowns at the values that the problem and its records suggest."""
 
-from typing import Any  # params: any record class of a model
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, FlightData, Layout
+
+# params is Any: a record of a model's Params, whose class may be a user's own.
 
 
 def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:

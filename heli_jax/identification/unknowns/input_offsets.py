@@ -20,6 +20,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.vehicle import of_helicopter
 
+# params, states and inputs are Any: records of a model, whose classes may be a user's own.
+
 _EXPLAINED = 1e-6
 """part of an offset's response that initial states and biases leave over where they explain it"""
 _POINTS = 200

@@ -34,6 +34,8 @@ from heli_jax.identification.validation.metrics import (
     autocorrelation,
 )
 
+# params is Any: a record of a model's Params, whose class may be a user's own.
+
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
 NEARLY_WHITE = 0.1

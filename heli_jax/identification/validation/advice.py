@@ -15,6 +15,8 @@ from heli_jax.identification.validation.metrics import cross_correlation
 from heli_jax.identification.validation.operating_point import modes_of_flight
 from heli_jax.simulation.simulate import simulate
 
+# params is Any: a record of a model's Params, whose class may be a user's own.
+
 GATE = 0.9
 """VAF that the acceptance card asks for: below it, with residuals not white, there is doubt"""
 FAR_FROM_WHITE = 0.5
