@@ -63,6 +63,7 @@ def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarra
         size[pivots] = 0.0
         # Half of the largest pivot is as stable as it needs to be, and leaves a choice of names.
         near = [i for i in range(W.shape[1]) if size[i] >= 0.5 * size.max()]
+        # The pivot is what the others are divided by, so if possible it is one that has powers.
         proper = [i for i in near if unknowns[i].is_parameter and unknowns[i].logarithmic]
         pivot = (proper or near)[-1]
         row = k + int(np.argmax(np.abs(W[k:, pivot])))

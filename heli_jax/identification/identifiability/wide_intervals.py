@@ -64,6 +64,7 @@ def reported_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> 
     # Autocorrelated residuals have no rows of their own, only the covariance of the sandwich.
     if not _reaching_too_far(covariance, unknowns):
         return []
+    # As in `too_wide`: if no single direction is too wide, the widest stands for their sum.
     values, vectors = np.linalg.eigh(covariance)
     return [unit_vector(v) for v in vectors[:, values > _FAR**2].T] or [unit_vector(vectors[:, -1])]
 
