@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
 
-# By the number; more than nine are not counted out.
+# Index is the number; from nine on all are called nine.
 _NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 _STATED = 8.0 / 9.0
 """share of what is known of a parameter above which it is said that weak priors hold it: its sd
