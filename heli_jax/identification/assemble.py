@@ -40,10 +40,10 @@ from heli_jax.identification.uncertainty.estimates import (
     prior_notes,
     stated_noise_notes,
 )
-from heli_jax.identification.unknowns.layout import Layout, Noise, Reached, unpack
+from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
-from heli_jax.identification.validation.adequacy import Adequacy, assess
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import (
@@ -145,7 +145,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
     nuisance |= flight_nuisances(problem, layout, data, best.z, e, sure.quantiles, sure.wider)
     none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
     if none:
-        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
+        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.disturbance}
     held = _held_out(problem, search, settled)
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
@@ -191,7 +191,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
         steps=sum(s for s, _ in settled.trace),
         trace=settled.trace,
         notes=tuple(notes),
-        reached=Reached(layout, data, noise, best.z),
+        reached=Solution(layout, data, noise, best.z),
         seed=ran.seed,
         timing=ran.timing,
     )
@@ -200,7 +200,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
 def _unknowns(layout: Layout, *, none: bool) -> int:
     """All that was estimated; a disturbance that does not show is not among it."""
     estimated = layout.determined + layout.estimator.noise_unknowns(layout)
-    return estimated - (len(layout.noise) if none else 0)
+    return estimated - (len(layout.disturbance) if none else 0)
 
 
 def _notes(
@@ -220,7 +220,7 @@ def _notes(
         ill: whether the numbers are rounding.
     """
     layout, data, best = search.layout, search.data, settled.best
-    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    reached = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
     return [
         *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
@@ -238,7 +238,7 @@ def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
     along = np.zeros((len(verdict.combinations), layout.size))
     for k, c in enumerate(verdict.combinations):
         for name, power in c.exponents.items():
-            i = layout.named.index(name)
+            i = layout.of_interest.index(name)
             along[k, i] = power * slopes[i]
     return along
 
@@ -246,8 +246,8 @@ def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
 def _reported(errors: Sandwich, layout: Layout, e: Evaluation, quantiles: np.ndarray) -> np.ndarray:
     """Covariance (k, k) of the named unknowns with autocorrelated residuals, as wide as the
     intervals that are reported."""
-    named = np.eye(layout.size)[: len(layout.named)]
-    factor = quantiles[: len(layout.named)] / Z95
+    named = np.eye(layout.size)[: len(layout.of_interest)]
+    factor = quantiles[: len(layout.of_interest)] / Z95
     return errors.covariance(named) * np.outer(factor, factor)
 
 
@@ -293,8 +293,8 @@ def _hold_notes(
     if not bool(settled.best.converged):
         return []
     sd = {n: one.sd for n, one in named.items() if one.sd is not None}
-    at = (search.layout, search.data, settled.noise, settled.best.z)
-    return other_hold(problem, *at, e, sd, in_doubt=True)
+    at = Solution(search.layout, search.data, settled.noise, settled.best.z)
+    return other_hold(problem, at, e, sd, in_doubt=True)
 
 
 def _correlation_notes(together: dict[str, float]) -> list[str]:
@@ -316,7 +316,8 @@ def _adequacy(
         Record(s.flight, flight.dt, s.measured, s.simulated)
         for s, flight in zip(signals, problem.training, strict=True)
     )
-    return assess(problem, params, records, pooled_metrics(signals), white, against, unknowns)
+    evidence = Evidence(records, pooled_metrics(signals), white, against, unknowns)
+    return assess(problem, params, evidence)
 
 
 def _disturbance_notes(ratio: float | None) -> list[str]:

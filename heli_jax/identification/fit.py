@@ -26,6 +26,7 @@ from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
     Noise,
+    Solution,
     layout_of,
     unpack,
 )
@@ -71,7 +72,7 @@ def check(problem: Problem) -> Check:
     runs = tuple(s.simulated for s in signals_of(e, problem.training))
     notes = excitation.notes(problem, runs, begin.noise.sd)
     lost = (*verdict.undetermined, *verdict.without_effect)
-    notes += other_hold(problem, *begin[:4], e, skip=lost)
+    notes += other_hold(problem, Solution(*begin[:4]), e, skip=lost)
     scales = unpack(begin.layout, begin.data, begin.z).scales
     guessed = tuple(
         f"{label}/{name}"
@@ -108,9 +109,9 @@ def fit(
     tell = progress or (lambda _: None)
     begin = _begin(problem)
     before = verdict_of(problem, begin.layout, begin.e)
-    tell(f"fitting {', '.join(begin.layout.named)}")
+    tell(f"fitting {', '.join(begin.layout.of_interest)}")
     points = starting.draw(begin.layout, problem, begin.z, starts, seed)
-    asked = "sigma_w" in begin.layout.noise
+    asked = "sigma_w" in begin.layout.disturbance
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     short = min(max_steps, _FIRST_STEPS) if asked else max_steps

@@ -89,15 +89,15 @@ def at_record(flight: FittedFlight) -> OperatingPoint:
     # What acts is gain times what was logged: the mean of the log would be another point.
     estimates = {n: flight.fit.nuisance.get(f"gain {n}") for n in signals.inputs}
     gains = {n: gain.value for n, gain in estimates.items() if gain is not None}
+    inputs = {n: gains.get(n, 1.0) * np.asarray(u) for n, u in signals.inputs.items()}
     dt = float(signals.times[1] - signals.times[0]) if signals.times.size > 1 else 1.0
     return operating_point(
         flight.model,
         flight.params,
-        signals.inputs,
+        inputs,
         signals.measured,
         dt,
         substeps=substeps_for(dt),
-        gains=gains,
     )
 
 

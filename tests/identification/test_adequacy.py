@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, cli, fit, models
-from heli_jax.identification.validation.adequacy import assess
+from heli_jax.identification.validation.adequacy import Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.metrics import metrics, whiteness
 from tests.identification.bench import BENCH, vehicle
@@ -66,7 +66,7 @@ def judged(measured, simulated, *, model=own, against=None, **how):
     white = {f"flight 1/{name}": whiteness(measured - simulated)}
     against = None if against is None else {name: against}
     agreement = {name: metrics(measured, simulated)}
-    return assess(problem, params, (record,), agreement, white, against)
+    return assess(problem, params, Evidence((record,), agreement, white, against))
 
 
 def test_white_residuals_are_adequate_whatever_is_explained():

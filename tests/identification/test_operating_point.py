@@ -135,9 +135,7 @@ def test_own_models_are_linearised_at_the_records_mean():
 
     t = np.arange(N) * DT
     run = scipy.integrate.solve_ivp(rate, (0, t[-1]), [0.0], t_eval=t, max_step=DT / 4, rtol=1e-8)
-    at = operating_point(
-        sled, Params(drag), {"force": u}, {"speed": run.y[0]}, DT, gains={"force": gain}
-    )
+    at = operating_point(sled, Params(drag), {"force": gain * u}, {"speed": run.y[0]}, DT)
     assert at.words == "the record's mean"
     assert float(at.inputs.force) == pytest.approx(gain * u.mean())
     assert float(at.state.v) == pytest.approx(run.y[0].mean(), rel=1e-3)

@@ -6,7 +6,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.identification.estimation.levenberg_marquardt import slopes
-from heli_jax.identification.identifiability.analysis import judge
+from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
@@ -50,15 +50,15 @@ def test_reported_intervals_enter_the_verdict():
     unknowns = tuple(Unknown(n, 1.0, True, 1.0, 0.0) for n in ("p", "q"))
     limit = np.log(FACTOR) / Z95
     sensitivity = np.diag([10.0, 10.0])
-    assert judge(sensitivity, unknowns).identifiable
+    assert analyse(sensitivity, unknowns).identifiable
     inside, outside = np.diag([0.01, 0.9 * limit**2]), np.diag([0.01, 1.1 * limit**2])
-    assert judge(sensitivity, unknowns, reported=inside).identifiable
-    wide = judge(sensitivity, unknowns, reported=outside)
+    assert analyse(sensitivity, unknowns, reported=inside).identifiable
+    wide = analyse(sensitivity, unknowns, reported=outside)
     assert not wide.identifiable
     assert wide.undetermined == ("q",)
     # A parameter that may be zero has no factor.
     scaled = (unknowns[0], unknowns[1]._replace(logarithmic=False))
-    assert judge(sensitivity, scaled, reported=outside).identifiable
+    assert analyse(sensitivity, scaled, reported=outside).identifiable
 
 
 def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):

@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
-from heli_jax.identification.identifiability.analysis import judge
+from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
@@ -85,7 +85,7 @@ def unknowns(*names: str, **priors: float) -> tuple[Unknown, ...]:
 
 def test_the_factor_of_ten_is_asked_of_the_others_too_where_one_has_no_effect():
     sensitivity = np.array([[100.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
-    verdict = judge(sensitivity, unknowns("L", "B", "D"))
+    verdict = analyse(sensitivity, unknowns("L", "B", "D"))
     assert set(verdict.undetermined) == {"B", "D"}
     assert "The data determine L." in verdict.text
     assert "determine L and B" not in verdict.text
@@ -94,19 +94,19 @@ def test_the_factor_of_ten_is_asked_of_the_others_too_where_one_has_no_effect():
 def test_the_reported_interval_is_asked_of_the_others_too():
     sensitivity = np.array([[100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     reported = np.diag([1e-4, 4.0, 0.0])
-    verdict = judge(sensitivity, unknowns("L", "B", "D"), reported=reported)
+    verdict = analyse(sensitivity, unknowns("L", "B", "D"), reported=reported)
     assert set(verdict.undetermined) == {"B", "D"}
 
 
 def test_who_takes_a_small_part_is_not_called_determined():
     sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 1.0]])
-    verdict = judge(sensitivity, unknowns("a", "c", "B"))
+    verdict = analyse(sensitivity, unknowns("a", "c", "B"))
     assert set(verdict.undetermined) == {"a", "c"}
     assert "The data determine B." in verdict.text
 
 
 def test_what_rests_on_its_prior_is_not_called_determined_by_the_data():
     sensitivity = np.array([[1.0, 0.0], [0.0, 50.0]])
-    verdict = judge(sensitivity, unknowns("a", "B", a=100.0))
+    verdict = analyse(sensitivity, unknowns("a", "B", a=100.0))
     assert "The data determine B." in verdict.text
     assert "a rests on its prior" in verdict.text

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, models
-from heli_jax.identification.identifiability.analysis import judge
-from heli_jax.identification.identifiability.directions import Held, projected
+from heli_jax.identification.identifiability.analysis import analyse
+from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
 from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle
@@ -174,8 +174,10 @@ def test_a_signed_parameter_that_weak_priors_narrow_tenfold_is_not_determined():
     offset = Unknown("L0", 0.1, False, 1.0, 0.0)
     for hold, identifiable in ((20.0, False), (2.0, True)):
         bare = np.array([[0.5]])
-        held = Held(bare, np.array([[1.0]]), ("the bias of p",), ("flight 1/bias p",), {})
-        verdict = judge(hold * bare, (offset,), held=held)
+        without_weak = WithoutWeakPriors(
+            bare, np.array([[1.0]]), ("the bias of p",), ("flight 1/bias p",), {}
+        )
+        verdict = analyse(hold * bare, (offset,), without_weak=without_weak)
         assert verdict.identifiable is identifiable
         assert verdict.prior_share["L0"] == pytest.approx(1.0 if hold > 10 else 0.75)
 

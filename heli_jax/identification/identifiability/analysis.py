@@ -19,26 +19,36 @@ from heli_jax.identification.identifiability.combinations import (
 from heli_jax.identification.identifiability.directions import (
     Directions,
     Exchange,
-    Held,
+    WithoutWeakPriors,
     covariance_of,
     directions,
 )
-from heli_jax.identification.identifiability.sentences import Facts, Open, Weakest, sentences
-from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Pair, Unknown, Verdict
+from heli_jax.identification.identifiability.sentences import (
+    Facts,
+    Inseparable,
+    Weakest,
+    sentences,
+)
+from heli_jax.identification.identifiability.verdict import Pair, Unknown, Verdict
+from heli_jax.identification.identifiability.wide_intervals import (
+    TAKES_NO_PART,
+    further,
+    reported_too_wide,
+    single_too_wide,
+    too_wide,
+    weakly_held,
+)
 
 NULL = 1e-8
 """A singular value below this part of the largest counts as zero."""
 ILL_CONDITIONED = 1e4
+"""condition number above which the verdict warns: the data determine all, some of it hardly"""
 STRONG = 0.99
-_PART = 1e-3
-"""of a unit direction that is not determined: less leaves an unknown determined"""
+"""correlation beyond which the verdict names a pair; rank alone does not show it (a stand's damping
+and the flybar's have correlation 1.00000 and full rank)"""
 
 
-_FAR = math.log(FACTOR) / Z95
-"""sd in relative coordinates of an interval that reaches just as far as the factor"""
-
-
-class _Known(NamedTuple):
+class _Determined(NamedTuple):
     """What is known of the unknowns, and along which directions nothing is."""
 
     null: list[np.ndarray]
@@ -52,39 +62,39 @@ class _Known(NamedTuple):
     rank: int
 
 
-def _known(
+def _determined(
     sensitivity: np.ndarray,
     bare: np.ndarray,
-    prior: np.ndarray,
     unknowns: tuple[Unknown, ...],
     null_below: float,
     reported: np.ndarray | None,
-) -> _Known:
+) -> _Determined:
     """Directions without effect, then those whose interval reaches too far.
 
     Args:
         sensitivity, bare: (any, q) with and without the nuisances' weak priors.
-        prior: (q, q) rows of the unknowns' own priors.
     """
     scale = np.array([u.scale for u in unknowns])
+    prior = np.diag([u.prior for u in unknowns])
+    # The rank is that without the weak priors: they give every nuisance a finite interval, and so
+    # would lend one to each parameter that a bias or an initial state can take the place of.
     total = directions(np.vstack([bare, prior]), scale)
-    with_weak = directions(np.vstack([sensitivity, prior]), scale)
     kept = total.singular > null_below * max(total.singular[0], 1e-300)
     without_weak = covariance_of(total, kept, scale)
     covariance = without_weak
     null = [unit_vector(scale * v) for v in total.right[~kept]]
     if not null:
+        # All is determined: the intervals are those of the fit, which has the weak priors.
+        with_weak = directions(np.vstack([sensitivity, prior]), scale)
         covariance = covariance_of(with_weak, with_weak.singular > 0, scale)
-        null = _too_wide(np.vstack([bare, prior]), without_weak, unknowns)
+        null = too_wide(np.vstack([bare, prior]), without_weak, unknowns)
     # What one direction leaves open says nothing of the parameters that take no part in it.
-    null += _further(_weakly_held(without_weak, covariance, unknowns), null)
-    null += _further(_single_too_wide(without_weak, unknowns), null)
+    null += further(weakly_held(without_weak, covariance, unknowns), null)
+    null += further(single_too_wide(without_weak, unknowns), null)
     if reported is not None:
-        wide = (
-            _single_too_wide(reported, unknowns) if null else _reported_too_wide(reported, unknowns)
-        )
-        null += _further(wide, null)
-    return _Known(null, covariance, without_weak, total, int(kept.sum()))
+        wide = single_too_wide if null else reported_too_wide
+        null += further(wide(reported, unknowns), null)
+    return _Determined(null, covariance, without_weak, total, int(kept.sum()))
 
 
 class _ByData(NamedTuple):
@@ -96,133 +106,159 @@ class _ByData(NamedTuple):
 
 
 def _by_data(
-    bare: np.ndarray, known: _Known, unknowns: tuple[Unknown, ...], null_below: float
+    bare: np.ndarray, determined: _Determined, unknowns: tuple[Unknown, ...], null_below: float
 ) -> _ByData:
     scale = np.array([u.scale for u in unknowns])
     data = directions(bare, scale)
     kept = data.singular > null_below * max(data.singular[0], 1e-300)
     covariance = covariance_of(data, kept, scale)
     null = []
-    if not known.null and any(u.prior for u in unknowns):
+    # Without priors this is what has been found already.
+    if not determined.null and any(u.prior for u in unknowns):
         null = [unit_vector(scale * v) for v in data.right[~kept]]
-        null = null or _too_wide(bare, covariance, unknowns)
+        null = null or too_wide(bare, covariance, unknowns)
     return _ByData(null, covariance, int(kept.sum()))
 
 
-def judge(
+class _Analysis(NamedTuple):
+    """All that the verdict is made of."""
+
+    unknowns: tuple[Unknown, ...]
+    determined: _Determined
+    data: _ByData
+    without_effect: tuple[str, ...]
+    groups: tuple[Inseparable, ...]
+    """what is not determined"""
+    resting: tuple[Inseparable, ...]
+    """what priors determine, and the data alone do not"""
+    exchange: Exchange
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Also those that take a small part in a direction that is not determined."""
+        return tuple(
+            u.name
+            for i, u in enumerate(self.unknowns)
+            if any(abs(v[i]) > TAKES_NO_PART for v in self.determined.null)
+        )
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value."""
+        singular = self.determined.total.singular
+        return float(singular[0] / singular[-1]) if singular[-1] > 0 else math.inf
+
+
+def analyse(
     sensitivity: np.ndarray,
     unknowns: tuple[Unknown, ...],
     remedies: Mapping[str, str] | None = None,
     null_below: float = NULL,
-    held: Held | None = None,
+    without_weak: WithoutWeakPriors | None = None,
     reported: np.ndarray | None = None,
 ) -> Verdict:
-    """The verdict from a whitened sensitivity (any rows, q) in relative coordinates.
+    """The verdict from a whitened sensitivity in relative coordinates.
 
     Args:
-        sensitivity: with the nuisances free but for their weak priors. Priors of the unknowns are
-            no rows of it; they come with the unknowns.
+        sensitivity: (any, q) with the nuisances free but for their weak priors. Priors of the
+            unknowns are no rows of it; they come with the unknowns.
+        unknowns: (q,) what the columns are.
         remedies: by name of an unknown, a further way out that the model offers, such as a run
             with a known inertia.
         null_below: the part of the largest singular value that counts as zero.
-        held: the same without the weak priors, which count as data where it is not given.
+        without_weak: the same without the weak priors, which count as data where it is not given.
         reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
             where it is not that of white residuals: these must not reach further than the factor
             either.
     """
-    names = tuple(u.name for u in unknowns)
-    bare = sensitivity if held is None else held.sensitivity
-    prior = np.diag([u.prior for u in unknowns])
-    known = _known(sensitivity, bare, prior, unknowns, null_below, reported)
-    data = _by_data(bare, known, unknowns, null_below)
-    null, covariance, total = known.null, known.covariance, known.total
-    dead = _dead(sensitivity, unknowns)
-    least = null_below * max(total.singular[0], 1e-300)
-    exchanged = Exchange(sensitivity, held, least)
-    groups = _groups(null, covariance, unknowns, dead, exchanged)
+    bare = sensitivity if without_weak is None else without_weak.sensitivity
+    determined = _determined(sensitivity, bare, unknowns, null_below, reported)
+    data = _by_data(bare, determined, unknowns, null_below)
+    dead = _without_effect(sensitivity, unknowns)
+    least = null_below * max(determined.total.singular[0], 1e-300)
+    exchange = Exchange(sensitivity, without_weak, least)
+    groups = _groups(determined.null, determined.covariance, unknowns, dead, exchange)
     # What the data alone say, so that no prior is in it.
-    resting = _groups(data.null, data.covariance, unknowns, (), exchanged)
-    undetermined = tuple(n for i, n in enumerate(names) if any(abs(v[i]) > _PART for v in null))
-    correlation = _correlation(covariance)
-    pairs = _pairs(correlation, names, undetermined)
-    smallest = total.singular[-1]
-    condition = float(total.singular[0] / smallest) if smallest > 0 else math.inf
-    own, weak, share = _shares(covariance, known.without_weak, unknowns)
-    for group in groups:
-        if group.nuisances:
-            share |= dict.fromkeys(group.names, 1.0)
-    weakest = None
-    if not null and condition > ILL_CONDITIONED and not data.null:
-        weakest = _weakest(covariance, condition, unknowns)
+    resting = _groups(data.null, data.covariance, unknowns, (), exchange)
+    analysis = _Analysis(unknowns, determined, data, dead, groups, resting, exchange)
+    return _verdict(analysis, remedies or {})
+
+
+def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
+    names, known = tuple(u.name for u in a.unknowns), a.determined
+    correlation = _correlation(known.covariance)
+    pairs = _pairs(correlation, names, a.undetermined)
+    share = _shares(known.covariance, known.without_weak, a.unknowns)
+    nuisances_hold = [n for group in a.groups if group.nuisances for n in group.names]
     facts = Facts(
-        unknowns,
-        dead,
-        groups,
-        undetermined,
-        resting,
+        a.unknowns,
+        a.without_effect,
+        a.groups,
+        a.undetermined,
+        a.resting,
         pairs,
-        weakest,
-        weak,
-        own,
-        dict(remedies or {}),
+        _weakest(a),
+        share.weak,
+        share.prior,
+        dict(remedies),
     )
+    directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
         names=names,
-        identifiable=not null,
+        identifiable=not known.null,
         rank=known.rank,
-        rank_without_priors=data.rank,
-        condition=condition,
-        singular_values=total.singular,
-        null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in null),
-        combinations=tuple(c for group in (*groups, *resting) for c in group.combinations),
+        rank_without_priors=a.data.rank,
+        condition=a.condition,
+        singular_values=known.total.singular,
+        null_directions=tuple(dict(zip(names, map(float, v), strict=True)) for v in known.null),
+        combinations=tuple(c for group in (*a.groups, *a.resting) for c in group.combinations),
         pairs=pairs,
-        without_effect=dead,
-        undetermined=undetermined,
-        covariance=covariance,
+        without_effect=a.without_effect,
+        undetermined=a.undetermined,
+        covariance=known.covariance,
         correlation=correlation,
-        prior_share=share,
+        # Where a nuisance is exchangeable with a parameter the data say nothing of it, whatever
+        # interval the weak priors make.
+        prior_share=share.both | dict.fromkeys(nuisances_hold, 1.0),
         sentences=sentences(facts),
-        resting=tuple(n for group in resting for n in group.names),
+        resting=tuple(n for group in a.resting for n in group.names),
         exchangeable=tuple(
-            dict.fromkeys(label for v in (*null, *data.null) for label in exchanged.labels(v))
+            dict.fromkeys(
+                label for v in directions_not_determined for label in a.exchange.labels(v)
+            )
         ),
     )
 
 
-def _dead(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
+def _without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
     """The unknowns without any effect."""
     sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
+    # So little beside the largest is what rounding leaves of no effect.
     least = 1e-12 * max(sizes.max(), 1e-300)
     return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
 
 
-def _weakly_held(
-    without_weak: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
-) -> list[np.ndarray]:
-    """Directions of unknowns that may be zero and that weak priors alone hold.
+class _Shares(NamedTuple):
+    """By name, shares of the posterior precision (1 / variance) that come from priors."""
 
-    For those of one sign the factor of ten tells it; here it is an sd, without the weak priors,
-    beyond the unknown's scale and ten times the one with them.
-    """
-    return [
-        unit_vector(without_weak[:, i] / math.sqrt(without_weak[i, i]))
-        for i, u in enumerate(unknowns)
-        if not u.logarithmic and without_weak[i, i] > max(1.0, FACTOR**2 * covariance[i, i])
-    ]
+    prior: dict[str, float]
+    """the unknown's own"""
+    weak: dict[str, float]
+    """the weak ones of nuisances"""
+    both: dict[str, float]
 
 
 def _shares(
     covariance: np.ndarray, without_weak: np.ndarray, unknowns: tuple[Unknown, ...]
-) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """By name, the share of what is known that comes from the unknown's own prior, from the weak
-    priors of nuisances, and from both."""
-    own, weak, share = {}, {}, {}
+) -> _Shares:
+    prior, weak, both = {}, {}, {}
     for i, u in enumerate(unknowns):
-        own[u.name] = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
+        # Precisions add, so a prior's share is its precision times the variance that is left.
+        prior[u.name] = float(np.clip(covariance[i, i] * u.prior**2, 0.0, 1.0))
         ratio = covariance[i, i] / without_weak[i, i] if without_weak[i, i] > 0 else 1.0
         weak[u.name] = float(np.clip(1.0 - ratio, 0.0, 1.0))
-        share[u.name] = 1.0 - (1.0 - own[u.name]) * (1.0 - weak[u.name])
-    return own, weak, share
+        both[u.name] = 1.0 - (1.0 - prior[u.name]) * (1.0 - weak[u.name])
+    return _Shares(prior, weak, both)
 
 
 def _groups(
@@ -230,89 +266,53 @@ def _groups(
     covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
     dead: tuple[str, ...],
-    exchanged: Exchange,
-) -> tuple[Open, ...]:
+    exchange: Exchange,
+) -> tuple[Inseparable, ...]:
     """The parameters in null directions, those apart that no direction ties together."""
     names = [u.name for u in unknowns]
-    gone = [names.index(n) for n in dead]
-    alive = [v for v in null if np.delete(np.abs(v), gone).max(initial=0.0) > TAKES_PART]
+    # Parameters without effect have a sentence of their own, and no combination to offer.
+    gone = {names.index(n) for n in dead}
+    alive = [v for v in null if np.delete(np.abs(v), list(gone)).max(initial=0.0) > TAKES_PART]
     if not alive:
         return ()
+    # Any basis of the null space serves; the reduced one has zeros wherever it can, and so shows
+    # which parameters are not tied together.
     W, _ = row_reduced(np.array(alive), unknowns)
+    return tuple(
+        Inseparable(
+            tuple(names[i] for i in sorted(members)),
+            len(rows),
+            combinations(rows, covariance, unknowns),
+            exchange.words(rows),
+            exchange.switches(rows),
+        )
+        for members, rows in _tied_together([unit_vector(v) for v in W], gone)
+    )
+
+
+def _tied_together(
+    rows: list[np.ndarray], gone: set[int]
+) -> list[tuple[set[int], list[np.ndarray]]]:
+    """Directions that share an unknown, together with all their unknowns by number."""
     groups: list[tuple[set[int], list[np.ndarray]]] = []
-    for v in map(unit_vector, W):
-        part = {int(i) for i in np.flatnonzero(np.abs(v) > TAKES_PART)} - set(gone)
+    for v in rows:
+        part = {int(i) for i in np.flatnonzero(np.abs(v) > TAKES_PART)} - gone
         if not part:
             continue
         joined, apart = (part, [v]), []
+        # One direction may join several groups that were apart until now.
         for group in groups:
             if group[0] & part:
                 joined = (joined[0] | group[0], [*group[1], *joined[1]])
             else:
                 apart.append(group)
         groups = [*apart, joined]
-    return tuple(
-        Open(
-            tuple(names[i] for i in sorted(members)),
-            len(directions),
-            combinations(directions, covariance, unknowns),
-            exchanged.words(directions),
-            exchanged.switches(directions),
-        )
-        for members, directions in groups
-    )
-
-
-def _reaching_too_far(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[int]:
-    """The unknowns whose 95 % interval reaches further than the factor."""
-    return [
-        i
-        for i, u in enumerate(unknowns)
-        if (u.logarithmic or u.symmetric) and covariance[i, i] > _FAR**2
-    ]
-
-
-def _too_wide(
-    total: np.ndarray, covariance: np.ndarray, unknowns: tuple[Unknown, ...]
-) -> list[np.ndarray]:
-    """Directions of full rank along which a 95 % interval still spans more than the factor."""
-    if not _reaching_too_far(covariance, unknowns):
-        return []
-    plain = directions(total, np.ones(len(unknowns)))
-    weak = [
-        unit_vector(v) for s, v in zip(plain.singular, plain.right, strict=True) if s * _FAR < 1
-    ]
-    return weak or [unit_vector(plain.right[-1])]
-
-
-def _single_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
-    """For each unknown whose interval reaches too far the direction in which it does."""
-    return [
-        unit_vector(covariance[:, i] / math.sqrt(covariance[i, i]))
-        for i in _reaching_too_far(covariance, unknowns)
-    ]
-
-
-def _further(directions: list[np.ndarray], null: list[np.ndarray]) -> list[np.ndarray]:
-    """Of the directions those that are led by an unknown which the null ones do not touch."""
-    added: list[np.ndarray] = []
-    for v in directions:
-        leads = int(np.argmax(np.abs(v)))
-        if all(abs(w[leads]) <= _PART for w in (*null, *added)):
-            added.append(v)
-    return added
-
-
-def _reported_too_wide(covariance: np.ndarray, unknowns: tuple[Unknown, ...]) -> list[np.ndarray]:
-    """As `_too_wide` has them, by the covariance of the intervals that are reported."""
-    if not _reaching_too_far(covariance, unknowns):
-        return []
-    values, vectors = np.linalg.eigh(covariance)
-    return [unit_vector(v) for v in vectors[:, values > _FAR**2].T] or [unit_vector(vectors[:, -1])]
+    return groups
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
     sd = np.sqrt(np.diag(covariance))
+    # An unknown that takes part in no determined direction has no variance in it.
     safe = np.where(sd > 0, sd, 1.0)
     correlation = covariance / np.outer(safe, safe)
     np.fill_diagonal(correlation, 1.0)
@@ -323,20 +323,24 @@ def _pairs(
     correlation: np.ndarray, names: tuple[str, ...], undetermined: tuple[str, ...]
 ) -> tuple[Pair, ...]:
     """Pairs beyond the limit; what is not determined has no correlation."""
-    found = []
+    pairs = []
     for i in range(len(names)):
         for j in range(i):
-            lost = names[i] in undetermined or names[j] in undetermined
-            if abs(correlation[i, j]) > STRONG and not lost:
-                found.append(Pair(names[j], names[i], float(correlation[i, j])))
-    return tuple(sorted(found, key=lambda p: -abs(p.correlation)))
+            not_determined = names[i] in undetermined or names[j] in undetermined
+            if abs(correlation[i, j]) > STRONG and not not_determined:
+                pairs.append(Pair(names[j], names[i], float(correlation[i, j])))
+    return tuple(sorted(pairs, key=lambda p: -abs(p.correlation)))
 
 
-def _weakest(covariance: np.ndarray, condition: float, unknowns: tuple[Unknown, ...]) -> Weakest:
-    """The least determined direction, and what is determined far better."""
+def _weakest(a: _Analysis) -> Weakest | None:
+    """The least determined direction, and what is determined far better; None where there is more
+    to say than that."""
+    if a.determined.null or a.data.null or not a.condition > ILL_CONDITIONED:
+        return None
+    covariance = a.determined.covariance
     _, vectors = np.linalg.eigh(covariance)
     direction = unit_vector(vectors[:, -1])
     parts = {
-        u.name: float(v) for u, v in zip(unknowns, direction, strict=True) if abs(v) > TAKES_PART
+        u.name: float(v) for u, v in zip(a.unknowns, direction, strict=True) if abs(v) > TAKES_PART
     }
-    return Weakest(parts, combinations([direction], covariance, unknowns), condition)
+    return Weakest(parts, combinations([direction], covariance, a.unknowns), a.condition)

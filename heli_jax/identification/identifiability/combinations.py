@@ -19,26 +19,40 @@ def unit_vector(v: np.ndarray) -> np.ndarray:
 def combinations(
     null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
 ) -> tuple[Combination, ...]:
-    """Products of powers that do not change along the null directions."""
+    """Products of powers that do not change along the null directions.
+
+    Args:
+        null: unit directions (q,) in relative coordinates.
+        covariance: (q, q) of what is determined, in the same.
+        unknowns: (q,) what the coordinates are.
+    """
     if not null:
         return ()
+    # The exponents are those of values, so all goes on in log |value|.
     per_log = np.array([u.per_log for u in unknowns])
     null = [unit_vector(v * per_log) for v in null]
     covariance = covariance * np.outer(per_log, per_log)
     W, pivots = row_reduced(np.array(null), unknowns)
-    found = []
-    for i in range(len(unknowns)):
-        if i in pivots or np.all(np.abs(W[:, i]) < TAKES_PART):
-            continue
-        exponents = np.zeros(len(unknowns))
-        exponents[i] = 1.0
-        exponents[pivots] = -W[:, i]
-        exponents = np.array([_rounded(e) for e in exponents])
-        if exponents[pivots].sum() < 0:  # a/Ixx rather than Ixx/a
-            exponents = -exponents
-        if all(unknowns[k].logarithmic for k in np.flatnonzero(exponents)):
-            found.append(_combination(exponents, covariance, unknowns))
-    return tuple(found)
+    # One that takes no part in any null direction is determined by itself.
+    part = [i for i in range(W.shape[1]) if i not in pivots and np.any(abs(W[:, i]) >= TAKES_PART)]
+    # What may be zero or change its sign has no power.
+    return tuple(
+        _combination(exponents, covariance, unknowns)
+        for exponents in (_exponents(W, i, pivots) for i in part)
+        if all(unknowns[k].logarithmic for k in np.flatnonzero(exponents))
+    )
+
+
+def _exponents(W: np.ndarray, i: int, pivots: list[int]) -> np.ndarray:
+    """Powers (q,) of the unknowns in the product that unknown i makes with the pivots."""
+    # W holds the identity in the pivots' columns: the logarithm of unknown i less W[:, i] times
+    # those of the pivots is the same all along the null directions.
+    exponents = np.zeros(W.shape[1])
+    exponents[i] = 1.0
+    exponents[pivots] = -W[:, i]
+    exponents = np.array([_rounded(e) for e in exponents])
+    # a/Ixx rather than Ixx/a
+    return -exponents if exponents[pivots].sum() < 0 else exponents
 
 
 def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarray, list[int]]:
@@ -47,7 +61,9 @@ def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarra
     for k in range(W.shape[0]):
         size = np.max(np.abs(W[k:]), axis=0)
         size[pivots] = 0.0
+        # Half of the largest pivot is as stable as it needs to be, and leaves a choice of names.
         near = [i for i in range(W.shape[1]) if size[i] >= 0.5 * size.max()]
+        # The pivot is what the others are divided by, so if possible it is one that has powers.
         proper = [i for i in near if unknowns[i].is_parameter and unknowns[i].logarithmic]
         pivot = (proper or near)[-1]
         row = k + int(np.argmax(np.abs(W[k:, pivot])))
@@ -62,6 +78,7 @@ def row_reduced(W: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[np.ndarra
 
 def _rounded(exponent: float) -> float:
     """A small fraction where the exponent is one, else two digits."""
+    # What the record's noise leaves of a/Ixx is a/Ixx^0.99.
     quarter = round(exponent * 4) / 4
     return quarter if abs(exponent - quarter) < 0.02 else round(exponent, 2)
 
@@ -71,7 +88,9 @@ def _combination(
 ) -> Combination:
     by_name = {u.name: float(e) for u, e in zip(unknowns, exponents, strict=True) if e}
     log = sum(e * math.log(abs(u.value)) for u, e in zip(unknowns, exponents, strict=True) if e)
+    # exp overflows at 709.
     value = math.exp(log) if abs(log) < 700 else math.inf
+    # Rounding can leave the variance of what is known exactly a little below zero.
     sd = math.sqrt(max(0.0, float(exponents @ covariance @ exponents)))
     reach = math.exp(min(Z95 * sd, 700.0))
     return Combination(

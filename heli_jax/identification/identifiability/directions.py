@@ -6,11 +6,11 @@ import numpy as np
 
 from heli_jax.identification.identifiability.combinations import TAKES_PART
 
-_HELD = 3.0
+_SHARPER = 3.0
 """weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
 
 
-class Held(NamedTuple):
+class WithoutWeakPriors(NamedTuple):
     """What is left of the data where the nuisances' weak priors are taken away.
 
     Initial states, biases and input offsets carry priors of ten times the signal, so that one that
@@ -31,44 +31,66 @@ class Held(NamedTuple):
 
 
 def projected(J: np.ndarray, nuisances: np.ndarray, smallest: float | None = None) -> np.ndarray:
-    """What J (n, q) says once the nuisance columns (n, k) are free, as few rows (any, q).
-
-    By orthogonal factors, never by normal equations: singular values keep their full precision.
+    """What the rows say of the unknowns once the nuisances are free, as few rows (any, q).
 
     Args:
+        J: (n, q) whitened Jacobian by the unknowns.
+        nuisances: (n, k) that by the nuisances.
         smallest: the nuisances may be dependent: of their directions, with columns of equal size,
             those below this part of the largest have no effect of their own and are left out.
             Without it they have to be independent.
     """
+    # By orthogonal factors, never by normal equations, which square the condition number: singular
+    # values down to 1e-8 of the largest are looked at, and their squares are below rounding.
     q, k = J.shape[1], nuisances.shape[1]
     both = np.hstack([nuisances, J])
     if both.shape[0] < q + k:
         both = np.vstack([both, np.zeros((q + k - both.shape[0], q + k))])
     R = np.linalg.qr(both, mode="r")
+    # With the nuisances first, the lower right corner is what they cannot explain.
     if smallest is None or k == 0:
         return R[k : k + q, k:]
-    N, S = R[:, :k], R[:, k:]
-    norms = np.linalg.norm(N, axis=0)
-    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
-    shown = left[:, singular > smallest * max(singular[0], 1e-300)]
+    S, spanned = R[:, k:], _span(R[:, :k], smallest)
     for _ in range(2):  # the second time takes off what rounding left the first time
-        S = S - shown @ (shown.T @ S)
+        S = S - spanned @ (spanned.T @ S)
     return S
 
 
+def _span(N: np.ndarray, smallest: float) -> np.ndarray:
+    """Orthonormal columns that span those of N but for directions of no effect."""
+    # Dependent columns leave directions of pure rounding in QR's Q; projecting those out too would
+    # take some of the unknowns' effect away. Hence singular values, of columns of one size.
+    norms = np.linalg.norm(N, axis=0)
+    left, singular, _ = np.linalg.svd(N / np.where(norms > 0, norms, 1.0), full_matrices=False)
+    return left[:, singular > smallest * max(singular[0], 1e-300)]
+
+
 class Directions(NamedTuple):
+    """Orthogonal directions of the scaled unknowns, the best determined first."""
+
     singular: np.ndarray
+    """(q,) 1 / sd along each"""
     right: np.ndarray
+    """(q, q) a direction a row"""
 
 
 def directions(sensitivity: np.ndarray, scale: np.ndarray) -> Directions:
+    """Those of a whitened sensitivity (any, q), each unknown in units of its scale (q,)."""
     q = scale.size
+    # With fewer rows than unknowns the decomposition would leave the null directions out.
     padded = np.vstack([sensitivity * scale, np.zeros((q, q))])
     _, singular, right = np.linalg.svd(padded, full_matrices=False)
     return Directions(singular, right)
 
 
 def covariance_of(total: Directions, kept: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Covariance (q, q) of the unknowns along the directions that are kept.
+
+    Args:
+        total: the directions of the scaled unknowns.
+        kept: (q,) which of them are determined.
+        scale: (q,) in relative coordinates, as `directions` had it.
+    """
     V = total.right[kept].T / total.singular[kept]
     return np.outer(scale, scale) * (V @ V.T)
 
@@ -77,43 +99,52 @@ class Exchange(NamedTuple):
     """Which nuisances a direction of the unknowns is exchanged with."""
 
     sensitivity: np.ndarray
-    held: Held | None
+    """(any, q) with the weak priors"""
+    without_weak: WithoutWeakPriors | None
     least: float
     """singular value that counts as zero"""
 
     def moves(self, v: np.ndarray) -> np.ndarray:
         """(k,) whether each nuisance takes part; none where weak priors do not hold v."""
-        if self.held is None or not self.held.nuisances:
+        if self.without_weak is None or not self.without_weak.nuisances:
             return np.zeros(0, bool)
         with_weak = np.linalg.norm(self.sensitivity @ v)
-        without = np.linalg.norm(self.held.sensitivity @ v)
-        size = np.abs(self.held.compensation @ v)
-        if with_weak < max(self.least, _HELD * without):
+        without = np.linalg.norm(self.without_weak.sensitivity @ v)
+        # In sds of their weak priors, so that a bias in rad and an offset of a stick compare.
+        size = np.abs(self.without_weak.compensation @ v)
+        # Sharp by the weak priors and by nothing else: then what moves is what they hold.
+        if with_weak < max(self.least, _SHARPER * without):
             return np.zeros(size.size, bool)
         return size > TAKES_PART * max(size.max(), 1e-300)
 
     def labels(self, v: np.ndarray) -> tuple[str, ...]:
         """As the fit names the nuisances."""
         moves = self.moves(v)
-        return tuple(self.held.labels[i] for i in np.flatnonzero(moves)) if self.held else ()
+        return (
+            tuple(self.without_weak.labels[i] for i in np.flatnonzero(moves))
+            if self.without_weak
+            else ()
+        )
 
     def words(self, rows: list[np.ndarray]) -> tuple[str, ...]:
         """The nuisances that the directions are exchanged with, each once."""
-        if self.held is None:
+        if self.without_weak is None:
             return ()
-        found = [self.held.nuisances[i] for v in rows for i in np.flatnonzero(self.moves(v))]
-        return tuple(dict.fromkeys(found))
+        words = self.without_weak.nuisances
+        moving = [words[i] for v in rows for i in np.flatnonzero(self.moves(v))]
+        return tuple(dict.fromkeys(moving))
 
     def switches(self, rows: list[np.ndarray]) -> tuple[str, ...]:
         """The nuisances without which every direction would be determined."""
-        if self.held is None or not self.words(rows):
+        if self.without_weak is None or not self.words(rows):
             return ()
+        # Switched off one kind at a time; one that leaves a direction open is no way out of it.
         return tuple(
             name
-            for name, other in self.held.switched_off.items()
+            for name, other in self.without_weak.switched_off.items()
             if all(
                 np.linalg.norm(other @ v)
-                > max(self.least, _HELD * np.linalg.norm(self.held.sensitivity @ v))
+                > max(self.least, _SHARPER * np.linalg.norm(self.without_weak.sensitivity @ v))
                 for v in rows
             )
         )

@@ -1,46 +1,58 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.identifiability.analysis import NULL, Unknown, Verdict, judge
-from heli_jax.identification.identifiability.directions import Held, projected
+from heli_jax.identification.identifiability.analysis import NULL, analyse
+from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
+from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
-from heli_jax.identification.unknowns.nuisances import can_be_off, weak_unknowns
+from heli_jax.identification.unknowns.nuisances import WeakUnknown, can_be_off, weak_unknowns
 
 _NEAR_ZERO = 1e-2
 """part of a parameter's size below which it takes no part in products of powers"""
 
 
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
-    """The named unknowns for the verdict, with their size and prior in relative coordinates."""
-    found = []
-    for i, name in enumerate(layout.named):
-        value = float(e.named[i])
-        free = problem.free.get(name)
-        if name == "time_shift":
-            found.append(Unknown(name, value, False, 1.0, 0.0, is_parameter=False))
-        elif free is None:
-            found.append(Unknown(name, value, True, 1.0, 0.0, is_parameter=False))
-        else:
-            reference, log = _reference(problem, name, value)
-            prior = reference / free.prior.sd if free.prior else 0.0
-            scale = 1.0 / prior if prior else _interval(free.lower, free.upper, log)
-            symmetric = coordinates.changes_sign(free)
-            per_log = reference / abs(value) if symmetric and log else 1.0
-            found.append(
-                Unknown(name, value, log, scale, prior, per_log=per_log, symmetric=symmetric)
-            )
-    return tuple(found)
+    """The parameters of interest for the verdict, with their size and prior in relative
+    coordinates.
+
+    Args:
+        problem: bounds, priors and starts.
+        layout: the order of the unknowns.
+        e: their values at the point.
+    """
+    return tuple(
+        _unknown(problem, name, float(e.named[i])) for i, name in enumerate(layout.of_interest)
+    )
+
+
+def _unknown(problem: Problem, name: str, value: float) -> Unknown:
+    free = problem.free.get(name)
+    if name == "time_shift":
+        # Zero is as good a value as any: one unit is a sample, see `references_of`.
+        return Unknown(name, value, False, 1.0, 0.0, is_parameter=False)
+    if free is None:
+        return Unknown(name, value, True, 1.0, 0.0, is_parameter=False)
+    reference, log = _reference(problem, name, value)
+    prior = reference / free.prior.sd if free.prior else 0.0
+    # What a parameter may plausibly do: by its prior, or half its interval.
+    scale = 1.0 / prior if prior else _interval(free.lower, free.upper, log)
+    symmetric = transforms.changes_sign(free)
+    # A coordinate in units of the reference becomes log |value| by the reference over the value.
+    per_log = reference / abs(value) if symmetric and log else 1.0
+    return Unknown(name, value, log, scale, prior, per_log=per_log, symmetric=symmetric)
 
 
 def _interval(lower: float | None, upper: float | None, log: bool) -> float:
+    """Half the interval between the bounds, in relative coordinates."""
     if log and lower and upper:
+        # Bounds that nearly meet would make a scale of zero, and a null direction of it.
         return max(0.5 * float(np.log(upper / lower)), 1e-3)
     return 1.0
 
@@ -49,33 +61,36 @@ def _reference(problem: Problem, name: str, value: float) -> tuple[float, bool]:
     """What one unit of a parameter's relative coordinate is, and whether it is log |value|."""
     free = problem.free[name]
     low, high = free.lower, free.upper
+    # Between bounds of both signs neither a logarithm nor the start's size means anything.
     if low is not None and high is not None and low < 0 < high:
         return 0.5 * (high - low), False
-    if coordinates.changes_sign(free):
+    if transforms.changes_sign(free):
         # A value near zero is known as soon as it is known to be small beside the start.
-        size = max(abs(value), coordinates.scale(free))
+        size = max(abs(value), transforms.scale(free))
         return size, abs(value) > _NEAR_ZERO * size
     return abs(value), True
 
 
-def references_of(problem: Problem, layout: Layout, unknowns: tuple[Unknown, ...]) -> np.ndarray:
+def references_of(problem: Problem, unknowns: tuple[Unknown, ...]) -> np.ndarray:
+    """What one unit of each relative coordinate is (q,), in the unknowns' own units."""
+    # A shift is known well where it is known to a sample, whatever its value.
     dt = problem.training[0].dt
-    out = []
+    references = []
     for u in unknowns:
         if u.name == "time_shift":
-            out.append(dt)
+            references.append(dt)
         elif u.name in problem.free:
-            out.append(_reference(problem, u.name, u.value)[0])
+            references.append(_reference(problem, u.name, u.value)[0])
         else:
-            out.append(abs(u.value))
-    return np.array(out)
+            references.append(abs(u.value))
+    return np.array(references)
 
 
 class _Rows(NamedTuple):
     """The Jacobian without the priors of the parameters, taken apart."""
 
     sensitivity: np.ndarray
-    """(n, q) of the rows of data, named unknowns in relative coordinates"""
+    """(n, q) of the rows of data, parameters of interest in relative coordinates"""
     nuisances: np.ndarray
     """(n, k) of the same rows, all other unknowns"""
     weak: np.ndarray
@@ -83,11 +98,12 @@ class _Rows(NamedTuple):
 
 
 def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> _Rows:
+    # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
     J = np.asarray(e.J, dtype=np.float64)
-    q, p = len(layout.named), len(layout.free)
-    count = layout.size - layout.weak
-    # Last come the weak priors (all that stands in z from `layout.weak` on), before them the
-    # parameters' own; the jumps between windows count as data.
+    q, p = len(layout.of_interest), len(layout.free)
+    count = layout.size - layout.first_nuisance
+    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
+    # the parameters' own; the defects between windows count as data.
     data = J[: J.shape[0] - count - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)
@@ -101,50 +117,60 @@ _NO_EFFECT = 1e-6
 disturbance that is not there, has no direction to be projected out."""
 
 
-def _held(problem: Problem, layout: Layout, rows: _Rows, smallest: float) -> tuple[Any, Held]:
-    """The sensitivity with the weak priors, and what is left of it without them.
+def _with_weak_priors(rows: _Rows, S: np.ndarray, N: np.ndarray) -> np.ndarray:
+    """What the data (S by the unknowns, N by the nuisances) say of the unknowns (any, q) where the
+    nuisances are free but for their weak priors."""
+    sensitivity = np.vstack([S, np.zeros((rows.weak.shape[0], S.shape[1]))])
+    nuisances = np.vstack([N, rows.weak])
+    # What neither the data nor a prior of its own sees is no unknown.
+    shown = np.linalg.norm(nuisances, axis=0) > _NO_EFFECT
+    # Each has a prior or an effect, so none depends on the others: no part is to be left out.
+    return projected(sensitivity, nuisances[:, shown])
+
+
+def _without_weak_priors(
+    problem: Problem,
+    named: tuple[WeakUnknown, ...],
+    S: np.ndarray,
+    N: np.ndarray,
+    smallest: float,
+) -> WithoutWeakPriors:
+    """What is left of that without the weak priors.
 
     Args:
+        named: the nuisances that have weak priors, the last columns of N.
         smallest: part of the largest singular value below which a direction of the nuisances has
             no effect.
     """
-    q = rows.sensitivity.shape[1]
-    # All further work is on the triangle, which holds what the data say.
-    R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
-    S, N = R[:, :q], R[:, q:]
     seen = np.linalg.norm(N, axis=0) > _NO_EFFECT
-    with_weak = np.vstack([S, np.zeros((rows.weak.shape[0], q))])
-    all_nuisances = np.vstack([N, rows.weak])
-    # What neither the data nor a prior of its own sees is no unknown.
-    shown = np.linalg.norm(all_nuisances, axis=0) > _NO_EFFECT
-    sensitivity = projected(with_weak, all_nuisances[:, shown])
-    named = weak_unknowns(problem, layout)
-    kinds = np.array([""] * (N.shape[1] - len(named)) + [one.kind for one in named])
-    off = {
+    # Before those stand the parameters of the disturbance and the noise's factors, of no kind.
+    kinds = np.array([""] * (N.shape[1] - len(named)) + [nuisance.kind for nuisance in named])
+    switched_off = {
         f"nuisance.{kind}": projected(S, N[:, seen & (kinds != kind)], smallest)
-        for kind in dict.fromkeys(one.kind for one in named)
+        for kind in dict.fromkeys(nuisance.kind for nuisance in named)
         if can_be_off(problem, kind)
     }
-    weak = kinds != ""
-    moves = -np.linalg.lstsq(N[:, seen], S, rcond=smallest)[0]
-    compensation = np.zeros((N.shape[1], q))
-    compensation[seen] = moves
-    held = Held(
+    # The weak priors' sds are the units of these columns, so the solution is in sds.
+    compensation = np.zeros((N.shape[1], S.shape[1]))
+    compensation[seen] = -np.linalg.lstsq(N[:, seen], S, rcond=smallest)[0]
+    return WithoutWeakPriors(
         projected(S, N[:, seen], smallest),
-        compensation[weak],
-        tuple(one.words for one in named),
-        tuple(one.label for one in named),
-        off,
+        compensation[kinds != ""],
+        tuple(nuisance.words for nuisance in named),
+        tuple(nuisance.label for nuisance in named),
+        switched_off,
     )
-    return sensitivity, held
 
 
 def _signs(unknowns: tuple[Unknown, ...]) -> np.ndarray:
+    # log |value| falls as a negative value rises.
     return np.array([np.sign(u.value) or 1.0 if u.logarithmic else 1.0 for u in unknowns])
 
 
 def _remedies(problem: Problem) -> dict[str, str]:
     """By parameter, what determines it beside a known value or a prior."""
+    # On the stand Ixx, If and a are known up to a factor: moments of inertia and lift scale alike.
+    # A second run with a known inertia added sets the scale.
     known = naming.names(problem.model.Params)
     return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
 
@@ -155,8 +181,11 @@ def verdict_of(
     """What the data determine at one point.
 
     Args:
-        reported: covariance (k, k) of the named unknowns, in the optimiser's coordinates, that the
-            reported intervals have where it is not that of white residuals.
+        problem: what is free, with bounds and priors.
+        layout: what stands where in the Jacobian's columns.
+        e: the whitened residuals' Jacobian and the values there.
+        reported: covariance (k, k) of the parameters of interest, in the optimiser's coordinates,
+            that the reported intervals have where it is not that of white residuals.
 
     Raises:
         ValueError: the simulation is not finite there.
@@ -167,13 +196,17 @@ def verdict_of(
             "the length of this record; start elsewhere or use a shorter window"
         )
     unknowns = unknowns_of(problem, layout, e)
-    rows = _split(layout, e, references_of(problem, layout, unknowns), _signs(unknowns))
+    references, signs = references_of(problem, unknowns), _signs(unknowns)
+    rows = _split(layout, e, references, signs)
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
-    sensitivity, held = _held(problem, layout, rows, null_below)
-    relative = None
+    q = len(unknowns)
+    # All further work is on the triangle, which holds what the data say in as many rows as columns.
+    R = np.linalg.qr(np.hstack([rows.sensitivity, rows.nuisances]), mode="r")
+    S, N = R[:, :q], R[:, q:]
+    sensitivity = _with_weak_priors(rows, S, N)
+    without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, null_below)
     if reported is not None:
-        slopes = np.asarray(e.slopes, np.float64)
-        to_relative = slopes / references_of(problem, layout, unknowns) * _signs(unknowns)
-        relative = reported * np.outer(to_relative, to_relative)
-    return judge(sensitivity, unknowns, _remedies(problem), null_below, held, relative)
+        to_relative = np.asarray(e.slopes, np.float64) / references * signs
+        reported = reported * np.outer(to_relative, to_relative)
+    return analyse(sensitivity, unknowns, _remedies(problem), null_below, without, reported)

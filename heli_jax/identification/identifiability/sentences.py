@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
 
+# Index is the number; from nine on all are called nine.
 _NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 _STATED = 8.0 / 9.0
 """share of what is known of a parameter above which it is said that weak priors hold it: its sd
@@ -15,7 +16,7 @@ _BY_PRIOR = 0.9
 """share of its prior above which a parameter is what the prior says"""
 
 
-class Open(NamedTuple):
+class Inseparable(NamedTuple):
     """Parameters that no rows tell apart, and how many of them would have to be known."""
 
     names: tuple[str, ...]
@@ -41,11 +42,11 @@ class Facts(NamedTuple):
 
     unknowns: tuple[Unknown, ...]
     without_effect: tuple[str, ...]
-    groups: tuple[Open, ...]
+    groups: tuple[Inseparable, ...]
     """what is not determined"""
     undetermined: tuple[str, ...]
     """also those that take a small part in it"""
-    resting: tuple[Open, ...]
+    resting: tuple[Inseparable, ...]
     """where all is determined: what is so by the priors of parameters alone"""
     pairs: tuple[Pair, ...]
     weakest: Weakest | None
@@ -59,51 +60,64 @@ class Facts(NamedTuple):
 
 def sentences(facts: Facts) -> tuple[str, ...]:
     """What the data determine, what they do not, and what can be done, most important first."""
-    names = tuple(u.name for u in facts.unknowns)
-    said = [_without_effect(name) for name in facts.without_effect]
-    said += [_open(group, facts) for group in facts.groups]
-    named = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
-    partners = [n for n in facts.undetermined if n not in named]
-    lost = named | set(partners)
-    told = set(lost)
+    lines = [_without_effect(name) for name in facts.without_effect]
+    lines += [_not_determined(group, facts) for group in facts.groups]
+    in_groups = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
+    partners = [n for n in facts.undetermined if n not in in_groups]
+    not_determined = in_groups | set(partners)
     if partners:
         verb = "take part in that and are" if len(partners) > 1 else "takes part in that and is"
-        said.append(f"{listed(partners)} {verb} not determined either.")
-    held = [n for n, share in facts.prior_share.items() if share > _BY_PRIOR and n not in lost]
-    if lost:
-        rest = [n for n in names if n not in lost and n not in held]
-        said += [f"The data determine {listed(rest)}."] if rest else []
-        said += _by_prior(held)
-    elif facts.resting:
-        said += [_resting(group, facts) for group in facts.resting]
-        told |= {n for group in facts.resting for n in group.names}
-    else:
-        rest = [n for n in names if n not in held]
-        said += [f"The data determine {listed(rest)}."] if rest else []
-        said += _by_prior(held)
+        lines.append(f"{listed(partners)} {verb} not determined either.")
+    lines += _determined(facts, not_determined)
+    # A pair whose members have both been spoken of needs no sentence of its own.
+    covered = set(not_determined)
+    if not not_determined:
+        covered |= {n for group in facts.resting for n in group.names}
     if facts.weakest is not None:
-        said.append(_weakest(facts.weakest, facts))
-        told |= set(facts.weakest.parts)
-    for pair in facts.pairs:
-        if {pair.first, pair.second} <= told:
-            continue
-        both = (pair.first, pair.second)
-        said.append(
-            f"{pair.first} and {pair.second} can hardly be told apart (correlation "
-            f"{pair.correlation:+.5f}): {way_out(both, facts, 1)}."
-        )
-    leaning = {
+        lines.append(_weakest(facts.weakest, facts))
+        covered |= set(facts.weakest.parts)
+    lines += _correlated_pairs(facts, covered)
+    lines += _leaning_on_weak_priors(facts, not_determined)
+    return tuple(lines)
+
+
+def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
+    """What the data determine, and what priors do."""
+    if facts.resting and not not_determined:
+        return [_resting(group, facts) for group in facts.resting]
+    shares = facts.prior_share.items()
+    by_prior = [n for n, share in shares if share > _BY_PRIOR and n not in not_determined]
+    by_data = [
+        u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
+    ]
+    lines = [f"The data determine {listed(by_data)}."] if by_data else []
+    return lines + _by_prior(by_prior)
+
+
+def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:
+    return [
+        f"{pair.first} and {pair.second} can hardly be told apart (correlation "
+        f"{pair.correlation:+.5f}): {way_out((pair.first, pair.second), facts, 1)}."
+        for pair in facts.pairs
+        if not {pair.first, pair.second} <= covered
+    ]
+
+
+def _leaning_on_weak_priors(facts: Facts, not_determined: set[str]) -> list[str]:
+    # The share s of the precision that weak priors have: without them the sd is (1 - s)^-1/2 times
+    # as large. A share of 1 is what is not determined, which has its sentence.
+    factors = {
         n: (1.0 - share) ** -0.5
         for n, share in facts.weak_share.items()
-        if _STATED < share < 1.0 and n not in lost
+        if _STATED < share < 1.0 and n not in not_determined
     }
-    if leaning:
-        said.append(
-            "Without the weak priors of initial states, biases and input offsets (ten times the "
-            f"signal) the sd of {listed(list(leaning))} would be {max(leaning.values()):.2g} times "
-            "as large."
-        )
-    return tuple(said)
+    if not factors:
+        return []
+    return [
+        "Without the weak priors of initial states, biases and input offsets (ten times the "
+        f"signal) the sd of {listed(list(factors))} would be {max(factors.values()):.2g} times "
+        "as large."
+    ]
 
 
 def _by_prior(names: list[str]) -> list[str]:
@@ -134,7 +148,7 @@ def _switch(name: str) -> str:
     return "nuisance.time_shift" if name == "time_shift" else ""
 
 
-def _open(group: Open, facts: Facts) -> str:
+def _not_determined(group: Inseparable, facts: Facts) -> str:
     names = group.names
     if group.combinations:
         what = (
@@ -147,6 +161,7 @@ def _open(group: Open, facts: Facts) -> str:
         what = f"the data determine no part of {listed(names)}"
     if group.nuisances:
         what = f"{listed([*names, *group.nuisances])} are exchangeable, so {what}"
+    # Not capitalize(): that would lower the names' capitals.
     what = what[0].upper() + what[1:] if what.startswith("the") else what
     return f"{what}: {way_out(names, facts, group.count, group.switches)}."
 
@@ -158,31 +173,34 @@ def way_out(
 
     Args:
         names: the parameters, gains and the time shift concerned.
+        facts: which of them are parameters, and what remedies the model has.
         count: how many of them have to be known for the rest to be determined.
         switches: nuisances whose absence would determine them too.
     """
     parameters = [u.name for u in facts.unknowns if u.name in names and u.is_parameter]
     off = [*switches, *dict.fromkeys(s for s in map(_switch, names) if s)]
-    ways = []
-    if off:
-        ways.append(f"switch off {listed(off, 'or')}")
-    if len(parameters) == 1 and len(names) == 1:
-        ways += [f"fix {parameters[0]}", "give it a prior"]
-    elif len(parameters) == 1:
-        ways += [f"fix {parameters[0]}", f"give {parameters[0]} a prior"]
-    elif parameters:
-        number = _NUMBERS[min(count, len(parameters), len(_NUMBERS) - 1)]
-        which = ", ".join(parameters)
-        if min(count, len(parameters)) == 1:
-            ways += [f"fix one of {which}", "give it a prior"]
-        else:
-            ways += [f"fix {number} of {which}", "give them priors"]
-    further = [facts.remedies[n] for n in parameters if n in facts.remedies]
-    ways += dict.fromkeys(further)
+    ways = [f"switch off {listed(off, 'or')}"] if off else []
+    ways += _fix(parameters, len(names) == 1, count)
+    ways += dict.fromkeys(facts.remedies[n] for n in parameters if n in facts.remedies)
     return listed(ways, "or") if len(ways) < 3 else f"{', '.join(ways[:-1])}, or {ways[-1]}"
 
 
-def _resting(group: Open, facts: Facts) -> str:
+def _fix(parameters: list[str], alone: bool, count: int) -> list[str]:
+    """How many of the parameters to fix or to give priors; `alone` where nothing else is named, so
+    that 'it' is plain."""
+    if not parameters:
+        return []
+    if len(parameters) == 1:
+        return [f"fix {parameters[0]}", f"give {'it' if alone else parameters[0]} a prior"]
+    # At most all of them: a direction may also run through gains and the time shift.
+    number, which = min(count, len(parameters)), ", ".join(parameters)
+    if number == 1:
+        return [f"fix one of {which}", "give it a prior"]
+    return [f"fix {_NUMBERS[min(number, len(_NUMBERS) - 1)]} of {which}", "give them priors"]
+
+
+def _resting(group: Inseparable, facts: Facts) -> str:
+    # Only a parameter with a prior can hold the others up; the rest of the group leans on it.
     with_prior = [u.name for u in facts.unknowns if u.prior > 0 and u.name in group.names]
     owners = f"the prior of {listed(with_prior)}" if with_prior else "the priors"
     verb = "rests" if len(group.names) == 1 else "rest"
@@ -199,6 +217,7 @@ def _resting(group: Open, facts: Facts) -> str:
 
 def _weakest(weakest: Weakest, facts: Facts) -> str:
     words = ", ".join(f"{n} {v:+.2f}" for n, v in weakest.parts.items())
+    # The direction is one of logarithms: parameters may move along it by these powers of a factor.
     names, combos = tuple(weakest.parts), weakest.combinations
     better = listed([c.name for c in combos]) if combos else "their combinations"
     return (

@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
+# The 97.5 % point of the standard normal distribution.
 Z95 = 1.959963984540054
 
 
@@ -55,6 +57,7 @@ class Verdict:
 
     names: tuple[str, ...]
     identifiable: bool
+    # Both without the weak priors of nuisances, which would give full rank to anything.
     rank: int
     rank_without_priors: int
     condition: float
@@ -70,6 +73,7 @@ class Verdict:
     covariance: np.ndarray
     """(q, q) in relative coordinates; the undetermined directions are left out of it"""
     correlation: np.ndarray
+    # A key of fit.json: a prior's share in the posterior precision, 1 / variance.
     prior_share: dict[str, float]
     """share of what is known of a parameter that came from priors: its own, and the weak ones of
     the nuisances; 1 where the data said nothing"""

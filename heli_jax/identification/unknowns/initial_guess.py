@@ -10,21 +10,31 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, FlightData, Layout
+
+# params is Any: a record of a model's Params, whose class may be a user's own.
 
 
 def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, " q"]:
-    """z at the start values: gains 1, no shift, the model's own initial state, no bias."""
+    """z at the start values: gains 1, no shift, the model's own initial state, no bias.
+
+    Args:
+        layout: what stands where in z.
+        data: scales, signs and bounds of the coordinates, and the measured outputs.
+        problem: the start values, in the units of the parameters.
+    """
+    dtype = data.low.dtype
     z = [
-        coordinates.to_coordinate(
-            how, jnp.asarray(f.start, data.low.dtype), data.sign[i], data.low[i], data.high[i]
+        transforms.to_coordinate(
+            kind, jnp.asarray(f.start, dtype), data.sign[i], data.low[i], data.high[i]
         )
-        for i, (f, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
+        for i, (f, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
     ]
-    one, zero = jnp.ones((), data.low.dtype), jnp.zeros((), data.low.dtype)
+    one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     z += [one] * len(layout.gains) + [zero] * layout.shift
-    z += [jnp.asarray(np.log(problem.noise[n].start), data.low.dtype) for n in layout.noise]
+    z += [jnp.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
+    # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
     z = jnp.stack([*z, *[zero] * (layout.size - len(z))])
     if layout.initial_state:
         z = _initial_states(layout, data, problem, z)
@@ -34,24 +44,27 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
     """The model's own initial state, or for one that is not linear the nearest that shows the
     measured outputs at the first sample of the window."""
-    at = layout.weak
+    at, names = layout.first_nuisance, naming.names(layout.model.State)
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
-    for flight, outputs, (count, m) in zip(
-        data.flights, layout.outputs, layout.windows, strict=True
-    ):
+    for i, flight in enumerate(data.flights):
+        count, m = layout.windows[i]
+        # What is known of this flight alone stands over what is free in all of them.
         params = layout.model.Params(**{**data.base, **values, **flight.known})
-        own = naming.asdict(layout.model.initial_state(params))
-        first = np.array([float(own[n]) for n in naming.names(layout.model.State)])
+        by_model = naming.asdict(layout.model.initial_state(params))
+        first = np.array([float(by_model[n]) for n in names])
         for k in range(count):
-            found = first
+            x0 = first
+            # The residual of a linear model is linear in its initial states: one step finds them
+            # from anywhere. Of others a far start can lie in the valley of another solution.
             if not layout.model.linear:
-                found = _shown(layout, params, flight, k * m, first)
-            for i, name in enumerate(layout.states):
-                value = found[naming.names(layout.model.State).index(name)]
+                x0 = _state_that_shows(layout, params, flight, k * m, first)
+            for j, name in enumerate(layout.states):
+                value = x0[names.index(name)]
+                # Coordinates of states are in units of their weak priors' sds.
                 scale = float(flight.state_scale[name])
-                z = z.at[at + i].set(jnp.asarray(value / scale, z.dtype))
+                z = z.at[at + j].set(jnp.asarray(value / scale, z.dtype))
             at += len(layout.states)
-        at += layout.constants(outputs)
+        at += layout.constants(layout.outputs[i])
     return z
 
 
@@ -59,10 +72,13 @@ _LINE = 5
 """samples to which a straight line is fitted for the value at the first"""
 
 
-def _shown(
+def _state_that_shows(
     layout: Layout, params: Any, flight: FlightData, k: int, first: np.ndarray
 ) -> np.ndarray:
-    """The state (n,) nearest to `first` whose outputs are the measured ones at sample k."""
+    """The state (n,) nearest to `first` whose outputs are the measured ones at sample k.
+
+    Three Gauss-Newton steps: outputs are mostly states themselves, or angles of them.
+    """
     measured = {n: _at_start(np.asarray(y)[k : k + _LINE]) for n, y in flight.outputs.items()}
     measured = {n: v for n, v in measured.items() if np.isfinite(v)}
     inputs = jax.tree.map(lambda u: u[k], flight.inputs)
@@ -72,13 +88,17 @@ def _shown(
         state = layout.model.State(**dict(zip(names, jnp.asarray(x), strict=True)))
         _, _, C, _ = jacobians(layout.model, params, state, inputs)
         outputs = naming.asdict(layout.model.output(params, state, inputs))
-        missed = np.array([v - float(outputs[n]) for n, v in measured.items()])
-        x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ missed
+        error = np.array([v - float(outputs[n]) for n, v in measured.items()])
+        # The least step: states that no output shows stay where the model puts them.
+        x = x + np.linalg.pinv(np.asarray(C)[rows], rcond=1e-8) @ error
     return x
 
 
 def _at_start(y: np.ndarray) -> float:
+    """The value at the first of a few samples, with less noise than that sample has; NaN where
+    nothing is measured."""
     seen = np.flatnonzero(np.isfinite(y))
     if seen.size < 3:
+        # Too few for a line that averages anything.
         return float(y[seen[0]]) if seen.size else float("nan")
     return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

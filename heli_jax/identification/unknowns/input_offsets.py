@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
@@ -18,6 +19,8 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.vehicle import of_helicopter
+
+# params, states and inputs are Any: records of a model, whose classes may be a user's own.
 
 _EXPLAINED = 1e-6
 """part of an offset's response that initial states and biases leave over where they explain it"""
@@ -33,67 +36,85 @@ def offset_inputs(problem: Problem) -> tuple[str, ...]:
     throttle is no stick that has a centre, and where a free parameter is a constant term of the
     equations that parameter stands for the offsets already.
     """
-    known = naming.names(problem.model.Inputs)
-    asked = problem.nuisance.input_offset
-    if asked is None:
+    inputs = naming.names(problem.model.Inputs)
+    requested = problem.nuisance.input_offset
+    if requested is None:
         return _in_free_flight(problem)
-    if isinstance(asked, bool):
-        return known if asked else ()
-    return tuple(n for n in known if n in asked)
+    if isinstance(requested, bool):
+        return inputs if requested else ()
+    return tuple(n for n in inputs if n in requested)
 
 
 def _in_free_flight(problem: Problem) -> tuple[str, ...]:
     model, params = problem.model, problem.start_params()
     sticks = [n for n in naming.names(model.Inputs) if n != "x_throttle"]
+    # Our model that is not linear is the whole helicopter, which flies free. Its matrices at the
+    # mean inputs and the model's own initial state, no trim, would say nothing.
     if of_helicopter(model.Params) and not model.linear:
         return tuple(sticks)
     flight = problem.training[0]
     params = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
+    # A model declared linear vanishes at zero, so it has no constant term to look for.
     if not model.linear and _has_constant_term(model, params, tuple(problem.free)):
         return ()
-    left = _left_over(model, params, flight)
+    unexplained = _unexplained(model, params, flight)
     at = naming.names(model.Inputs)
-    return tuple(n for n in sticks if not left[at.index(n)] < _EXPLAINED)
+    # Not '>=': where the comparison has no number an offset is the safer assumption.
+    return tuple(n for n in sticks if not unexplained[at.index(n)] < _EXPLAINED)
 
 
-def _left_over(model: Model, params: Any, flight: Flight) -> np.ndarray:
+def _unexplained(model: Model, params: Any, flight: Flight) -> np.ndarray:
     """Of the response to a constant offset of each input (m,) the part that no initial state and no
-    constant in the outputs explains, of the model linearised at the flight's mean inputs."""
-    dtype = jnp.result_type(float)
-    inputs = {n: jnp.asarray(np.mean(flight.inputs[n]), dtype) for n in flight.inputs}
-    u = model.Inputs(**{n: inputs[n] for n in naming.names(model.Inputs)})
-    space = jacobians(model, params, None, u)
-    A, B, C = (np.asarray(M, np.float64) for M in (space.A, space.B, space.C))
-    m = B.shape[1]
-    if not (np.isfinite(A).all() and np.isfinite(B).all() and np.isfinite(C).all()):
-        return np.ones(m)
-    names = naming.names(model.Outputs)
-    C = C[[names.index(n) for n in sorted(flight.outputs)]]
-    n = A.shape[0]
-    both = np.zeros((n + m, n + m))
-    both[:n, :n], both[:n, n:] = A, B
-    step = max(flight.duration, flight.dt) / _POINTS
-    with np.errstate(all="ignore"):
-        E, state, rows = scipy.linalg.expm(both * step), np.eye(n + m), []
-        for _ in range(_POINTS + 1):
-            rows.append(C @ state[:n])
-            state = E @ state
-        response = np.concatenate(rows)
+    constant in the outputs explains, of the model linearised at the flight's mean inputs.
+
+    1 for all of them where the model cannot be linearised there or is unstable over the record.
+    """
+    response = _responses(model, params, flight)
+    n, m = len(naming.names(model.State)), len(naming.names(model.Inputs))
     if not np.isfinite(response).all():
-        return np.ones(m)  # unstable over the record: free flight
-    constants = np.tile(np.eye(C.shape[0]), (_POINTS + 1, 1))
+        return np.ones(m)
+    p = len(flight.outputs)
+    constants = np.tile(np.eye(p), (_POINTS + 1, 1))
     others, driven = np.hstack([response[:, :n], constants]), response[:, n:]
+    # Columns of one size: a fast decay leaves little of an initial state, and is not nothing.
     sizes = np.linalg.norm(others, axis=0)
     factors: Any = scipy.linalg.qr(
         others / np.where(sizes > 0, sizes, 1.0), mode="economic", pivoting=True
     )
     Q, R = factors[:2]
-    kept = np.abs(np.diag(R)) > 1e-10 * np.abs(R[0, 0])
-    Q = Q[:, kept]
+    # Pivoted, so that dependent columns come last: an angle's initial value is a constant in it.
+    Q = Q[:, np.abs(np.diag(R)) > 1e-10 * np.abs(R[0, 0])]
     rest = driven - Q @ (Q.T @ driven)
     size = np.linalg.norm(driven, axis=0)
     # An input that no output shows has no offset to be found.
     return np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros(m), where=size > 0)
+
+
+def _responses(model: Model, params: Any, flight: Flight) -> np.ndarray:
+    """Of the linearised model the outputs over the record ((_POINTS + 1) p, n + m): the free
+    response to each initial state, and that to a unit of each input from rest. NaN where there are
+    no finite matrices."""
+    dtype = jnp.result_type(float)
+    inputs = {n: jnp.asarray(np.mean(flight.inputs[n]), dtype) for n in flight.inputs}
+    u = model.Inputs(**{n: inputs[n] for n in naming.names(model.Inputs)})
+    space = jacobians(model, params, None, u)
+    A, B, C = (np.asarray(M, np.float64) for M in (space.A, space.B, space.C))
+    n, m = B.shape
+    if not (np.isfinite(A).all() and np.isfinite(B).all() and np.isfinite(C).all()):
+        return np.full((1, n + m), np.nan)
+    names = naming.names(model.Outputs)
+    C = C[[names.index(output) for output in sorted(flight.outputs)]]
+    # A constant input is a state that stays: one exponential of [[A, B], [0, 0]] propagates both.
+    # D is left out: what an offset adds through it is a constant, which the bias takes up.
+    augmented = np.zeros((n + m, n + m))
+    augmented[:n, :n], augmented[:n, n:] = A, B
+    step = max(flight.duration, flight.dt) / _POINTS
+    with np.errstate(all="ignore"):  # an unstable model overflows, which the caller looks at
+        E, state, rows = scipy.linalg.expm(augmented * step), np.eye(n + m), []
+        for _ in range(_POINTS + 1):
+            rows.append(C @ state[:n])
+            state = E @ state
+        return np.concatenate(rows)
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:
@@ -105,19 +126,18 @@ def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool
         names = naming.names(record)
         return record(**{n: jnp.asarray(rng.standard_normal(), dtype) for n in names})
 
-    def rates(values: dict[str, Any], x: Any, u: Any) -> Any:
+    def rates(values: dict[str, Array], x: Any, u: Any) -> Any:
         return model.vector_field(naming.replace(params, **values), x, u)
 
     values = {n: jnp.asarray(getattr(params, n), dtype) for n in free}
-    found = []
+    slopes_at_points = []
+    # A constant term has the same derivative everywhere. Three random points: one where the
+    # derivative of another term happens to be the same is as good as impossible.
     for _ in range(3):
         slopes = jax.jacfwd(rates)(values, draw(model.State), draw(model.Inputs))
-        by_state = [
-            [float(d[n]) for d in (naming.asdict(slopes)[s] for s in naming.names(model.State))]
-            for n in free
-        ]
-        found.append(np.array(by_state))
-    for slopes in zip(*found, strict=True):
+        by_state = naming.asdict(slopes)
+        slopes_at_points.append(np.array([[float(d[n]) for d in by_state.values()] for n in free]))
+    for slopes in zip(*slopes_at_points, strict=True):
         first, size = slopes[0], np.max(np.abs(slopes[0]))
         if size > 0 and all(np.max(np.abs(s - first)) <= 1e-9 * size for s in slopes):
             return True

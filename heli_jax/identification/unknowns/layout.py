@@ -16,8 +16,12 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
-from heli_jax.identification.unknowns import transforms as coordinates
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
+from heli_jax.identification.unknowns.transforms import Real
+
+# Where a type is Any here it is a record class of the model (Params, State, Inputs: a user's own
+# classes), or numbers that are NumPy's before they are put on the device and JAX's after.
 
 _BLOCK = 32
 _SCALES = 40.0
@@ -25,17 +29,21 @@ _SCALES = 40.0
 _FAINTEST, _STRONGEST = 60.0, 10.0
 """logarithms: how far sigma_w may fall below the measured motion, and rise above what would move
 the model as far as it was measured within one sample"""
+_SHORTEST, _LONGEST = 0.01, 1e3
+"""bounds of tau_w, in samples and in lengths of the record"""
 
 
 class FlightData(NamedTuple):
     """One flight as arrays: what a trace may see of it."""
 
     dt: Any
+    """[s]"""
     inputs: Any
-    """the model's Inputs, arrays (N,)"""
+    """the model's Inputs, arrays (N,), SI"""
     outputs: dict[str, Any]
-    """measured, arrays (N,)"""
+    """measured, arrays (N,), SI, NaN where one is missing"""
     known: dict[str, Any]
+    """parameters that differ in this flight, SI"""
     state_scale: dict[str, Any]
     """sd of the weak prior on the initial state"""
     bias_scale: dict[str, Any]
@@ -73,7 +81,7 @@ class Layout(eqx.Module):
     """inputs with an offset of their own in each flight"""
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """by flight, sorted by name: the order of the residuals"""
-    noise: tuple[str, ...] = eqx.field(static=True)
+    disturbance: tuple[str, ...] = eqx.field(static=True)
     """parameters of the disturbance, estimated beside the others by filter error"""
     scaled: tuple[str, ...] = eqx.field(static=True)
     """filter error: outputs whose noise has an unknown factor of its own"""
@@ -93,8 +101,9 @@ class Layout(eqx.Module):
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
 
     @property
-    def named(self) -> tuple[str, ...]:
-        """The unknowns that the verdict speaks of: parameters, gains, the shift."""
+    def of_interest(self) -> tuple[str, ...]:
+        """The parameters of interest: what the verdict speaks of, first in z. To the free
+        parameters come the gains and the shift, which are shared by all flights."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
 
@@ -103,22 +112,25 @@ class Layout(eqx.Module):
         """The states whose initial values are unknowns: all that are not random there."""
         if not self.initial_state:
             return ()
+        # A disturbance's state has a distribution at the first sample, with which the filter
+        # begins; an unknown beside that would be a second estimate of the same thing.
         random = self.model.random_states
         return tuple(n for n in naming.names(self.model.State) if n not in random)
 
     @property
-    def weak(self) -> int:
-        """Where in z the initial states, biases and input offsets begin."""
-        return len(self.named) + len(self.noise) + len(self.scaled)
+    def first_nuisance(self) -> int:
+        """Where in z the nuisance parameters of the flights begin: initial states, biases and
+        input offsets, which have weak priors and are projected out of the verdict."""
+        return len(self.of_interest) + len(self.disturbance) + len(self.scaled)
 
-    def noise_at(self, name: str) -> int:
+    def disturbance_at(self, name: str) -> int:
         """Where in z a parameter of the disturbance stands."""
-        return len(self.named) + self.noise.index(name)
+        return len(self.of_interest) + self.disturbance.index(name)
 
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        return self.weak + sum(
+        return self.first_nuisance + sum(
             count * len(self.states) + self.constants(outputs)
             for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
         )
@@ -136,6 +148,8 @@ class Layout(eqx.Module):
         """Unknowns that the data have to determine: those that windows tie together count once."""
         if self.continuity is None:
             return self.size
+        # The states at the start of a window are nearly given by the window before it, so only
+        # those of the first take a degree of freedom.
         return self.size - len(self.states) * sum(count - 1 for count, _ in self.windows)
 
 
@@ -144,12 +158,12 @@ class Noise(NamedTuple):
 
     sd: tuple[dict[str, Any], ...]
     """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
-    level: Any
+    log_variance_ratio: Any
     """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
     the likelihood is laid out in rows, so that they have variance 1"""
 
 
-class Reached(NamedTuple):
+class Solution(NamedTuple):
     """Where a fit ended, for what goes on from there."""
 
     layout: Layout
@@ -178,34 +192,44 @@ class Unknowns(NamedTuple):
 def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
     """The static side of a problem over the given flights.
 
-    `bounded` keeps the free parameters within their bounds by logit coordinates.
+    Args:
+        problem: what is free, and which nuisances.
+        flights: those whose initial states, biases and offsets stand in z, in this order.
+        bounded: keeps the free parameters within their bounds by logit coordinates.
     """
+    # All of it is hashable and static: two problems of one layout share their compiled programs.
     estimator = estimator_of(problem.method)
     scaled, concentrated = estimator.scaled_outputs(problem)
-    how = coordinates.kind if bounded else coordinates.plain_kind
+    kind_of = transforms.kind if bounded else transforms.plain_kind
     nuisance = problem.nuisance
-    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
     return Layout(
         model=problem.model,
         free=tuple(problem.free),
-        kinds=tuple(how(f) for f in problem.free.values()),
+        kinds=tuple(kind_of(f) for f in problem.free.values()),
         gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
         bias=nuisance.bias,
         offsets=offset_inputs(problem),
+        # By name, as JAX orders the dictionaries in everything that is compiled.
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
-        noise=tuple(problem.noise),
+        disturbance=tuple(problem.noise),
         scaled=scaled,
         estimator=estimator,
         concentrated=concentrated,
         solver=problem.solver,
         substeps=problem.substeps,
-        block=_BLOCK if exact else 1,
+        block=_block(problem),
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
     )
+
+
+def _block(problem: Problem) -> int:
+    """Samples that one step of the recurrence takes: several only where it is exact."""
+    exact = problem.solver == "exact" or (problem.solver is None and problem.model.linear)
+    return _BLOCK if exact else 1
 
 
 def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
@@ -218,16 +242,25 @@ def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
     if problem.window is None:
         return 1, n
     samples = round(problem.window / flight.dt)
+    # The length asked for is met only about: windows of one length run side by side in one vmap,
+    # where a short one at the end would be simulated by itself.
     count = max(1, round(n / samples))
     return count, -(-n // count)
 
 
-def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
-    """The i-th free parameter at its coordinate z (any shape)."""
-    return coordinates.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
+def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
+    """The value of a free parameter.
+
+    Args:
+        layout: says how its coordinate is to be read.
+        data: its sign or scale and its bounds.
+        i: which one, in the order of `layout.free`.
+        z: its coordinate, any shape.
+    """
+    return transforms.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 
-def noise_limits(data: Data) -> dict[str, tuple[Any, Any]]:
+def disturbance_limits(data: Data) -> dict[str, tuple[Any, Any]]:
     """Lowest and highest logarithm of each parameter of the disturbance.
 
     A correlation time below a hundredth of a sample is white noise to any record, one above a
@@ -244,53 +277,69 @@ def noise_limits(data: Data) -> dict[str, tuple[Any, Any]]:
     motion = functools.reduce(
         jnp.maximum, [0.1 * s for f in data.flights for s in f.bias_scale.values()]
     )
+    # sigma_w is an acceleration: over one sample it moves an angle by sigma_w dt^2, hence the
+    # -2 log(dt) at the upper end.
     size = jnp.log(motion)
     return {
         "sigma_w": (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST),
-        "tau_w": (jnp.log(0.01 * dt), jnp.log(1e3 * longest)),
+        "tau_w": (jnp.log(_SHORTEST * dt), jnp.log(_LONGEST * longest)),
     }
 
 
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
-    """Names for the entries of z."""
+    """Names for the entries of z.
+
+    Args:
+        layout: what stands where.
+        data: scales, signs and bounds of the coordinates.
+        z: all unknowns (q,), without units.
+    """
     q = len(layout.free)
     params = {name: value_of(layout, data, i, z[i]) for i, name in enumerate(layout.free)}
     gains = {name: z[q + i] for i, name in enumerate(layout.gains)}
     at = q + len(layout.gains)
     shift = None
     if layout.shift:
+        # Bounded smoothly: a clip would leave a shift at the bound without a derivative.
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
-    limits = noise_limits(data)
+    limits = disturbance_limits(data)
+    # Clipped, not transformed: inside the limits the likelihood keeps its shape in the logarithm,
+    # and outside its derivative is zero, which tells that the parameter means nothing there.
     noise = {
-        name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noise)
+        name: jnp.exp(jnp.clip(z[at + i], *limits[name]))
+        for i, name in enumerate(layout.disturbance)
     }
-    at += len(layout.noise)
+    at += len(layout.disturbance)
     scales = {
         name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
         for i, name in enumerate(layout.scaled)
     }
-    at = layout.weak
-    states, biases, offsets = [], [], []
-    for flight, outputs, (count, _) in zip(
-        data.flights, layout.outputs, layout.windows, strict=True
-    ):
-        state = None
-        if layout.initial_state:
-            k = len(layout.states)
-            own = z[at : at + count * k].reshape(count, k)
-            own = own[0] if count == 1 else own
-            values = dict.fromkeys(naming.names(layout.model.State), jnp.zeros_like(own[..., 0]))
-            values |= {n: own[..., i] * flight.state_scale[n] for i, n in enumerate(layout.states)}
-            state, at = layout.model.State(**values), at + count * k
-        bias = {n: jnp.zeros_like(z[0]) for n in outputs}
-        if layout.bias:
-            bias = {n: z[at + i] * flight.bias_scale[n] for i, n in enumerate(outputs)}
-            at += len(outputs)
-        offset = {n: z[at + i] * flight.offset_scale[n] for i, n in enumerate(layout.offsets)}
-        at += len(layout.offsets)
-        states.append(state)
-        biases.append(bias)
-        offsets.append(offset)
-    by_flight = (tuple(states), tuple(biases), tuple(offsets))
-    return Unknowns(params, noise, scales, gains, shift, *by_flight)
+    at = layout.first_nuisance
+    flights = []
+    for i, flight in enumerate(data.flights):
+        flights.append(_of_flight(layout, i, flight, z, at))
+        at += layout.windows[i][0] * len(layout.states) + layout.constants(layout.outputs[i])
+    states, biases, offsets = zip(*flights, strict=True)
+    return Unknowns(params, noise, scales, gains, shift, states, biases, offsets)
+
+
+def _of_flight(
+    layout: Layout, i: int, flight: FlightData, z: Array, at: int
+) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """The i-th flight's initial state, biases and input offsets, which begin at z[at]."""
+    count, outputs, state = layout.windows[i][0], layout.outputs[i], None
+    if layout.initial_state:
+        k = len(layout.states)
+        initial = z[at : at + count * k].reshape(count, k)
+        initial = initial[0] if count == 1 else initial
+        # States that are random at the first sample begin at their mean, zero.
+        values = dict.fromkeys(naming.names(layout.model.State), jnp.zeros_like(initial[..., 0]))
+        values |= {n: initial[..., j] * flight.state_scale[n] for j, n in enumerate(layout.states)}
+        state, at = layout.model.State(**values), at + count * k
+    bias = {n: jnp.zeros_like(z[0]) for n in outputs}
+    if layout.bias:
+        bias = {n: z[at + j] * flight.bias_scale[n] for j, n in enumerate(outputs)}
+        at += len(outputs)
+    offset = {n: z[at + j] * flight.offset_scale[n] for j, n in enumerate(layout.offsets)}
+    return state, bias, offset

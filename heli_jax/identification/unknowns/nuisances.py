@@ -19,28 +19,34 @@ class WeakUnknown(NamedTuple):
 
 
 def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
-    """The unknowns from `layout.weak` on, in their order."""
-    found = []
-    for label, outputs, (count, _) in zip(
-        labels(problem.training), layout.outputs, layout.windows, strict=True
-    ):
-        for k in range(count):
-            ending = f" of window {k + 1}" if count > 1 else ""
-            found += [
-                WeakUnknown(f"{label}/initial {n}{ending}", "initial_state", f"the initial {n}")
-                for n in layout.states
-            ]
-        if layout.bias:
-            found += [WeakUnknown(f"{label}/bias {n}", "bias", f"the bias of {n}") for n in outputs]
-        found += [
-            WeakUnknown(f"{label}/offset {n}", "input_offset", f"the offset of {n}")
-            for n in layout.offsets
-        ]
-    size = layout.size - layout.weak
+    """The unknowns from `layout.first_nuisance` on, in their order."""
+    unknowns = []
+    for i, label in enumerate(labels(problem.training)):
+        unknowns += _of_flight(label, layout, i)
+    size = layout.size - layout.first_nuisance
     # One that is not listed here is left without a name, not taken for another.
-    if len(found) != size:
-        found = [WeakUnknown(f"nuisance {i + 1}", "", "a nuisance") for i in range(size)]
-    return tuple(found)
+    if len(unknowns) != size:
+        unknowns = [WeakUnknown(f"nuisance {i + 1}", "", "a nuisance") for i in range(size)]
+    return tuple(unknowns)
+
+
+def _of_flight(label: str, layout: Layout, i: int) -> list[WeakUnknown]:
+    """Those of the i-th flight, in the order in which `layout.unpack` reads them."""
+    unknowns, count = [], layout.windows[i][0]
+    for k in range(count):
+        ending = f" of window {k + 1}" if count > 1 else ""
+        unknowns += [
+            WeakUnknown(f"{label}/initial {n}{ending}", "initial_state", f"the initial {n}")
+            for n in layout.states
+        ]
+    if layout.bias:
+        unknowns += [
+            WeakUnknown(f"{label}/bias {n}", "bias", f"the bias of {n}") for n in layout.outputs[i]
+        ]
+    return unknowns + [
+        WeakUnknown(f"{label}/offset {n}", "input_offset", f"the offset of {n}")
+        for n in layout.offsets
+    ]
 
 
 def can_be_off(problem: Problem, kind: str) -> bool:
@@ -51,5 +57,6 @@ def can_be_off(problem: Problem, kind: str) -> bool:
 def labels(flights: tuple[Flight, ...]) -> list[str]:
     """What to call each flight; of several with one name the second and further have a number."""
     names = [f.name or f"flight {i + 1}" for i, f in enumerate(flights)]
+    # Two logs may bear one file name; results are kept by label, so one would hide the other.
     before = [names[:i].count(name) for i, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]

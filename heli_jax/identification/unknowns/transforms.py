@@ -2,12 +2,16 @@
 bounds."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from heli_jax.identification.problem import Free
+
+type Real = Array | np.ndarray | np.floating | float
+"""real numbers of any shape, traced or not"""
 
 KINDS = ("log", "linear", "above", "below", "logit-log", "logit")
 """log: x = sign e^z. linear: x = scale z. above, below: a bound on one side. logit-log: between two
@@ -19,11 +23,13 @@ def kind(free: Free) -> str:
     that may be any."""
     if free.lower is None and free.upper is None:
         return "linear" if free.sign == "any" else "log"
+    # By `limits`, not by what is stated: one bound on a parameter of one sign makes two with zero.
     low, high = limits(free)
     if math.isinf(high):
         return "above"
     if math.isinf(low):
         return "below"
+    # A logarithm needs both bounds on one side of zero, and none at zero.
     return "logit-log" if low * high > 0 else "logit"
 
 
@@ -38,6 +44,7 @@ def limits(free: Free) -> tuple[float, float]:
             -math.inf if free.lower is None else free.lower,
             math.inf if free.upper is None else free.upper,
         )
+    # Zero cannot be crossed in log coordinates, so it bounds the side on which the start lies.
     low = free.lower if free.lower is not None else (0.0 if free.start > 0 else -math.inf)
     high = free.upper if free.upper is not None else (0.0 if free.start < 0 else math.inf)
     return low, high
@@ -45,11 +52,10 @@ def limits(free: Free) -> tuple[float, float]:
 
 def plain_kind(free: Free) -> str:
     """The coordinate without regard to bounds: log wherever zero is not inside them, linear where
-    the sign may be any and there are not two of them.
-
-    A least-squares valley that is straight in log coordinates stays straight; the bounds are
-    looked at afterwards.
-    """
+    the sign may be any and there are not two of them."""
+    # A product of powers that the data determine, such as a/Ixx, is a straight valley in log
+    # coordinates. A logit bends it, and Levenberg-Marquardt then creeps along the bend; so bounds
+    # are looked at only after this search has left them.
     low, high = limits(free)
     if low >= 0 or high <= 0:
         return "log"
@@ -66,6 +72,7 @@ def changes_sign(free: Free) -> bool:
 def scale(free: Free) -> float:
     """The size of a parameter that may have any sign: that of its start, else of its prior or
     bound, else one unit."""
+    # Of these the first that is not zero: a start of zero says nothing of the parameter's size.
     sizes = [abs(free.start)]
     if free.prior is not None:
         sizes += [abs(free.prior.mean), free.prior.sd]
@@ -75,6 +82,7 @@ def scale(free: Free) -> float:
 
 def sign_or_scale(free: Free) -> float:
     """What `to_value` and `to_coordinate` take as `sign`."""
+    # Whichever of the two it is, to_value multiplies by it: one array of numbers serves both.
     if changes_sign(free):
         return scale(free)
     return math.copysign(1.0, free.start) if free.start else 1.0
@@ -86,35 +94,55 @@ def inside(free: Free, value: float) -> bool:
     return bool(low <= value <= high)
 
 
-def to_value(how: str, z: Any, sign: Any, low: Any, high: Any) -> Any:
-    """The parameter's value for a coordinate z; `sign` is the scale where it is linear."""
-    if how == "log":
+def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real:
+    """The parameter's value for a coordinate.
+
+    Args:
+        transform: one of `KINDS`.
+        z: the coordinate, any shape, no unit.
+        sign: +1 or -1; the parameter's scale where the transform is linear (`sign_or_scale`).
+        low, high: bounds, in the parameter's unit, infinite where there is none.
+    """
+    # Which branch is taken is known before tracing: the compiled program holds one expression.
+    if transform == "log":
         return sign * jnp.exp(z)
-    if how == "linear":
+    if transform == "linear":
         return sign * z
-    if how == "above":
+    if transform == "above":
         return low + jnp.exp(z)
-    if how == "below":
+    if transform == "below":
+        # e^z is the distance to the bound, so the value falls as z rises.
         return high - jnp.exp(z)
-    if how == "logit":
+    if transform == "logit":
         return low + (high - low) * jax.nn.sigmoid(z)
+    # logit-log: a is the logarithm of the lower bound's size, so for two negative bounds a > b and
+    # the value still rises with z.
     a, b = jnp.log(jnp.abs(low)), jnp.log(jnp.abs(high))
     return sign * jnp.exp(a + (b - a) * jax.nn.sigmoid(z))
 
 
-def to_coordinate(how: str, x: Any, sign: Any, low: Any, high: Any) -> Any:
-    """The coordinate z of a value inside the bounds."""
-    if how == "log":
+def to_coordinate(transform: str, x: Real, sign: Real, low: Real, high: Real) -> Real:
+    """The coordinate of a value inside the bounds: the inverse of `to_value`.
+
+    Args:
+        transform: one of `KINDS`.
+        x: the value, any shape, in the parameter's unit.
+        sign: as in `to_value`.
+        low, high: bounds, in the parameter's unit, infinite where there is none.
+    """
+    # A value on a bound has an infinite coordinate: callers move it inside first.
+    if transform == "log":
         return jnp.log(sign * x)
-    if how == "linear":
+    if transform == "linear":
         return x / sign
-    if how == "above":
+    if transform == "above":
         return jnp.log(x - low)
-    if how == "below":
+    if transform == "below":
         return jnp.log(high - x)
-    if how == "logit":
+    if transform == "logit":
         share = (x - low) / (high - low)
     else:
         a, b = jnp.log(jnp.abs(low)), jnp.log(jnp.abs(high))
         share = (jnp.log(jnp.abs(x)) - a) / (b - a)
+    # log1p keeps the digits of a share near zero, where 1 - share rounds to 1.
     return jnp.log(share) - jnp.log1p(-share)

@@ -23,7 +23,7 @@ from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
-    Judged,
+    OutputAdequacy,
     Record,
     advice_for,
     is_unstable,
@@ -33,6 +33,8 @@ from heli_jax.identification.validation.metrics import (
     Whiteness,
     autocorrelation,
 )
+
+# params is Any: a record of a model's Params, whose class may be a user's own.
 
 EXPLAINED = 0.8
 """share of what is not white noise that has to be explained"""
@@ -56,7 +58,8 @@ class Adequacy(NamedTuple):
     adequate: bool
     less_than_mean: bool
     """whether some output is followed worse than by its mean"""
-    judged: tuple[Judged, ...]
+    # Its name is a key of fit.json.
+    judged: tuple[OutputAdequacy, ...]
     reasons: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -65,20 +68,23 @@ class Adequacy(NamedTuple):
     @property
     def doubtful(self) -> bool:
         """Whether some output misses the card's gate, though not by far."""
-        return any(one.doubtful for one in self.judged)
+        return any(output.doubtful for output in self.judged)
 
     @property
     def summary(self) -> str:
         """`yes`, or `no (VAF of p is -586, less than its mean)`."""
         if self.adequate:
             doubts = [
-                f"VAF of {one.output} is {one.vaf:.3g}" for one in self.judged if one.doubtful
+                f"VAF of {output.output} is {output.vaf:.3g}"
+                for output in self.judged
+                if output.doubtful
             ]
             return f"yes, with doubts ({'; '.join(doubts)})" if doubts else "yes"
-        bad = [one for one in self.judged if not one.adequate]
+        bad = [output for output in self.judged if not output.adequate]
         words = [
-            f"VAF of {one.output} is {one.vaf:.3g}{', less than its mean' if one.vaf < 0 else ''}"
-            for one in bad
+            f"VAF of {output.output} is {output.vaf:.3g}"
+            + (", less than its mean" if output.vaf < 0 else "")
+            for output in bad
         ]
         return f"no ({'; '.join(words)})" if words else "no"
 
@@ -92,83 +98,103 @@ UNJUDGED = Adequacy(True, False, ())
 """what a Fit has that nobody judged"""
 
 
-def assess(
-    problem: Problem,
-    params: Any,
-    records: tuple[Record, ...],
-    agreement: Mapping[str, Metrics],
-    whiteness: Mapping[str, Whiteness],
-    against: Mapping[str, float] | None = None,
-    unknowns: int = 0,
-) -> Adequacy:
-    """Judge the fitted flights.
+class Evidence(NamedTuple):
+    """What adequacy is assessed by: the fitted flights, and what is known of their residuals."""
+
+    records: tuple[Record, ...]
+    agreement: Mapping[str, Metrics]
+    """of the simulation, by output over all fitted flights"""
+    whiteness: Mapping[str, Whiteness]
+    """by 'flight/output', of the residuals, with filter error of the innovations"""
+    error_ratio: Mapping[str, float] | None = None
+    """with a disturbance, by output the power of the simulation's error over that which disturbance
+    and noise make; without, the simulation has to explain by itself"""
+    unknowns: int = 0
+    """how many were estimated; a response that explains no more than as many unknowns explain of
+    noise by chance shows nothing"""
+
+
+def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
+    """Whether the model is adequate to the fitted flights.
 
     Args:
-        params: the vehicle with the estimates in place.
-        records: the fitted flights.
-        agreement: of the simulation, by output over all fitted flights.
-        whiteness: by 'flight/output', of the residuals, with filter error of the innovations.
-        against: with a disturbance, by output the power of the simulation's error over that which
-            disturbance and noise make; without, the simulation has to explain by itself.
-        unknowns: how many were estimated; a response that explains no more than as many unknowns
-            explain of noise by chance shows nothing.
+        problem: what was fitted.
+        params: the vehicle with the estimates in place, a record of the model's Params, SI.
+        evidence: measured and simulated outputs, and what is left between them.
     """
-    unstable = against is not None and is_unstable(problem, params)
-    judged = tuple(
-        _judged(name, m, records, whiteness, None if against is None else against[name], unstable)
-        for name, m in agreement.items()
-        if not _still(name, records)
+    disturbed = evidence.error_ratio is not None
+    # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
+    unstable = disturbed and is_unstable(problem, params)
+    outputs = tuple(
+        _of_output(name, m, evidence, unstable)
+        for name, m in evidence.agreement.items()
+        if not _still(name, evidence.records)
     )
-    bad = [one for one in judged if not one.adequate]
-    if judged and not bad and against is None and not _stands_out(judged, records, unknowns):
-        return _nothing_shown(judged)
-    doubted = [*bad, *(one for one in judged if one.doubtful)]
+    bad = [output for output in outputs if not output.adequate]
+    if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
+        return _nothing_shown(outputs)
+    doubted = [*bad, *(output for output in outputs if output.doubtful)]
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
-    apart = len(doubted) < len(judged)
+    apart = len(doubted) < len(outputs)
     advice = [
-        text for one in doubted for text in advice_for(problem, one, records, unstable, apart)
-    ]
-    remarks = [
-        f"Driven by the inputs alone, the model follows {one.output} worse than its mean does (VAF "
-        f"{one.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
-        "columns, signs and units the right ones?"
-        for one in judged
-        if one.adequate and one.against_disturbance is not None and one.vaf < 0
+        text
+        for output in doubted
+        for text in advice_for(problem, output, evidence.records, unstable, apart)
     ]
     return Adequacy(
         not bad,
-        any(not one.vaf >= 0 for one in bad),
-        judged,
-        tuple(_reason(one) for one in bad),
+        # Written so that a VAF that is no number counts as less than the mean.
+        any(not output.vaf >= 0 for output in bad),
+        outputs,
+        tuple(_reason(output) for output in bad),
         tuple(dict.fromkeys(advice)),
-        tuple(remarks),
+        tuple(_as_expected(outputs)),
     )
+
+
+def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:
+    """What looks bad and is what the estimated disturbance makes."""
+    return [
+        f"Driven by the inputs alone, the model follows {output.output} worse than its mean does "
+        f"(VAF {output.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
+        "columns, signs and units the right ones?"
+        for output in outputs
+        if output.adequate and output.against_disturbance is not None and output.vaf < 0
+    ]
 
 
 _BY_CHANCE = 1e-3
 """probability that noise alone is explained as well"""
 
 
-def _stands_out(judged: tuple[Judged, ...], records: tuple[Record, ...], unknowns: int) -> bool:
+def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool:
     """Whether the response of some output stands out of the noise: a likelihood ratio of the model
     against a constant (Wilks, 1938)."""
-    for one in judged:
-        measured = [r.measured[one.output] for r in records if one.output in r.measured]
-        n = sum(int(np.isfinite(y).sum()) for y in measured)
-        gained = -n * np.log(max(1.0 - one.vaf, 1e-300))
-        if unknowns < 1 or scipy.special.chdtrc(unknowns, max(gained, 0.0)) < _BY_CHANCE:
+    unknowns = evidence.unknowns
+    for output in outputs:
+        measured = _of_all_flights(output.output, evidence.records)
+        n = int(np.isfinite(measured).sum())
+        # Twice the gain in log-likelihood of white noise with unknown variance: n log(1/(1 - VAF)),
+        # which noise alone makes chi-squared with one degree of freedom an unknown.
+        gain = -n * np.log(max(1.0 - output.vaf, 1e-300))
+        if unknowns < 1 or scipy.special.chdtrc(unknowns, max(gain, 0.0)) < _BY_CHANCE:
             return True
-    return not judged
+    return not outputs
 
 
-def _nothing_shown(judged: tuple[Judged, ...]) -> Adequacy:
-    outputs = " and ".join(f"{one.output} (VAF {one.vaf:.2g})" for one in judged)
+def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
+    """The measured output (any,), flight after flight."""
+    return np.concatenate([r.measured[name] for r in records if name in r.measured])
+
+
+def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
+    words = " and ".join(f"{output.output} (VAF {output.vaf:.2g})" for output in outputs)
     return Adequacy(
         False,
         False,
-        tuple(one._replace(adequate=False) for one in judged),
+        tuple(output._replace(adequate=False) for output in outputs),
         (
-            f"The response does not stand out of the noise in {outputs}: as many unknowns explain "
+            f"The response does not stand out of the noise in {words}: as many unknowns explain "
             "as much of noise alone.",
         ),
         ("Use larger or more inputs, a longer record, or an output with less noise.",),
@@ -180,31 +206,26 @@ def _still(name: str, records: tuple[Record, ...]) -> bool:
     return all(np.nanstd(r.measured[name]) == 0 for r in records if name in r.measured)
 
 
-def _judged(
-    name: str,
-    m: Metrics,
-    records: tuple[Record, ...],
-    whiteness: Mapping[str, Whiteness],
-    against: float | None,
-    unstable: bool,
-) -> Judged:
-    mine = [whiteness[f"{r.label}/{name}"] for r in records if name in r.measured]
-    white = all(w.white for w in mine)
-    lag1 = max((w.lag1 for w in mine), key=abs)
-    error = [r.measured[name] - r.simulated[name] for r in records if name in r.measured]
-    total = np.concatenate([r.measured[name] for r in records if name in r.measured])
-    explained, other = _explained(np.concatenate(error), total, error)
+def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> OutputAdequacy:
+    records = [r for r in evidence.records if name in r.measured]
+    tests = [evidence.whiteness[f"{r.label}/{name}"] for r in records]
+    white = all(test.white for test in tests)
+    lag1 = max((test.lag1 for test in tests), key=abs)
+    ratio = None if evidence.error_ratio is None else evidence.error_ratio[name]
+    error = [r.measured[name] - r.simulated[name] for r in records]
+    explained, other = _explained(error, _of_all_flights(name, evidence.records))
     if not np.isfinite(m.vaf):
-        return Judged(name, False, m.vaf, float("nan"), white, lag1, against)
+        return OutputAdequacy(name, False, m.vaf, float("nan"), white, lag1, ratio)
     enough = explained >= EXPLAINED
-    if against is None:
+    if ratio is None:
         noise_alone = (white or other <= NEARLY_WHITE) and m.vaf >= WORSE
-        return Judged(name, bool(enough or noise_alone), m.vaf, explained, white, lag1)
+        return OutputAdequacy(name, bool(enough or noise_alone), m.vaf, explained, white, lag1)
     # Of an unstable model the filter expects any error of a simulation: then its innovations are
     # all there is to judge by.
-    expected = against <= EXPECTED and (white or (abs(lag1) < FAR_FROM_WHITE and not unstable))
-    expected = expected and not _moves_against(name, records)
-    return Judged(name, bool(enough or expected), m.vaf, explained, white, lag1, against)
+    expected = ratio <= EXPECTED and (white or (abs(lag1) < FAR_FROM_WHITE and not unstable))
+    expected = expected and not _moves_against(name, evidence.records)
+    adequate = bool(enough or expected)
+    return OutputAdequacy(name, adequate, m.vaf, explained, white, lag1, ratio)
 
 
 def _moves_against(name: str, records: tuple[Record, ...]) -> bool:
@@ -212,64 +233,74 @@ def _moves_against(name: str, records: tuple[Record, ...]) -> bool:
 
     A disturbance knows nothing of the inputs. So the slope of the measured on the simulated output
     is 1 but for what chance makes of the two, whose autocorrelations say how much that is
-    (Bartlett, 1935). In a record of a few swings of the disturbance that is little known, and the
-    slope may well be below zero. Where an input has the wrong sign and the parameters keep theirs,
-    the filter takes the response for disturbance and the simulation shrinks: the slope is then
-    several times below -1.
+    (Bartlett, 1935).
     """
+    # Where an input has the wrong sign and the parameters keep theirs, the filter takes the
+    # response for disturbance and the simulation shrinks: the slope is then several times below
+    # -1. A slope that is merely negative tells nothing in a record of a few swings.
     product, power, variance = 0.0, 0.0, 0.0
     for r in records:
         if name not in r.measured or not np.isfinite(r.simulated[name]).all():
             continue
-        y, m = r.measured[name], r.simulated[name]
-        d, m = np.where(np.isnan(y), 0.0, y - m - np.nanmean(y - m)), m - m.mean()
-        lags = max(1, y.size // 5)
-        window = 1.0 - np.arange(lags + 1) / (lags + 1)
-        both = window * autocorrelation(d, lags) * autocorrelation(m, lags)
-        product, power = product + float(d @ m), power + float(m @ m)
-        variance += float(d @ d) * float(m @ m) * (both[0] + 2.0 * both[1:].sum()) / y.size
+        covariance, own_power, chance = _covariance_by_chance(r.measured[name], r.simulated[name])
+        product, power, variance = product + covariance, power + own_power, variance + chance
     if not (power > 0 and variance > 0):
         return False
     return 1.0 + product / power < _TURNED and product / variance**0.5 < _FIVE_PERCENT
 
 
-def _explained(
-    error: np.ndarray, measured: np.ndarray, by_flight: list[np.ndarray]
-) -> tuple[float, float]:
-    """Share explained of what is not white noise, and the part of the error that is not."""
-    with np.errstate(all="ignore"):
-        residual, total = float(np.nanvar(error)), float(np.nanvar(measured))
-        sizes = [int(np.count_nonzero(~np.isnan(r))) for r in by_flight]
-        noises = [noise_guess(r) ** 2 for r in by_flight]
+def _covariance_by_chance(y: np.ndarray, m: np.ndarray) -> tuple[float, float, float]:
+    """Of the disturbance's part d = y - m of an output: d'm, m'm, and the variance that d'm has
+    where the two are independent."""
+    # The slope of y on m is 1 + d'm / m'm.
+    d, m = np.where(np.isnan(y), 0.0, y - m - np.nanmean(y - m)), m - m.mean()
+    lags = max(1, y.size // 5)
+    # Bartlett's window: without it the sum over the lags can be negative, and no variance.
+    window = 1.0 - np.arange(lags + 1) / (lags + 1)
+    both = window * autocorrelation(d, lags) * autocorrelation(m, lags)
+    power = float(m @ m)
+    chance = float(d @ d) * power * (both[0] + 2.0 * both[1:].sum()) / y.size
+    return float(d @ m), power, chance
+
+
+def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, float]:
+    """Share explained of what is not white noise, and the part of the error that is not; `error`
+    by flight."""
+    with np.errstate(all="ignore"):  # a simulation that diverges overflows in its square
+        residual, total = float(np.nanvar(np.concatenate(error))), float(np.nanvar(measured))
+        # Flight by flight, since differences across the joint of two flights are no noise.
+        sizes = [int(np.count_nonzero(~np.isnan(r))) for r in error]
+        noises = [noise_guess(r) ** 2 for r in error]
         noise = float(np.average(noises, weights=sizes))
     if not np.isfinite(residual):
         return float("nan"), float("nan")
+    # The guess of the noise may exceed a residual that is noise alone.
     other = max(residual - noise, 0.0)
     rest = max(total - min(noise, residual), 1e-300)
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
-def _reason(one: Judged) -> str:
-    if not np.isfinite(one.vaf):
-        return f"The simulated {one.output} is not finite: nothing of it is explained."
-    if one.vaf < 0:
+def _reason(output: OutputAdequacy) -> str:
+    name, vaf, ratio = output.output, output.vaf, output.against_disturbance
+    if not np.isfinite(vaf):
+        return f"The simulated {name} is not finite: nothing of it is explained."
+    if vaf < 0:
         return (
-            f"Driven by the inputs alone, the model follows {one.output} worse than its mean does "
-            f"(VAF {one.vaf:.3g}): its parameters mean little. Are the columns, signs and units "
-            "the right ones, and the start values near?"
+            f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
+            f"{vaf:.3g}): its parameters mean little. Are the columns, signs and units the right "
+            "ones, and the start values near?"
         )
-    if one.against_disturbance is not None and one.against_disturbance > EXPECTED:
+    if ratio is not None and ratio > EXPECTED:
         return (
-            f"The simulated {one.output} misses the measured one by "
-            f"{one.against_disturbance**0.5:.2g} times what the estimated disturbance explains "
-            f"(VAF {one.vaf:.3g})."
+            f"The simulated {name} misses the measured one by {ratio**0.5:.2g} times what the "
+            f"estimated disturbance explains (VAF {vaf:.3g})."
         )
-    if one.against_disturbance is not None:
+    if ratio is not None:
         return (
-            f"The innovations of {one.output} are far from white (autocorrelation {one.lag1:+.2f} "
-            f"at one sample) and its simulation explains little (VAF {one.vaf:.3g})."
+            f"The innovations of {name} are far from white (autocorrelation {output.lag1:+.2f} "
+            f"at one sample) and its simulation explains little (VAF {vaf:.3g})."
         )
     return (
-        f"The model explains {one.explained:.0%} of what in {one.output} is not white noise (VAF "
-        f"{one.vaf:.3g}), wanted is half at least; the acceptance card asks for a VAF of 0.9."
+        f"The model explains {output.explained:.0%} of what in {name} is not white noise, expected "
+        f"at least {EXPLAINED:.0%} (VAF {vaf:.3g}); the acceptance card asks for a VAF of 0.9."
     )

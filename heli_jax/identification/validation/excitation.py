@@ -1,67 +1,89 @@
 """Doubts about a record that no residual shows: sampling too slow, inputs too small or too few."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.linear import modes
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.validation.operating_point import operating_point
+from heli_jax.identification.validation.operating_point import modes_of_flight
 
 _AT_NYQUIST = 0.9
+"""part of the Nyquist frequency from which on a mode is hardly shown by the samples"""
 _FEEBLE = 3.0
+"""rms of a response over the noise below which an input hardly excites the model"""
 
 
-def notes(problem: Problem, simulated: tuple[dict[str, np.ndarray], ...], sd: Any) -> list[str]:
-    """Sentences on sampling and excitation for runs simulated at the start values."""
-    found = sampling(problem, {n: f.start for n, f in problem.free.items()})
+def notes(
+    problem: Problem,
+    simulated: tuple[dict[str, np.ndarray], ...],
+    sd: tuple[Mapping[str, Any], ...],
+) -> list[str]:
+    """Sentences on sampling and excitation for runs simulated at the start values.
+
+    Args:
+        problem: the flights and what is free.
+        simulated: by flight and output (N,), SI.
+        sd: by flight and output that of the measurement noise, SI, a scalar of NumPy or JAX.
+    """
+    sentences = sampling(problem, {n: f.start for n, f in problem.free.items()})
     for flight, outputs, noise in zip(problem.training, simulated, sd, strict=True):
-        where = flight.name or "the flight"
-        for name, y in outputs.items():
-            moved = float(np.std(y))
-            if moved < _FEEBLE * float(noise[name]):
-                found.append(
-                    f"{where}: the input hardly excites the model: it moves {name} by "
-                    f"{moved:.2g} (rms, at the start values) where the noise is "
-                    f"{float(noise[name]):.2g}; use larger or more inputs."
-                )
-        changes = sum(int(np.count_nonzero(np.diff(u))) for u in flight.inputs.values())
-        if changes < len(problem.free):
-            names = " and ".join(flight.inputs)
-            found.append(
-                f"{where}: {names} {'change' if len(flight.inputs) > 1 else 'changes'} {changes} "
-                f"times in the record, fewer than there are free parameters "
-                f"({len(problem.free)}): it excites too little."
+        sentences += _feeble(flight, outputs, noise)
+        sentences += _few_changes(flight, len(problem.free))
+    return sentences
+
+
+def _feeble(
+    flight: Flight, outputs: Mapping[str, np.ndarray], noise: Mapping[str, Any]
+) -> list[str]:
+    sentences = []
+    for name, y in outputs.items():
+        # About its mean: a trim value that the model holds excites nothing.
+        moved = float(np.std(y))
+        if moved < _FEEBLE * float(noise[name]):
+            sentences.append(
+                f"{flight.name or 'the flight'}: the input hardly excites the model: it moves "
+                f"{name} by {moved:.2g} (rms, at the start values) where the noise is "
+                f"{float(noise[name]):.2g}; use larger or more inputs."
             )
-    return found
+    return sentences
+
+
+def _few_changes(flight: Flight, free: int) -> list[str]:
+    # Every change of an input is one new piece of information at best.
+    changes = sum(int(np.count_nonzero(np.diff(u))) for u in flight.inputs.values())
+    if changes >= free:
+        return []
+    return [
+        f"{flight.name or 'the flight'}: {' and '.join(flight.inputs)} "
+        f"{'change' if len(flight.inputs) > 1 else 'changes'} {changes} times in the record, fewer "
+        f"than there are free parameters ({free}): it excites too little."
+    ]
 
 
 def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
     """A sentence for each flight whose sampling a mode of the linearised model reaches."""
     free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
     params = naming.replace(problem.vehicle, **free)
-    found = []
+    sentences = []
     for flight in problem.training:
-        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-        here = naming.replace(params, **known)
-        at = operating_point(
-            problem.model, here, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
-        )
-        try:
-            eigenvalues = modes(problem.model, here, at.state, at.inputs)
-        except np.linalg.LinAlgError:  # no finite matrices there: nothing is known of the modes
+        linearised = modes_of_flight(problem.model, params, flight, problem.substeps)
+        if linearised is None:
             continue
+        eigenvalues, about = linearised
+        # The imaginary part alone: a fast decay without oscillation has no alias.
         fastest = float(np.max(np.abs(np.imag(eigenvalues))))
         nyquist = np.pi / flight.dt
         if fastest >= _AT_NYQUIST * nyquist:
             past = fastest >= nyquist
-            found.append(
+            sentences.append(
                 f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s"
-                f"{f' (linearised about {at.words})' if at.words else ''} lies "
+                f"{f' (linearised about {about})' if about else ''} lies "
                 f"{'at or past' if past else 'near'} the Nyquist frequency of the sampling "
                 f"({nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, and "
                 "its aliases may be taken for slower dynamics."
             )
-    return found
+    return sentences

@@ -40,19 +40,22 @@ def diverges(m: Metrics) -> bool:
 
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     """Agreement of two signals (N,) where something is measured (not NaN)."""
+    # Only what was measured counts, for the means too: a gap must not shift one of them.
     seen = ~np.isnan(measured)
     measured, simulated = measured[seen], simulated[seen]
     residual = measured - simulated
-    spread = np.linalg.norm(measured - measured.mean())
+    motion = np.linalg.norm(measured - measured.mean())
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
     mse = float(np.mean(residual**2))
     rmse = mse**0.5
+    # Theil's decomposition: the mean squared error is the sum of the squared difference of the
+    # means, that of the standard deviations, and 2 (1 - r) times their product.
     bias = (measured.mean() - simulated.mean()) ** 2 / mse if mse > 0 else float("nan")
     variance = (measured.std() - simulated.std()) ** 2 / mse if mse > 0 else float("nan")
     return Metrics(
-        vaf=float(1.0 - np.var(residual) / np.var(measured)) if spread > 0 else float("nan"),
+        vaf=float(1.0 - np.var(residual) / np.var(measured)) if motion > 0 else float("nan"),
         nrmse_fit_percent=(
-            float(100.0 * (1.0 - np.linalg.norm(residual) / spread)) if spread > 0 else float("nan")
+            float(100.0 * (1.0 - np.linalg.norm(residual) / motion)) if motion > 0 else float("nan")
         ),
         rmse=rmse,
         tic=float(rmse / rms) if rms > 0 else float("nan"),
@@ -79,29 +82,41 @@ def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
     """Autocorrelation (lags + 1,) from lag 0, by the biased estimate; NaN counts as the mean."""
     r = _centred(residual)
     n = r.size
+    # Padded to twice the length, or the end of the record would wrap round onto its beginning.
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(r, size)) ** 2
+    # Divided by n, not by the pairs at each lag: only so is the sequence positive semi-definite.
     c = np.fft.irfft(spectrum, size)[: lags + 1] / n
     return c / c[0] if c[0] > 0 else np.concatenate([[1.0], np.zeros(lags)])
 
 
 def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndarray:
-    """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags."""
+    """Correlation (2 lags + 1,) of u(t - lag) with the residual, lags from -lags to lags.
+
+    Args:
+        u: one signal (N,), any unit; NaN counts as its mean.
+        residual: the other (N,), as the first.
+        lags: how many samples to either side, below N.
+    """
     a, b = _centred(u), _centred(residual)
     n = a.size
     size = 1 << (2 * n - 1).bit_length()
+    # Gaps are at the mean and divided by n all the same: they draw the correlation towards zero.
     c = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size) / n
+    # The inverse transform keeps negative lags at its end.
     both = np.concatenate([c[-lags:], c[: lags + 1]])
     scale = a.std() * b.std()
     return both / scale if scale > 0 else np.zeros(2 * lags + 1)
 
 
 def _centred(signal: np.ndarray) -> np.ndarray:
+    # A missing sample at the mean adds nothing to any sum of products.
     return np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
 
 
 def lags_for(n: int) -> int:
     """How many lags a record of n samples bears: a quarter of it, at most 500."""
+    # Beyond a quarter an autocorrelation is the mean of too few products (Box and Jenkins).
     return max(1, min(n // 4, 500))
 
 
@@ -118,12 +133,10 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
     # Few lags see a short memory that many lags would drown; both must agree with white noise.
     short = min(lags, 20)
-    p = min(
-        1.0,
-        2.0
-        * together
-        * min(scipy.special.chdtrc(lags, q[-1]), scipy.special.chdtrc(short, q[short - 1])),
-    )
+    p_all = scipy.special.chdtrc(lags, q[-1])
+    p_short = scipy.special.chdtrc(short, q[short - 1])
+    # Bonferroni again, for two tests of each signal.
+    p = min(1.0, 2.0 * together * min(p_all, p_short))
     outside = float(np.mean(np.abs(r) * whole > BAND99 * np.sqrt(whole / pairs)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
 
@@ -140,8 +153,12 @@ def _seen_autocorrelation(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     def products(x: np.ndarray) -> np.ndarray:
         return np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)
 
+    # How many pairs are seen at each lag is the autocorrelation of the mask, whole numbers but for
+    # the rounding of the transform.
     pairs, c = np.round(products(seen.astype(float))), products(r)
     at = np.arange(1, max(n // 4, 1) + 1)
+    # With every second sample missing no pair is an odd lag apart; a lag of few pairs is noise that
+    # the division by them would blow up.
     at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
     if at.size == 0 or not c[0] > 0:
         return np.zeros(1), np.ones(1), np.ones(1)

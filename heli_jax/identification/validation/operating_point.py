@@ -11,13 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.analysis.linear import modes
 from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model
+from heli_jax.flights.flight import Flight
 from heli_jax.simulation.simulate import simulate
 from heli_jax.vehicle import of_helicopter
+
+# params, state and inputs are Any: records of a model, whose classes may be a user's own.
 
 _SLOW = 0.5
 """m/s: a record of less mean speed is of hover"""
@@ -44,7 +48,6 @@ def operating_point(
     dt: float,
     *,
     substeps: int = 4,
-    gains: Mapping[str, float] | None = None,
 ) -> OperatingPoint:
     """The point that stands for a record.
 
@@ -54,31 +57,51 @@ def operating_point(
 
     Args:
         model: any model, also one with a disturbance, which is zero at the point.
-        params: its parameters, of this flight.
-        inputs: as logged (N,), by name, SI.
+        params: its parameters, of this flight, SI.
+        inputs: as they act (N,), by name, SI: as logged, times a gain where one was estimated.
         outputs: as measured (N,), by name, SI; NaN where missing.
         dt: sample time [s].
         substeps: of the simulation.
-        gains: by name, what an input is multiplied by before it acts.
     """
     if model.linear:
         return EVERYWHERE
+    # A trim solves for the states that the machine has; those of a disturbance are none of them.
     quiet = _undisturbed(model)
     if is_full_nonlinear(quiet):
-        found = _trimmed(quiet, params, _condition(outputs, dt))
-        if found is not None:
-            return found._replace(state=_extended(model, found.state))
-    return _mean(model, params, inputs, dt, substeps, gains or {})
+        at_trim = _trimmed(quiet, params, _condition(outputs, dt))
+        if at_trim is not None:
+            return at_trim._replace(state=_extended(model, at_trim.state))
+    return _mean(model, params, inputs, dt, substeps)
+
+
+def modes_of_flight(
+    model: Model, params: Any, flight: Flight, substeps: int
+) -> tuple[np.ndarray, str] | None:
+    """Eigenvalues (n,) [1/s] of the model linearised for a flight, and about what, in words; None
+    where there are no finite matrices.
+
+    Args:
+        model: the model that is fitted.
+        params: its parameters, SI; what is known of the flight replaces them.
+        flight: the record.
+        substeps: of the simulation.
+    """
+    here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
+    at = operating_point(model, here, flight.inputs, flight.outputs, flight.dt, substeps=substeps)
+    try:
+        return modes(model, here, at.state, at.inputs), at.words
+    except np.linalg.LinAlgError:  # no finite matrices there: nothing is known of the modes
+        return None
 
 
 def _trimmed(model: Model, params: Any, condition: Condition) -> OperatingPoint | None:
     """The trim at a condition, else in hover; None where there is neither."""
-    for one in dict.fromkeys((condition, HOVER)):
+    for flown in dict.fromkeys((condition, HOVER)):
         try:
-            found = trim(model, params, one)
+            steady = trim(model, params, flown)
         except ValueError:  # the vehicle cannot fly so
             continue
-        return OperatingPoint(found.state, found.inputs, f"the trim {_words(one)}")
+        return OperatingPoint(steady.state, steady.inputs, f"the trim {_words(flown)}")
     return None
 
 
@@ -87,13 +110,16 @@ def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
     dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
     heading = outputs.get("yaw")
     psi = float(np.nanmean(heading)) if heading is not None else 0.0
-    ahead, aside = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
-    dx, dy, dz = (float(v) if abs(v) >= _SLOW else 0.0 for v in (ahead, aside, dz))
-    return Condition(dx, dy, dz, psi) if dx or dy or dz else HOVER
+    # From the axes of the ground to those of the heading, which a trim speaks of.
+    forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
+    # Records of hover drift: their trim would be called one of forward flight.
+    forward, lateral, up = (float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz))
+    return Condition(forward, lateral, up, psi) if forward or lateral or up else HOVER
 
 
 def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
     """Mean velocity along an axis [m/s], from what was measured of it."""
+    # A measured velocity tells more than two noisy positions at the ends of the record.
     if f"d{axis}" in outputs:
         return float(np.nanmean(outputs[f"d{axis}"]))
     if axis in outputs:
@@ -116,12 +142,13 @@ def _mean(
     inputs: Mapping[str, np.ndarray],
     dt: float,
     substeps: int,
-    gains: Mapping[str, float],
 ) -> OperatingPoint:
-    acting = {n: gains.get(n, 1.0) * np.asarray(inputs[n]) for n in naming.names(model.Inputs)}
+    """The mean of the inputs, and of the states that they give."""
+    acting = {n: np.asarray(inputs[n]) for n in naming.names(model.Inputs)}
     dtype = jnp.result_type(float)
     mean = model.Inputs(**{n: jnp.asarray(u.mean(), dtype) for n, u in acting.items()})
     driven = model.Inputs(**{n: jnp.asarray(u, dtype) for n, u in acting.items()})
+    # Not the equilibrium of the mean inputs: a model of one's own may have none.
     state = _mean_state(model, params, driven, jnp.asarray(dt, dtype), substeps)
     if all(bool(np.isfinite(v)) for v in jax.tree.leaves(state)):
         return OperatingPoint(state, mean, "the record's mean")
@@ -130,14 +157,16 @@ def _mean(
 
 
 @eqx.filter_jit
-def _mean_state(model: Model, params: Any, inputs: Any, dt: Any, substeps: int) -> Any:
-    found = simulate(model, params, inputs, dt=dt, substeps=substeps)
-    return jax.tree.map(lambda x: jnp.mean(x), found.states)
+def _mean_state(model: Model, params: Any, inputs: Any, dt: Float[Array, ""], substeps: int) -> Any:
+    run = simulate(model, params, inputs, dt=dt, substeps=substeps)
+    return jax.tree.map(lambda x: jnp.mean(x), run.states)
 
 
+# Cached, since a new Model is a new program to every function that is compiled for one.
 @functools.cache
 def _undisturbed(model: Model) -> Model:
     """A helicopter's model without the states of a disturbance; any other model as it is."""
+    # `with_disturbance` calls its states w1, w2.
     names = naming.names(model.State)
     kept = [n for n in names if not (n[:1] == "w" and n[1:2].isdigit())]
     if len(kept) == len(names) or not of_helicopter(model.Params):
@@ -164,6 +193,7 @@ def _undisturbed(model: Model) -> Model:
 
 def _extended(model: Model, state: Any) -> Any:
     """The model's State with zero where the given one has nothing."""
-    given = naming.asdict(state)
-    zero: Array = jnp.zeros((), jnp.result_type(*(jnp.asarray(v) for v in given.values())))
-    return model.State(**{n: given.get(n, zero) for n in naming.names(model.State)})
+    values = naming.asdict(state)
+    # Of the given dtype: strict promotion raises where a float32 state meets a float64 zero.
+    zero: Array = jnp.zeros((), jnp.result_type(*(jnp.asarray(v) for v in values.values())))
+    return model.State(**{n: values.get(n, zero) for n in naming.names(model.State)})

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.identification.unknowns.layout import Data, Layout, Solution
 
 _NULL = 1e-8
 """Directions of the scaled Jacobian below this part of the largest stay where they are."""
@@ -23,10 +22,7 @@ _MOST = 3
 
 def other_hold(
     problem: Problem,
-    layout: Layout,
-    data: Data,
-    noise: Noise,
-    z: Any,
+    at: Solution,
     e: Evaluation,
     sd: Mapping[str, float] | None = None,
     *,
@@ -36,54 +32,69 @@ def other_hold(
     """A sentence where the other hold of the inputs that move would change an estimate by more
     than its standard deviation; nothing where it would not.
 
-    One Gauss-Newton step from the same point, with r and r' the residuals with the hold taken and
-    with the other: -J'^+ (r' - r). So it tells the change at any point, as if the record were that
-    of the model there.
-
     Args:
-        e: the evaluation at z with the holds taken.
+        problem: what is fitted.
+        at: the point, with the layout and the numbers that it belongs to.
+        e: the evaluation there with the holds taken.
         sd: by name, SI; what J and the noise let expect unless given.
         skip: unknowns that the data do not determine.
         in_doubt: only of inputs that their log let be taken as linear, since a command that changes
             at every sample looks the same; and nothing where an input acts on an output directly,
             which would need a program of its own, as long in compiling as that of the fit.
     """
-    moving = [
-        {
-            n
-            for n in naming.names(problem.model.Inputs)
-            if np.ptp(f.inputs[n]) > 0
-            and (not in_doubt or (f.hold[n] == "linear" and n in f.hold_reason))
-        }
-        for f in problem.training
-    ]
+    moving = [_moving_inputs(problem, f, in_doubt) for f in problem.training]
     if not any(moving) or not np.all(np.isfinite(e.J)):
         return []
     if not _feeds_through(problem):
-        other = evaluate(layout, _averaged(layout, data, moving), noise, z)
+        other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
     elif not in_doubt:
-        other = evaluate(_flipped(layout, moving), data, noise, z)
+        other = evaluate(_flipped(at.layout, moving), at.data, at.noise, at.z)
     else:
         return []
     if not (np.all(np.isfinite(other.J)) and np.all(np.isfinite(other.r))):
         return []
-    q = len(layout.named)
-    change = _pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
-    change = change * np.asarray(e.slopes)
+    names = at.layout.of_interest
+    change = _change(e, other, len(names))
     if sd is None:
-        rows = _pseudoinverse(np.asarray(e.J))[:q]
-        expected = np.linalg.norm(rows, axis=1) * np.abs(e.slopes)
-        sd = dict(zip(layout.named, expected.tolist(), strict=True))
-    sizes = {
+        sd = dict(zip(names, _white_sd(e, len(names)).tolist(), strict=True))
+    changes = {
         n: (float(c), abs(float(c)) / sd[n])
-        for n, c in zip(layout.named, change, strict=True)
+        for n, c in zip(names, change, strict=True)
         if n not in skip and sd.get(n, 0.0) > 0
     }
-    return _sentence(problem.training, moving, layout, e, sizes)
+    return _sentence(problem.training, moving, at.layout, e, changes)
+
+
+def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]:
+    """The inputs whose hold matters; `in_doubt` those whose log was taken for linear."""
+    return {
+        n
+        for n in naming.names(problem.model.Inputs)
+        # What stays constant is the same under either hold.
+        if np.ptp(flight.inputs[n]) > 0
+        and (not in_doubt or (flight.hold[n] == "linear" and n in flight.hold_reason))
+    }
+
+
+def _change(e: Evaluation, other: Evaluation, q: int) -> np.ndarray:
+    """By how much the other hold would move the first q unknowns (q,), SI."""
+    # One Gauss-Newton step from the same point, with r and r' the residuals with the hold taken and
+    # with the other: -J'^+ (r' - r). The difference, not r' itself: so it tells the change at any
+    # point, also far from an optimum, as if the record were that of the model there.
+    change = _pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
+    # From the optimiser's coordinates to the parameters' units.
+    return change * np.asarray(e.slopes)
+
+
+def _white_sd(e: Evaluation, q: int) -> np.ndarray:
+    """Standard deviations (q,) of the first unknowns with white noise, SI."""
+    # The rows of a pseudoinverse of whitened residuals are as long as the sds.
+    return np.linalg.norm(_pseudoinverse(np.asarray(e.J))[:q], axis=1) * np.abs(e.slopes)
 
 
 def _feeds_through(problem: Problem) -> bool:
     """Whether an input acts on an output at once, without the dynamics."""
+    # At the start values and zero inputs: a term that vanishes there is taken for none.
     return bool(np.any(np.asarray(jacobians(problem.model, problem.start_params()).D)))
 
 
@@ -94,6 +105,7 @@ def _averaged(layout: Layout, data: Data, moving: list[set[str]]) -> Data:
     A linear input is that held at the mean of both ends of its interval; a held one is a linear one
     that is late by half a sample.
     """
+    # Only where nothing is fed through: at the sample itself the mean of two is another value.
     flights = []
     for i, (flight, names) in enumerate(zip(data.flights, moving, strict=True)):
         inputs = {}
@@ -107,6 +119,7 @@ def _averaged(layout: Layout, data: Data, moving: list[set[str]]) -> Data:
 
 
 def _flipped(layout: Layout, moving: list[set[str]]) -> Layout:
+    """The layout with the other hold of the inputs that move, exact and compiled anew."""
     names = naming.names(layout.model.Inputs)
     holds = tuple(
         tuple(_other(h) if n in moves else h for n, h in zip(names, taken, strict=True))
@@ -121,6 +134,7 @@ def _other(hold: str) -> str:
 
 def _pseudoinverse(J: np.ndarray) -> np.ndarray:
     """(q, n), with columns brought to one size first."""
+    # The cut is on singular values, and units of the unknowns must not decide what it takes.
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
     return np.linalg.pinv(J / norms[None, :], rcond=_NULL) / norms[:, None]
@@ -131,9 +145,10 @@ def _sentence(
     moving: list[set[str]],
     layout: Layout,
     e: Evaluation,
-    sizes: dict[str, tuple[float, float]],
+    changes: dict[str, tuple[float, float]],
 ) -> list[str]:
-    large = sorted((n for n, (_, sds) in sizes.items() if sds > 1.0), key=lambda n: -sizes[n][1])
+    """What would change; `changes` by name, SI and in sds."""
+    large = sorted((n for n in changes if changes[n][1] > 1.0), key=lambda n: -changes[n][1])
     if not large:
         return []
     taken = dict.fromkeys(
@@ -143,16 +158,17 @@ def _sentence(
         for n in f.inputs
         if n in names
     )
-    values = dict(zip(layout.named, np.asarray(e.named).tolist(), strict=True))
-    said = [_changed(n, values[n], *sizes[n]) for n in large[:_MOST]]
+    values = dict(zip(layout.of_interest, np.asarray(e.named).tolist(), strict=True))
+    words = [_changed(n, values[n], *changes[n]) for n in large[:_MOST]]
     return [
-        f"Between samples {', '.join(taken)}: with the other hold {', '.join(said)}. An input that "
-        "was commanded in steps has hold: zero-order, one that was sampled while it moved has "
+        f"Between samples {', '.join(taken)}: with the other hold {', '.join(words)}. An input "
+        "that was commanded in steps has hold: zero-order, one that was sampled while it moved has "
         "hold: linear."
     ]
 
 
 def _changed(name: str, value: float, change: float, sds: float) -> str:
+    # Relative to a shift of nearly zero a change would be any percentage.
     if name == "time_shift":
         share = f"{1e3 * change:+.2g} ms"
     else:
