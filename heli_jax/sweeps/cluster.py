@@ -31,8 +31,8 @@ _AHEAD = 3
 """chunks that each thread of a worker has in hand or waiting"""
 _CONNECT_S = 20
 _IMPORTS = (
-    "wanted is that modules of your own can be imported there too: begin scheduler and workers "
-    "with PYTHONPATH set to their folder"
+    "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
+    "to their folder"
 )
 
 _workers: dict[str, Worker] = {}
@@ -77,7 +77,7 @@ def connected(
             except (OSError, ValueError) as e:
                 raise InputError(
                     f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
-                    ", wanted is the address that `dask scheduler` printed, as tcp://HOST:8786"
+                    ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
                 ) from e
             cache = None
         else:
@@ -134,8 +134,8 @@ def _answering() -> Iterator[None]:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
         raise InputError(
-            f"dask: the scheduler or its workers are lost ({type(e).__name__}), wanted is that "
-            "they run to the end; what is finished is kept: --resume goes on"
+            f"dask: the scheduler or its workers are lost ({type(e).__name__}), expected "
+            "them to run to the end; what is finished is kept: --resume goes on"
         ) from e
     except ImportError as e:
         raise InputError(f"dask: {e} on the scheduler or a worker, {_IMPORTS}") from e
@@ -154,20 +154,23 @@ def _check_versions(client: Client, where: str) -> None:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError:
         raise InputError(
-            f"{where}: the scheduler has no worker, wanted is `dask worker ADDRESS` on each host"
+            f"{where}: the scheduler has no worker, expected `dask worker ADDRESS` on each host"
         ) from None
     here = _versions()
     run: Any = client.run
     try:
         there = run(_versions)
     except ImportError as e:
-        raise InputError(f"{where}: a worker has no heli_jax ({e}), wanted is {here}") from e
-    for worker, found in there.items():
-        wrong = [f"{n} {found[n]} (here {v})" for n, v in here.items() if found.get(n) != v]
-        if wrong:
+        needed = ", ".join(f"{n} {v}" for n, v in here.items())
+        raise InputError(f"{where}: a worker has no heli_jax ({e}), expected {needed}") from e
+    for address, installed in there.items():
+        other = [n for n, v in here.items() if installed.get(n) != v]
+        if other:
+            expected = ", ".join(f"{n} {here[n]}" for n in other)
+            got = ", ".join(f"{n} {installed.get(n)}" for n in other)
             raise InputError(
-                f"{where}: the worker {worker} has {', '.join(wrong)}, wanted is the same: the "
-                "last digits may differ"
+                f"{where}: the worker {address}: expected {expected} as in this process, got "
+                f"{got}: the last digits may differ"
             )
 
 

@@ -74,21 +74,19 @@ def digest(arrays: Mapping[str, np.ndarray]) -> str:
 def _check_between(name: str, axis: Range) -> None:
     low, high = axis.lower, axis.upper
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(
-            f"axes.{name}: lower is {low:g} and upper {high:g}, wanted is lower < upper"
-        )
+        raise ValueError(f"axes.{name}: expected finite lower < upper, got {low:g} and {high:g}")
     if axis.scale not in ("linear", "log"):
-        raise ValueError(f"axes.{name}: scale is {axis.scale!r}, wanted is linear or log")
+        raise ValueError(f"axes.{name}.scale: expected linear or log, got {axis.scale!r}")
     if axis.scale == "log" and low * high <= 0:
         raise ValueError(
-            f"axes.{name}: from {low:g} to {high:g} on a log scale, wanted are two numbers of one "
-            "sign"
+            f"axes.{name}: expected lower and upper of one sign on a log scale, got {low:g} and "
+            f"{high:g}"
         )
 
 
 def _check_axes(axes: Mapping[str, Any]) -> None:
     if not axes:
-        raise ValueError("axes: none given, wanted is at least one")
+        raise ValueError("axes: none given, expected at least one")
 
 
 def _points(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray:
@@ -96,17 +94,17 @@ def _points(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray
     if isinstance(axis, Range):
         _check_between(name, axis)
         if axis.n is None or axis.n < 2:
-            found = "none" if axis.n is None else axis.n
-            raise ValueError(f"axes.{name}: found n: {found}, wanted are at least 2 points")
+            got = "none" if axis.n is None else axis.n
+            raise ValueError(f"axes.{name}.n: expected at least 2 points, got {got}")
         values = axis.at(np.linspace(0.0, 1.0, axis.n))
         even = axis.scale == "linear" and (axis.upper - axis.lower) % (axis.n - 1) == 0.0
         # From 0 to 9 in ten points: 7 and not 6.999999999999999, which as a seed would be 6.
         return np.round(values) if even and axis.lower == round(axis.lower) else values
     values = np.asarray(axis)
     if values.ndim != 1 or values.size == 0:
-        raise ValueError(f"axes.{name}: no values, wanted is at least one")
+        raise ValueError(f"axes.{name}: no values, expected at least one")
     if values.dtype.kind not in "iuf":
-        raise ValueError(f"axes.{name}: found {values[0]!r:.40}, wanted are numbers")
+        raise ValueError(f"axes.{name}: expected numbers, got {values[0]!r:.40}")
     return values if values.dtype.kind in "iu" else values.astype(np.float64)
 
 
@@ -160,10 +158,10 @@ class _Sampled:
         _check_axes(axes)
         for name, axis in axes.items():
             if not isinstance(axis, Range):
-                raise ValueError(f"axes.{name}: wanted are lower and upper, for {kind}")
+                raise ValueError(f"axes.{name}: expected lower and upper, for {kind}")
             _check_between(name, axis)
         if n < 1:
-            raise ValueError(f"n is {n}, wanted is at least 1")
+            raise ValueError(f"n must be at least 1, got {n}")
         self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
         self._idle: list[Any] = []
 
@@ -280,7 +278,7 @@ def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     lengths = {n: v.size for n, v in columns.items()}
     if len(set(lengths.values())) > 1:
         words = ", ".join(f"{n} has {k}" for n, k in lengths.items())
-        raise ValueError(f"axes: {words} values, wanted is the same number in a list")
+        raise ValueError(f"axes: {words} values, expected the same number in a list")
     return _Listed(columns, "list")
 
 
@@ -322,8 +320,11 @@ def whole_seeds(values: np.ndarray) -> np.ndarray:
         ValueError: one is none.
     """
     whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
-    if not np.all(whole & (values < 2**32)):
-        raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1")
+    wrong = values[~(whole & (values < 2**32))]
+    if wrong.size:
+        raise ValueError(
+            f"axes.seed: expected whole numbers from 0 to 2^32 - 1, got {wrong[0]:.10g}"
+        )
     return values.astype(np.int64)
 
 
@@ -338,11 +339,11 @@ def log_axes(design: Design) -> set[str]:
 
 def _check_parts(parts: tuple[Design, ...]) -> None:
     if not parts:
-        raise ValueError("of: no designs, wanted is at least one")
+        raise ValueError("of: no designs, expected at least one")
     seen: set[str] = set()
     for name in (n for part in parts for n in part.names):
         if name in seen:
-            raise ValueError(f"the axis {name!r} is in two designs, wanted is one")
+            raise ValueError(f"the axis {name!r} is in two designs, expected one")
         seen.add(name)
 
 
@@ -366,5 +367,5 @@ def zipped(*parts: Design) -> Design:
     sizes = [part.size for part in parts]
     if len(set(sizes)) > 1:
         words = " and ".join(str(s) for s in sizes)
-        raise ValueError(f"the designs have {words} elements, wanted is the same number in a zip")
+        raise ValueError(f"the designs have {words} elements, expected the same number in a zip")
     return _Zipped(parts)

@@ -217,7 +217,7 @@ def _own(name: str, how: Callable[[Trajectory], Any], run: Trajectory) -> dict[s
         first = str(e).partition("\n")[0]
         raise ValueError(
             f"reduce.{name}: {called} cannot be computed ({type(e).__name__}: {first:.200}), "
-            "wanted is a function of a Trajectory, of jax.numpy and without branches on its "
+            "expected a function of a Trajectory, of jax.numpy and without branches on its "
             "values, that gives a number or numbers by name"
         ) from e
     for n, v in found.items():
@@ -225,7 +225,7 @@ def _own(name: str, how: Callable[[Trajectory], Any], run: Trajectory) -> dict[s
             jnp.issubdtype(v.dtype, jnp.complexfloating)
         ):
             raise ValueError(
-                f"reduce.{name}: {called} gives {n} as {v.dtype}, wanted is a real number"
+                f"reduce.{name}: {called} gives {n} as {v.dtype}, expected a real number"
             )
     return found
 

@@ -56,7 +56,7 @@ class Reduce(NamedTuple):
     input: str | None = None
     """the input at which margins break the loop"""
     gain: float = 1.0
-    """of the loop whose margins are wanted: the input is -gain times the signal"""
+    """of the loop that the margins are of: the input is -gain times the signal"""
 
 
 def measured(values: np.ndarray, dtype: Any) -> Measured:
@@ -167,13 +167,13 @@ def check(name: str, one: Reduce, outputs: tuple[str, ...], inputs: tuple[str, .
         raise ValueError(f"{where}.how: unknown reducer {one.how!r}{nearest(one.how, known)}")
     needs_signal = one.how == "margins" or one.how in REDUCERS
     if needs_signal and one.signal is None:
-        raise ValueError(f"{where}.signal: missing, wanted is one of {', '.join(outputs)}")
+        raise ValueError(f"{where}.signal: missing, expected one of {', '.join(outputs)}")
     if one.signal is not None and one.signal not in outputs:
         raise ValueError(
             f"{where}.signal: the model has no output {one.signal!r}{nearest(one.signal, outputs)}"
         )
     if one.how == "margins" and one.input is None:
-        raise ValueError(f"{where}.input: missing, wanted is one of {', '.join(inputs)}")
+        raise ValueError(f"{where}.input: missing, expected one of {', '.join(inputs)}")
     if one.input is not None and one.input not in inputs:
         raise ValueError(
             f"{where}.input: the model has no input {one.input!r}{nearest(one.input, inputs)}"
@@ -185,9 +185,9 @@ def check(name: str, one: Reduce, outputs: tuple[str, ...], inputs: tuple[str, .
     whole = callable(one.how) and not isinstance(one.how, Streaming)
     if one.signal is not None and (whole or one.how == "modes"):
         what = "modes are" if one.how == "modes" else "a function of a Trajectory is"
-        raise ValueError(f"{where}.signal: {what} of no one signal, wanted is none")
+        raise ValueError(f"{where}.signal: {what} of no one signal, expected none")
     if one.how == "margins" and not (np.isfinite(one.gain) and one.gain != 0):
-        raise ValueError(f"{where}.gain: found {one.gain}, wanted is a number that is not zero")
+        raise ValueError(f"{where}.gain: expected a number that is not zero, got {one.gain}")
 
 
 def streaming(one: Reduce) -> Streaming | None:

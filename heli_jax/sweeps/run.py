@@ -135,7 +135,7 @@ def run_sweep(
             run_directory.require_free(out, ", or --resume")
         _create(job, out, options, kept, files or {})
     if not out.is_dir() or not stores.writable(out):
-        raise InputError(f"{where}: is no directory that can be written to")
+        raise InputError(f"{where}: expected a directory that can be written to")
     return _resume(job, out, options)
 
 
@@ -189,7 +189,7 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
     for name in ("chunk", "lanes"):
         given = getattr(options, name)
         if given is not None and given < 1:
-            raise ValueError(f"{name} is {given}, wanted is at least 1")
+            raise ValueError(f"{name} must be at least 1, got {given}")
     lanes = None if options.lanes is None else min(options.lanes, job.design.size)
     asked = {"chunk": options.chunk, "lanes": lanes, "memory": options.memory}
     if options.client is not None:
@@ -209,7 +209,7 @@ def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> No
         taken = job.design.size if name == "lanes" else math.inf
         if given is not None and min(given, taken) != kept:
             raise InputError(
-                f"{where}: was begun with {name} {kept}, found {given}, wanted is the same"
+                f"{where}: was begun with {name} {kept}, expected the same, got {given}"
             )
 
 

@@ -234,7 +234,7 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
             for flight in flights:
                 if name in flight.known:
                     raise ValueError(
-                        f"axes.{name}: the flight {flight.name!r} states it as known, wanted is "
+                        f"axes.{name}: the flight {flight.name!r} states it as known, expected "
                         "one of the two"
                     )
         elif name not in special:
@@ -246,10 +246,12 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
     if "seed" in design.names and "seed" not in params:
         if model.noise_intensity is None:
             raise ValueError(
-                f"axes.seed: model {model.name} draws nothing at random, wanted is a disturbance"
+                f"axes.seed: model {model.name} draws nothing at random, expected a disturbance"
             )
         if "delay" in design.names and "delay" not in params:
-            raise ValueError("axes.seed: noise is drawn without a delay only")
+            raise ValueError(
+                "axes.seed: noise is drawn without a delay only, got an axis delay too"
+            )
         whole_seeds(design.values(0, min(design.size, _LOOKED_AT))["seed"])
 
 
@@ -261,7 +263,7 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
                     f"flight {flight.name!r} has no input {name!r}, which {model.name} needs"
                 )
         if flight.n_samples < 2:
-            raise ValueError(f"flight {flight.name!r} has one sample, wanted are two at least")
+            raise ValueError(f"flight {flight.name!r}: expected at least two samples, got one")
 
 
 def _check_results(
@@ -273,12 +275,12 @@ def _check_results(
 ) -> None:
     outputs, inputs = naming.names(model.Outputs), naming.names(model.Inputs)
     if not reduce and trajectories is None:
-        raise ValueError("reduce: nothing is to be kept, wanted is a result or trajectories")
+        raise ValueError("reduce: nothing is to be kept, expected a result or trajectories")
     for name, one in reduce.items():
         reducers.check(name, one, outputs, inputs)
         stream = reducers.streaming(one)
         if name in design.names or name in ("status", "element"):
-            raise ValueError(f"reduce.{name}: the name is taken, wanted is another")
+            raise ValueError(f"reduce.{name}: the name is taken, expected another")
         if stream is None or not stream.against_flight:
             continue
         for flight in flights:
@@ -290,7 +292,7 @@ def _check_results(
     if trajectories is None:
         return
     if not trajectories.signals:
-        raise ValueError("trajectories.signals: none given, wanted is at least one")
+        raise ValueError("trajectories.signals: none given, expected at least one")
     for signal in trajectories.signals:
         if signal not in outputs:
             raise ValueError(
@@ -298,10 +300,10 @@ def _check_results(
                 f"{nearest(signal, outputs)}"
             )
     if trajectories.every < 1:
-        raise ValueError(f"trajectories.every is {trajectories.every}, wanted is at least 1")
+        raise ValueError(f"trajectories.every must be at least 1, got {trajectories.every}")
     if len({(f.dt, f.n_samples) for f in flights}) > 1:
         raise ValueError(
-            "trajectories: the flights differ in rate or length, wanted are flights of one grid"
+            "trajectories: the flights differ in rate or length, expected flights of one grid"
         )
 
 

@@ -68,7 +68,7 @@ class Store:
                 if found < finished:
                     raise InputError(
                         f"{self.where}: {name} has {found} chunks of {finished} that are finished, "
-                        "wanted is a store from which nothing was taken, or another --out"
+                        "expected a store from which nothing was taken, or another --out"
                     )
         return done
 
@@ -102,7 +102,7 @@ def readable(where: str) -> Iterator[None]:
         raise
     except (OSError, RuntimeError, ValueError) as e:
         raise InputError(
-            f"{where}: a file of sweep.zarr cannot be read ({e}), wanted is an undamaged store, or "
+            f"{where}: a file of sweep.zarr cannot be read ({e}), expected an undamaged store, or "
             "another --out"
         ) from e
 
@@ -113,7 +113,7 @@ def _words(where: str) -> Iterator[None]:
         yield
     except OSError as e:
         full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        hint = ", wanted is room for the rest" if full else ""
+        hint = ", expected room for the rest" if full else ""
         raise InputError(
             f"{where}: cannot be written ({e.strerror or e}){hint}; what is finished is kept"
         ) from e
@@ -205,7 +205,7 @@ def reopen(path: Path, job: Job, where: str) -> Store:
     if wrong:
         more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
         raise InputError(
-            f"{where}: {path} is of another sweep: {wrong[0]}{more}; wanted is the same, or "
+            f"{where}: {path} is of another sweep: {wrong[0]}{more}; expected the same, or "
             "another --out"
         )
     missing = sorted(variables(job).keys() - store.names)
@@ -265,7 +265,7 @@ def only_writer(directory: Path, where: str) -> Iterator[None]:
             lock.acquire()
         except filelock.Timeout:
             raise InputError(
-                f"{where}: another process is writing to it, wanted is only one"
+                f"{where}: another process is writing to it, expected only one"
             ) from None
     try:
         yield

@@ -79,7 +79,7 @@ def variables(job: Job) -> dict[str, Variable]:
         dims = (*more, *dims)
         if not _NAME.fullmatch(name) or name in _TAKEN:
             raise ValueError(
-                f"reduce: a result would be called {name!r}, wanted is another name: not "
+                f"reduce: a result would be called {name!r}, expected another name: not "
                 f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
             )
         if name in found:
@@ -92,7 +92,7 @@ def variables(job: Job) -> dict[str, Variable]:
     for name, one in sorted(shape.results.items(), key=lambda r: _place(r[0], order)):
         if one.shape:
             raise ValueError(
-                f"reduce.{name}: the result has shape {one.shape}, wanted is one number"
+                f"reduce.{name}: the result has shape {one.shape}, expected one number"
             )
         add(name, (), job.precision, _result_words(job, name))
     for name in job.reduce:

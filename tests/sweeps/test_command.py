@@ -217,7 +217,7 @@ WRONG = {
         lambda c: c["sweep"]["axes"]["Ixx"].update(unit="m"), ["axes.Ixx.unit"],
     ),
     "a seed without disturbance": (
-        lambda c: c["sweep"].update(axes={"seed": {"values": [1]}}), ["wanted is a disturbance"],
+        lambda c: c["sweep"].update(axes={"seed": {"values": [1]}}), ["expected a disturbance"],
     ),
     "an unknown solver": (lambda c: c["sweep"].update(solver="Tsit6"), ["solver", "Tsit5"]),
     "an abstract solver": (
@@ -229,7 +229,7 @@ WRONG = {
     "trim of a roll model": (
         lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
     ),
-    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk is 0"]),
+    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk must be at least 1, got 0"]),
     "margins without input": (
         lambda c: c["sweep"]["reduce"].update(m={"how": "margins", "signal": "roll"}),
         ["m.input: missing"],
@@ -255,7 +255,7 @@ def test_seeds_that_are_no_whole_numbers_are_refused(design, axis, write, tmp_pa
     more = {"n": 4} if design == "sobol" else {}
     config = content(design=design, axes={"seed": axis}, **more) | DRAWN
     assert cli.main(["sweep", str(write(config)), "--out", str(tmp_path / "out")]) == 2
-    assert "axes.seed: wanted are whole numbers from 0 to 2^32 - 1" in capsys.readouterr().err
+    assert "axes.seed: expected whole numbers from 0 to 2^32 - 1, got" in capsys.readouterr().err
 
 
 def test_seeds_from_a_range_are_exact(write, tmp_path):
@@ -302,11 +302,11 @@ OWN = {
     "a branch": ("1.0 if run.outputs.roll[0] > 0 else 2.0", "TracerBoolConversionError"),
     "no such output": ("run.outputs.rol", "no attribute 'rol'"),
     "nothing": ("None", "None is not a valid value"),
-    "complex": ("run.outputs.roll[0].astype(complex)", "wanted is a real number"),
+    "complex": ("run.outputs.roll[0].astype(complex)", "expected a real number"),
     "a text": ("'hello'", "TypeError"),
     "its own error": ("1 / 0", "ZeroDivisionError: division by zero"),
-    "an array": ("run.outputs.roll", "has shape (50,), wanted is one number"),
-    "a name that is none": ("{'a/b': 1.0}", "'own_a/b', wanted is another name"),
+    "an array": ("run.outputs.roll", "has shape (50,), expected one number"),
+    "a name that is none": ("{'a/b': 1.0}", "'own_a/b', expected another name"),
 }
 
 
