@@ -21,7 +21,7 @@ from zarr.storage import MemoryStore
 from heli_jax.errors import InputError
 from heli_jax.regular_file import require_regular
 from heli_jax.sweeps.description import described, differences
-from heli_jax.sweeps.program import NOT_RUN
+from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from heli_jax import run_directory
 from heli_jax.sweeps.chunks import chunks_of
-from heli_jax.sweeps.program import MEANINGS, OK
+from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
 _WORST = 5

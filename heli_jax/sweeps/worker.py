@@ -12,15 +12,8 @@ from heli_jax import naming
 from heli_jax.analysis.margins import margins
 from heli_jax.sweeps import reducers
 from heli_jax.sweeps.design import log_axes
-from heli_jax.sweeps.program import (
-    DIVERGED,
-    MEANINGS,
-    OUT_OF_RANGE,
-    Found,
-    Program,
-    arguments,
-    shapes,
-)
+from heli_jax.sweeps.design_point import DIVERGED, MEANINGS, OUT_OF_RANGE, ElementResults
+from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job, axis_unit
 from heli_jax.vehicle import of_helicopter, possible
 
@@ -160,7 +153,7 @@ class Pending(NamedTuple):
     start: int
     stop: int
     columns: dict[str, np.ndarray]
-    found: tuple[Found, ...]
+    found: tuple[ElementResults, ...]
 
 
 class Worker:
@@ -213,7 +206,7 @@ class Worker:
         """A chunk from beginning to end."""
         return self.finish(self.begin(chunk))
 
-    def _results(self, found: Found) -> dict[str, np.ndarray]:
+    def _results(self, found: ElementResults) -> dict[str, np.ndarray]:
         results = dict(found.results)
         results |= {f"trajectory_{n}": v for n, v in found.trajectories.items()}
         model = self.job.model

@@ -229,7 +229,7 @@ WRONG = {
     "trim of a roll model": (
         lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
     ),
-    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk must be at least 1, got 0"]),
+    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk must be at least 1"]),
     "margins without input": (
         lambda c: c["sweep"]["reduce"].update(m={"how": "margins", "signal": "roll"}),
         ["m.input: missing"],

@@ -25,7 +25,7 @@ from heli_jax.sweeps import (
     product,
     sobol,
 )
-from heli_jax.sweeps.program import DIVERGED, OK, OUT_OF_RANGE
+from heli_jax.sweeps.design_point import DIVERGED, OK, OUT_OF_RANGE
 from heli_jax.sweeps.reducers import REDUCERS
 
 ROLL = models.roll_on_stand
