@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.trim import STICKS, equilibrium, plausible
+from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.accumulate import accumulated
@@ -190,16 +190,23 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
         (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
     )
     trim = equilibrium(whole, plain, condition, wind)
-    # `trim` raises where there is no such flight; one of a batch can only be flagged.
-    sound = plausible(trim) & (trim.residual < _TRIMMED)
-    for name, (low, high) in STICKS.items():
-        stick = getattr(trim.inputs, name)
-        sound = sound & (stick >= low) & (stick <= high)
+    sound = _is_trimmed(trim)
     # The states of a disturbance have no trim and keep their own beginning.
     state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
     share = 1.0 if plan.trimmed.sticks else 0.0
     sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
-    return InitialTrim(jax.tree.map(lambda v: jnp.asarray(v, dtype), state), sticks, sound)
+    state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
+    return InitialTrim(state, sticks, sound)
+
+
+def _is_trimmed(trim: Trim) -> jax.Array:
+    """Whether it is a steady flight that the sticks' travel allows."""
+    # `trim` raises where there is none; one of a batch can only be flagged.
+    sound = plausible(trim) & (trim.residual < _TRIMMED)
+    for name, (low, high) in STICKS.items():
+        stick = getattr(trim.inputs, name)
+        sound = sound & (stick >= low) & (stick <= high)
+    return sound
 
 
 def _gained_and_offset(inputs: Any, special: Scalars) -> Any:
@@ -221,22 +228,24 @@ def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any],
     start = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), s.start) for n, s in streams.items()}
     data = {n: (m.values, m.seen) for n, m in numbers.measured.items()}
 
+    def measured(name: str, now: dict[str, Any]) -> Measured | None:
+        if name not in now:
+            return None
+        # The signal's moments stay those of the whole record.
+        return numbers.measured[name]._replace(values=now[name][0], seen=now[name][1])
+
     def update(value: dict[str, Any], outputs: Any, now: dict[str, Any]) -> dict[str, Any]:
-        """Take one sample.
+        """The running values with one sample more.
 
         Args:
             value: running values by result.
-            outputs: the model's Outputs there, scalars.
-            now: value and seen of what was measured there, by result.
+            outputs: the model's Outputs at the sample, scalars.
+            now: what was measured there and whether, by result.
         """
-        updated = {}
-        for name, stream in streams.items():
-            measured = None
-            if name in now:
-                # The signal's moments stay those of the whole record.
-                measured = numbers.measured[name]._replace(values=now[name][0], seen=now[name][1])
-            updated[name] = stream.update(value[name], _signal(reduce[name], outputs), measured)
-        return updated
+        return {
+            name: stream.update(value[name], _signal(reduce[name], outputs), measured(name, now))
+            for name, stream in streams.items()
+        }
 
     return update, start, data
 

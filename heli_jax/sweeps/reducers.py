@@ -190,10 +190,17 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
         ValueError: an unknown `how`, an output or input that the model lacks, or none where one is
             needed.
     """
-    where, how, signal = f"reduce.{name}", reduce.how, reduce.signal
+    where, how = f"reduce.{name}", reduce.how
     if isinstance(how, str) and how not in (*REDUCERS, *LINEAR):
         known = [*REDUCERS, *LINEAR]
         raise ValueError(f"{where}.how: unknown reducer {how!r}{nearest(how, known)}")
+    _check_signal(where, reduce, outputs)
+    _check_loop(where, reduce, inputs)
+
+
+def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
+    """Refuse a signal that is missing, unknown or of no use."""
+    how, signal = reduce.how, reduce.signal
     if (how == "margins" or how in REDUCERS) and signal is None:
         raise ValueError(f"{where}.signal: missing, expected one of {', '.join(outputs)}")
     if signal is not None and signal not in outputs:
@@ -206,7 +213,6 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
     if signal is not None and (whole or how == "modes"):
         what = "modes are" if how == "modes" else "a function of a Trajectory is"
         raise ValueError(f"{where}.signal: {what} of no one signal, expected none")
-    _check_loop(where, reduce, inputs)
 
 
 def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:

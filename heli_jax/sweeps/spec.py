@@ -299,16 +299,19 @@ def _check_results(
         if name in design.names or name in ("status", "element"):
             raise ValueError(f"reduce.{name}: the name is taken, expected another")
         stream = reducers.streaming(reducer)
-        if stream is None or not stream.against_flight:
-            continue
-        for flight in flights:
-            if reducer.signal not in flight.outputs:
-                raise ValueError(
-                    f"reduce.{name}: flight {flight.name!r} measured no {reducer.signal!r}"
-                    f"{nearest(str(reducer.signal), flight.outputs)}"
-                )
+        if stream is not None and stream.against_flight:
+            _check_measured(name, str(reducer.signal), flights)
     if trajectories is not None:
         _check_trajectories(trajectories, outputs, flights)
+
+
+def _check_measured(name: str, signal: str, flights: tuple[Flight, ...]) -> None:
+    for flight in flights:
+        if signal not in flight.outputs:
+            raise ValueError(
+                f"reduce.{name}: flight {flight.name!r} measured no {signal!r}"
+                f"{nearest(signal, flight.outputs)}"
+            )
 
 
 def _check_trajectories(

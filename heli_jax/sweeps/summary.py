@@ -13,7 +13,7 @@ from heli_jax.sweeps.chunks import chunks_of
 from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
-_WORST = 5  # elements of each result: as many as the figure of them has dashes
+_WORST_COUNT = 5  # elements of each result: as many as the figure of them has dashes
 _SMALL_IS_BAD = ("fit", "vaf")  # 100 % and 1 are perfect, and there is no lower end
 
 
@@ -118,7 +118,7 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
     return {**_unit(variable), **counts, **dict(zip(names, map(float, q), strict=True))}
 
 
-def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.ndarray]:
+def worst(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, np.ndarray]:
     """By result, the elements that are ok and worst in it, worst first: the largest, or for what
     agrees with a flight the smallest; of several flights the worst one counts.
 
@@ -134,20 +134,27 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.nd
         # which of theirs should be small is not known.
         if name not in dataset.data_vars:
             continue
-        badness, element = np.empty(0), np.empty(0, np.int64)
-        for which, part in chunks_of(dataset[name]):
-            values = part.astype(np.float64)  # a bool or an integer has no minus
-            bad = -values if reduce.how in _SMALL_IS_BAD else np.abs(values)
-            bad = bad.reshape(len(values), -1).max(axis=1)
-            usable = np.flatnonzero(fine[which] & np.isfinite(bad))
-            most = min(count, usable.size)
-            top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
-            badness = np.concatenate([badness, bad[top]])
-            element = np.concatenate([element, top + which.start])
-        if element.size:
-            # Equal ones by their place, so that the order does not depend on how it was read.
-            by_result[name] = element[np.lexsort((element, -badness))[:count]]
+        elements = _worst(dataset[name], fine, reduce.how in _SMALL_IS_BAD, count)
+        if elements.size:
+            by_result[name] = elements
     return by_result
+
+
+def _worst(variable: xr.DataArray, fine: np.ndarray, small_is_bad: bool, count: int) -> np.ndarray:
+    """The elements that are fine and worst in a variable, worst first, (count,) or fewer."""
+    badness, element = np.empty(0), np.empty(0, np.int64)
+    for which, part in chunks_of(variable):
+        values = part.astype(np.float64)  # a bool or an integer has no minus
+        bad = -values if small_is_bad else np.abs(values)
+        bad = bad.reshape(len(values), -1).max(axis=1)
+        usable = np.flatnonzero(fine[which] & np.isfinite(bad))
+        most = min(count, usable.size)
+        # Of each part the worst few, and of those the worst: all are never sorted, nor held.
+        top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
+        badness = np.concatenate([badness, bad[top]])
+        element = np.concatenate([element, top + which.start])
+    # Equal ones by their place, so that the order does not depend on how it was read.
+    return element[np.lexsort((element, -badness))[:count]]
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:

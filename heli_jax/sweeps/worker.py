@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +26,12 @@ BLOCKS = 2
 _NAME = re.compile(r"(?!\.|__)[^/\\\x00-\x1f]+")
 # Dimensions, which xarray would take the result for, and Zarr's own file.
 _TAKEN = ("element", "flight", "time", "mode", "zarr.json")
+# Of the status, as the CF conventions name them: xarray and others decode the words.
+_FLAGS = {
+    "flag_values": list(MEANINGS),
+    "flag_meanings": " ".join(MEANINGS.values()),
+    "long_name": "what became of the element",
+}
 
 
 class Variable(NamedTuple):
@@ -64,27 +70,26 @@ def variables(job: Job) -> dict[str, Variable]:
     for name, column in job.design.values(0, 1).items():
         kind = "int64" if column.dtype.kind in "iu" else "float64"
         laid_out[name] = Variable(("element",), (), kind, _axis_words(job, name), True)
-    # Flags as the CF conventions name them: xarray and others decode the words.
-    flags = {
-        "flag_values": list(MEANINGS),
-        "flag_meanings": " ".join(MEANINGS.values()),
-        "long_name": "what became of the element",
-    }
-    laid_out["status"] = Variable(("element",), (), "uint8", flags)
+    laid_out["status"] = Variable(("element",), (), "uint8", dict(_FLAGS))
     flights = (("flight", len(job.flights)),) if len(job.flights) > 1 else ()
     for name, (dims, kind, words) in _result_variables(job):
         dims = (*flights, *dims)
-        if not _NAME.fullmatch(name) or name in _TAKEN:
-            raise ValueError(
-                f"reduce: a result would be called {name!r}, expected another name: not "
-                f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
-            )
-        if name in laid_out:
-            raise ValueError(f"reduce: two results or axes would be called {name!r}")
+        _check_name(name, laid_out)
         laid_out[name] = Variable(
             ("element", *(d for d, _ in dims)), tuple(k for _, k in dims), kind, words
         )
     return laid_out
+
+
+def _check_name(name: str, laid_out: Mapping[str, Variable]) -> None:
+    """Refuse a name that a store cannot have, or has already."""
+    if not _NAME.fullmatch(name) or name in _TAKEN:
+        raise ValueError(
+            f"reduce: a result would be called {name!r}, expected another name: not "
+            f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
+        )
+    if name in laid_out:
+        raise ValueError(f"reduce: two results or axes would be called {name!r}")
 
 
 _Sized = tuple[tuple[tuple[str, int], ...], str, dict[str, Any]]
@@ -109,15 +114,18 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
                 words = {"units": "1/s", "long_name": f"eigenvalues, {part} part, slowest first"}
                 yield f"{name}_{part}", ((("mode", n),), "float64", words)
         elif reduce.how == "margins":
-            of = f"{reduce.signal} to {reduce.input}"
-            yield f"{name}_gain", ((), "float64", _words("dB", f"gain margin, {of}"))
-            yield f"{name}_phase", ((), "float64", _words("deg", f"phase, {of}"))
-            words = {"long_name": f"whether the loop {of} is stable", "flag_values": [0, 1]}
-            yield f"{name}_stable", ((), "uint8", words | {"flag_meanings": "unstable stable"})
+            yield from _margin_variables(name, f"{reduce.signal} to {reduce.input}")
     outputs = job.model.Outputs
     for name, kept in shape.trajectories.items():
         words = _words(naming.unit(outputs, name), naming.meaning(outputs, name))
         yield f"trajectory_{name}", ((("time", kept.shape[0]),), job.precision, words)
+
+
+def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:
+    yield f"{name}_gain", ((), "float64", _words("dB", f"gain margin, {loop}"))
+    yield f"{name}_phase", ((), "float64", _words("deg", f"phase, {loop}"))
+    words = {"long_name": f"whether the loop {loop} is stable", "flag_values": [0, 1]}
+    yield f"{name}_stable", ((), "uint8", words | {"flag_meanings": "unstable stable"})
 
 
 def _place(name: str, order: list[str]) -> int:
@@ -207,13 +215,8 @@ class Worker:
         results = parts[0]
         if len(parts) > 1:
             results = {n: np.stack([p[n] for p in parts], axis=1) for n in results}
-        status = functools.reduce(_worst, [computed.status for computed in by_flight])
         impossible = self._impossible(pending.columns)
-        finite = [np.isfinite(v) for v in pending.columns.values()]
-        # A vehicle that cannot be is out of range even where its run diverged: that is why it did.
-        # An axis that is no number says nothing of the vehicle, and goes before.
-        status = np.where(impossible, OUT_OF_RANGE, status)
-        status = np.where(functools.reduce(np.logical_and, finite), status, DIVERGED)
+        status = _status(by_flight, pending.columns, impossible)
         # What a run that diverged or a vehicle that cannot be left behind is no result.
         lost = impossible | (status == DIVERGED)
         # Modes and margins stay: they are of where the run begins, and NaN if that is.
@@ -225,7 +228,7 @@ class Worker:
             n: v if v.dtype.kind in "iu" else v.astype(np.float64)
             for n, v in pending.columns.items()
         }
-        return {**columns, **results, "status": status.astype(np.uint8)}
+        return {**columns, **results, "status": status}
 
     def run(self, chunk: int) -> dict[str, np.ndarray]:
         """A chunk from beginning to end."""
@@ -258,6 +261,18 @@ class Worker:
         # The ends of the paddle are judged together.
         both = {n: self.job.params[n] for n in ("R1", "R2") if swept.keys() & {"R1", "R2"}}
         return ~np.broadcast_to(possible({**both, **swept}), count)
+
+
+def _status(
+    by_flight: Sequence[ElementResults], columns: dict[str, np.ndarray], impossible: np.ndarray
+) -> np.ndarray:
+    """The status (elements,) of a chunk's elements over all flights."""
+    status = functools.reduce(_worst, [computed.status for computed in by_flight])
+    finite = functools.reduce(np.logical_and, [np.isfinite(v) for v in columns.values()])
+    # A vehicle that cannot be is out of range even where its run diverged: that is why it did. An
+    # axis that is no number says nothing of the vehicle, and goes before.
+    status = np.where(impossible, OUT_OF_RANGE, status)
+    return np.where(finite, status, DIVERGED).astype(np.uint8)
 
 
 def _worst(a: np.ndarray, b: np.ndarray) -> np.ndarray:
