@@ -1,6 +1,7 @@
 """The compiled part of a sweep: `design_point` over the elements of a chunk, on all devices."""
 
-# `Any` below: a tree of arrays that JAX maps over, and the functions that it compiles.
+# `Any` below: a tree of arrays that JAX maps over, the functions that it compiles, and its devices,
+# whose class type checkers do not take for one.
 
 import functools
 from collections.abc import Callable, Sequence
@@ -61,7 +62,7 @@ def _shapes(
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(plan: Plan, devices: tuple[jax.Device, ...], lanes: int) -> tuple[Any, Any, Any]:
+def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, Any, Any]:
     """The functions that compute steady flights and elements on some devices, and how what is
     mapped is shared among these."""
     # Remembered, since every flight of a sweep and every sweep of the same plan asks for it.
@@ -91,7 +92,7 @@ def _compiled(plan: Plan, devices: tuple[jax.Device, ...], lanes: int) -> tuple[
 class Program:
     """The compiled part for one flight on some devices; a chunk is cut among them."""
 
-    def __init__(self, job: Job, index: int, devices: Sequence[jax.Device], lanes: int) -> None:
+    def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         self._step = lanes * len(devices)
         self._numbers = flight_numbers(job, index)
         self._trims, self._run, self._split = _compiled(job.plan(index), tuple(devices), lanes)
