@@ -112,7 +112,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "")
     return changes
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     if value is None:
         return "not given"
     text = str(value)

@@ -9,11 +9,14 @@ import functools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from heli_jax.sweeps.axes import Columns, Range, axis_values, check_axes, check_range, digest
+
+if TYPE_CHECKING:
+    import scipy.stats.qmc
 
 
 class Design(Protocol):
@@ -149,7 +152,7 @@ class _Sampled:
         return {"design": self.kind, "axes": axes, "n": self._n, "seed": self.seed}
 
 
-def _quiet_random(engine: Any, n: int) -> np.ndarray:
+def _quiet_random(engine: "scipy.stats.qmc.QMCEngine", n: int) -> np.ndarray:
     """Points of a Sobol sequence, without SciPy's warning that n is no power of two."""
     # It is right for the sequence and wrong for a slice of it, which seldom is a power of two.
     with warnings.catch_warnings():

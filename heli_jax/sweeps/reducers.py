@@ -5,8 +5,8 @@ result at the end, so that nothing of the run is stored. A function of a whole r
 place; the runs of one block are then held while it works.
 """
 
-# `Any` below: running values are a pytree of the reducer's own, and a signal is a scalar of JAX or,
-# for a Streaming of the user's without a signal, the model's Outputs.
+# `Any` below: the running values of a Streaming of the user's are any pytree, and without a signal
+# it gets the model's Outputs. Those here have scalars, ().
 
 import warnings
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from heli_jax.errors import nearest
 
@@ -87,70 +88,72 @@ def measured(values: np.ndarray, dtype: np.dtype) -> Measured:
     )
 
 
+_Two = tuple[Array, Array]
+
 # Updates (value, y, measured) and finishes (value, n, measured) of the reducers below; what one of
 # them does not need it calls _.
 
 
-def _summed(value: Any, y: Any, _: Any) -> Any:
+def _summed(value: Array, y: Array, _: Measured | None) -> Array:
     return value + y
 
 
-def _squared(value: Any, y: Any, _: Any) -> Any:
+def _squared(value: Array, y: Array, _: Measured | None) -> Array:
     return value + y * y
 
 
-def _mean(value: Any, n: Any, _: Any) -> Any:
+def _mean(value: Array, n: Array, _: Measured | None) -> Array:
     return value / n
 
 
-def _root_mean(value: Any, n: Any, _: Any) -> Any:
+def _root_mean(value: Array, n: Array, _: Measured | None) -> Array:
     return jnp.sqrt(value / n)
 
 
-def _same(value: Any, n: Any, _: Any) -> Any:
+def _same(value: Array, n: Array, _: Measured | None) -> Array:
     return value
 
 
-def _where(v: Any, m: Measured) -> Any:
+def _where(v: Array, m: Measured) -> Array:
     """Zero where nothing was measured."""
     return v if m.seen is None else v * m.seen
 
 
-def _misfit(value: Any, y: Any, m: Measured) -> Any:
+def _misfit(value: Array, y: Array, m: Measured) -> Array:
     e = _where(m.values - y, m)
     return value + e * e
 
 
-def _rmse(value: Any, n: Any, m: Measured) -> Any:
+def _rmse(value: Array, n: Array, m: Measured) -> Array:
     return jnp.sqrt(value / m.count)
 
 
-def _nrmse(value: Any, n: Any, m: Measured) -> Any:
+def _nrmse(value: Array, n: Array, m: Measured) -> Array:
     return jnp.sqrt(value / m.total_squares)
 
 
-def _fit_percent(value: Any, n: Any, m: Measured) -> Any:
+def _fit_percent(value: Array, n: Array, m: Measured) -> Array:
     # As MATLAB's `compare`: 100 is perfect, 0 is no better than the measured mean.
     return 100.0 * (1.0 - jnp.sqrt(value / m.total_squares))
 
 
-def _misfit_and_sum(value: Any, y: Any, m: Measured) -> Any:
+def _misfit_and_sum(value: _Two, y: Array, m: Measured) -> _Two:
     e = _where(m.values - y, m)
     return (value[0] + e * e, value[1] + e)
 
 
-def _vaf(value: Any, n: Any, m: Measured) -> Any:
+def _vaf(value: _Two, n: Array, m: Measured) -> Array:
     # 1 - var(e) / var(measured): sum (e - mean e)^2 = sum e^2 - (sum e)^2 / count, in one pass.
     squares, total = value
     return 1.0 - (squares - total * total / m.count) / m.total_squares
 
 
-def _misfit_and_power(value: Any, y: Any, m: Measured) -> Any:
+def _misfit_and_power(value: _Two, y: Array, m: Measured) -> _Two:
     e, seen = _where(m.values - y, m), _where(y, m)
     return (value[0] + e * e, value[1] + seen * seen)
 
 
-def _theil(value: Any, n: Any, m: Measured) -> Any:
+def _theil(value: _Two, n: Array, m: Measured) -> Array:
     # Theil's inequality coefficient, 0 to 1: rms(e) / (rms(y) + rms(measured)); the counts cancel.
     return jnp.sqrt(value[0]) / (jnp.sqrt(value[1]) + jnp.sqrt(m.power))
 

@@ -1,6 +1,7 @@
 """heli-jax sweep: from a configuration to a directory, and what is refused in words."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -114,6 +115,18 @@ def test_a_seed_and_a_function_of_ones_own(write, tmp_path):
     assert len(set(found["swing"].values.tolist())) == 3
     assert found["trajectory_roll"].shape == (3, 10)
     assert found["seed"].dtype == np.int64
+
+
+def test_the_python_of_the_documentation_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    page = (ROOT / "docs" / "sweeps.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    for block in blocks:
+        exec(block.replace('"DIR', f'"{tmp_path}/out'), names)
+    assert len(blocks) == 2
+    assert names["ds"].sizes["element"] == 128
+    assert not names["ds"]["status"].any()
 
 
 WRONG = {
