@@ -31,7 +31,7 @@ _RETRIES = 5  # of a chunk whose task fails; how often workers may die with it d
 # Chunks that each thread of a worker has in hand or waiting: with one it would idle while its
 # result travels; all at once, the results of a large sweep would wait in this process's memory.
 _AHEAD = 3
-_CONNECT_S = 20  # of silence, before an address is taken to be wrong
+_CONNECT_S = 20  # [s] without an answer, before an address is taken to be wrong
 _IMPORTS = (
     "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
     "to their folder"

@@ -26,7 +26,8 @@ from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
 # What stands where nothing was written: not a number, and for the status (unsigned) 'not run', by
-# which an unfinished chunk is known. Seeds (signed) are written before it and need no sign.
+# which an unfinished chunk is known. Seeds (signed) are written before it and need no such
+# mark.
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}
 
 
@@ -93,8 +94,7 @@ class Store:
 
     def dataset(self) -> xr.Dataset:
         """The store as an xarray Dataset, read as it is used."""
-        # Not consolidated: that file would have to be written again by each process that resumes.
-        # No dask arrays, which would need dask where nobody asked for it.
+        # chunks=None: no dask arrays, which would need dask where nobody asked for it.
         dataset = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
         # In the order asked for: that of files in a directory is none.
         return dataset[self.attributes["results"]]
@@ -284,8 +284,7 @@ def only_writer(directory: Path, where: str) -> Iterator[None]:
     Raises:
         InputError: another process holds it, or the directory cannot be written to.
     """
-    # The file stays when the lock is gone: one that is deleted and made anew between two processes
-    # would let both in.
+    # Refused at once: the other process may go on for hours.
     lock = filelock.FileLock(directory / ".lock", timeout=0)
     with _words(where):
         try:
