@@ -18,7 +18,8 @@ from heli_jax.flights.flight import Flight
 from heli_jax.flights.open_log import open_table
 from heli_jax.import_path import by_path, is_path
 from heli_jax.sweeps import design as designs
-from heli_jax.sweeps.design import Design, Range
+from heli_jax.sweeps.axes import Range, whole_seeds
+from heli_jax.sweeps.design import Design
 from heli_jax.sweeps.reducers import LINEAR, REDUCERS, Reduce, Streaming
 from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_unit, job
 
@@ -186,7 +187,7 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
 
 def _as_column(name: str, values: np.ndarray) -> np.ndarray:
     """Seeds are whole numbers."""
-    return designs.whole_seeds(values) if name == "seed" else values
+    return whole_seeds(values) if name == "seed" else values
 
 
 def _table(one: DesignConfig, model: Model, path: Path) -> Design:

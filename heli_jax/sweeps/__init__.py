@@ -9,8 +9,8 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from heli_jax.sweeps.axes import Range as Range
     from heli_jax.sweeps.design import Design as Design
-    from heli_jax.sweeps.design import Range as Range
     from heli_jax.sweeps.design import grid as grid
     from heli_jax.sweeps.design import lhs as lhs
     from heli_jax.sweeps.design import paired as paired
@@ -27,21 +27,23 @@ if TYPE_CHECKING:
 # Loaded when they are first used: the store's libraries take a second that other commands spare.
 _HOMES = {
     **dict.fromkeys(
-        ("Range", "Design", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),
+        ("Design", "grid", "lhs", "paired", "product", "sobol", "table", "zipped"),
         "design",
     ),
     **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
     **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
+    "Range": "axes",
     "sweep": "run",
 }
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+# Names of before, and what they are called now.
 _OLD = {"Between": "Range", "listed": "paired"}
-"""Names of before, and what they are called now."""
 
 
 def __getattr__(name: str) -> Any:
+    # Not in __all__, so that only those who ask for an old name are warned.
     if name in _OLD:
         new = _OLD[name]
         warnings.warn(

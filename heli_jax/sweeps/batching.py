@@ -16,18 +16,23 @@ from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import BLOCKS, Split
 
+# Elements side by side where nothing is measured: on a core a few vectors of them, so that their
+# states stay in its cache; on a GPU enough for all its threads.
 _CPU, _GPU = 64, 1 << 17
 _CANDIDATES = {"cpu": (32, 64, 128, 256), "gpu": (1 << 13, 1 << 15, 1 << 17)}
+# [s] A sweep that takes less is not worth measuring for: every candidate is compiled.
 _WORTH_S = 60.0
-"""A sweep that takes less [s] is not worth measuring for: every candidate is compiled."""
+# [s] What a chunk should take, about: a kill costs as much, and writing is to be little of it.
 _CHUNK_S = 2.0
-"""What a chunk should take [s], about: a kill costs as much, and writing is to be little of it."""
+# [bytes] Results of a chunk: two chunks are held at once, one computed and one written.
 _CHUNK_BYTES = 64e6
+# Chunks, about, where there are enough elements, so that progress shows; twice as many for each of
+# several processes, so that none waits long for the last one.
 _CHUNKS = 4
-"""about, where there are enough elements, to see how it goes; twice as many for each of several
-processes, to share the work evenly"""
+# [bytes] Whole runs held side by side, where a function of the user's sees them.
 _RUN_BYTES = {"cpu": 256e6, "gpu": 8e9}
-_ROOM = {"cpu": 1 << 16, "gpu": 1 << 18}
+# Elements of a chunk at most.
+_MOST_ELEMENTS = {"cpu": 1 << 16, "gpu": 1 << 18}
 
 
 def split_for(
@@ -43,28 +48,40 @@ def split_for(
     """How to cut a sweep: into chunks that are written at once, and those into what a device
     computes side by side.
 
-    `shares` is how many processes take chunks side by side; each shall have several.
-    `memory` is a file that keeps what was measured. Given numbers are taken as they are.
+    Args:
+        job: the sweep.
+        devices: of JAX; those of this process unless given.
+        chunk: elements written at a time; taken as it is where it is given.
+        lanes: elements computed side by side on a device; likewise.
+        shares: how many processes take chunks side by side; each shall have several.
+        memory: a file that keeps what was measured.
+        say: called with a sentence where measuring takes a while.
     """
     devices = tuple(jax.local_devices() if devices is None else devices)
     kind = "cpu" if devices[0].platform == "cpu" else "gpu"
     share = math.ceil(job.design.size / len(devices))
     if lanes is None:
+        # A small sweep still has BLOCKS blocks a device, or XLA would write other code for it.
         lanes = min(_default(job, kind), _power(share / BLOCKS))
         if share > 8 * max(_CANDIDATES[kind]):
             lanes = _measured(job, devices, kind, lanes, memory, say)
     if chunk is None:
-        step = BLOCKS * lanes * len(devices)
-        wanted = _power(_CHUNK_S * len(devices) / _guess(job))
-        heaviest = max(_bytes(shapes(job, i)) for i in range(len(job.flights)))
-        room = min(_ROOM[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
-        if kind == "gpu":
-            wanted = room
-        pieces = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
-        each = _power(job.design.size / pieces)
-        chunk = max(step, math.ceil(min(wanted, room, each) / step) * step)
-        chunk = min(chunk, math.ceil(job.design.size / step) * step)
+        chunk = _chunk_for(job, kind, len(devices), lanes, shares)
     return Split(chunk, lanes)
+
+
+def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:
+    """Elements of a chunk: whole blocks of all devices, of a few seconds and not much memory."""
+    step = BLOCKS * lanes * n_devices
+    heaviest = max(_bytes(shapes(job, i)) for i in range(len(job.flights)))
+    room = min(_MOST_ELEMENTS[kind], 1 << int(math.log2(max(1.0, _CHUNK_BYTES / heaviest))))
+    # The guess of the time is for a core; a GPU is done with any chunk that fits sooner than that.
+    in_time = room if kind == "gpu" else _power(_CHUNK_S * n_devices / _guess(job))
+    chunks = _CHUNKS if shares == 1 else 2 * _CHUNKS * shares
+    each = _power(job.design.size / chunks)
+    chunk = max(step, math.ceil(min(in_time, room, each) / step) * step)
+    # No larger than the sweep: what a chunk lacks in elements is computed all the same.
+    return min(chunk, math.ceil(job.design.size / step) * step)
 
 
 def _power(n: float) -> int:
@@ -72,19 +89,24 @@ def _power(n: float) -> int:
     return 1 << max(0, math.ceil(math.log2(max(1, n))))
 
 
-def _bytes(found: Any) -> int:
-    return sum(v.size * v.dtype.itemsize for v in jax.tree.leaves(found))
+def _bytes(tree: Any) -> int:
+    """Of all arrays in a pytree, or of arrays of these shapes."""
+    return sum(v.size * v.dtype.itemsize for v in jax.tree.leaves(tree))
 
 
 def _guess(job: Job) -> float:
     """Seconds an element takes on a core, within a factor of five: a nanosecond for each state,
-    sample and stage. Not measured, so that a sweep is cut in the same way each time."""
+    sample and stage."""
+    # Not measured: a sweep shall be cut in the same way each time, or its last digits would differ
+    # from one day to the next.
     samples = sum(f.n_samples for f in job.flights) if job.simulated else 1
+    # The exact step is one product of matrices; the others are taken for Runge-Kutta of order 4.
     stages = 1 if job.solver == "exact" else 4 * job.substeps
     return 1e-9 * samples * stages * len(naming.names(job.model.State))
 
 
 def _default(job: Job, kind: str) -> int:
+    """Elements side by side on a device, unless something faster is measured."""
     most = _CPU if kind == "cpu" else _GPU
     if job.streamed:
         return most
@@ -104,6 +126,7 @@ def _measured(
     say: Callable[[str], None],
 ) -> int:
     """The fastest of some numbers, or the default where the whole sweep is over sooner."""
+    # All that what is fastest may depend on; the vehicle and the axes' values are not of it.
     key = "|".join(
         [
             devices[0].device_kind,
@@ -121,13 +144,15 @@ def _measured(
     if first * job.design.size < _WORTH_S:
         return default
     say("measuring how many elements to compute side by side")
+    # Where whole runs are held the default is what memory has room for: no more are tried.
     limit = max(default, max(_CANDIDATES[kind])) if job.streamed else default
-    found = {default: first}
+    seconds = {default: first}
     for lanes in _CANDIDATES[kind]:
-        if lanes not in found and lanes <= limit:
-            found[lanes] = _time(job, devices, lanes)
-    best = min(found, key=lambda lanes: found[lanes])
+        if lanes not in seconds and lanes <= limit:
+            seconds[lanes] = _time(job, devices, lanes)
+    best = min(seconds, key=lambda lanes: seconds[lanes])
     if memory is not None and in_the_way(memory) is None:
+        # A cache folder that cannot be written to costs the next sweep a minute, and no more.
         with contextlib.suppress(OSError):
             memory.parent.mkdir(parents=True, exist_ok=True)
             memory.write_text(json.dumps({**known, key: best}, indent=1), encoding="utf-8")
@@ -138,10 +163,11 @@ def _remembered(memory: Path | None) -> dict[str, Any]:
     if memory is None:
         return {}
     try:
-        found = json.loads(read_regular(memory, "what was measured", 10**6))
+        remembered = json.loads(read_regular(memory, "what was measured", 10**6))
     except ValueError:  # InputError is one
         return {}
-    return found if isinstance(found, dict) else {}
+    # Somebody may have edited the file: what is no dictionary is as good as no file.
+    return remembered if isinstance(remembered, dict) else {}
 
 
 def _time(job: Job, devices: tuple[Any, ...], lanes: int) -> float:
@@ -149,12 +175,12 @@ def _time(job: Job, devices: tuple[Any, ...], lanes: int) -> float:
     program = Program(job, 0, devices, lanes)
     count = min(BLOCKS * lanes * len(devices), job.design.size)
     values = arguments(job, job.design.values(0, count))
-    jax.block_until_ready(program(values, count))
+    jax.block_until_ready(program(values, count))  # compiles
     best = math.inf
     for _ in range(3):
         begin = time.perf_counter()
         jax.block_until_ready(program(values, count))
         best = min(best, time.perf_counter() - begin)
-        if best > 5.0:
+        if best > 5.0:  # [s] long enough for a clock, and three would try the user's patience
             break
     return best / count

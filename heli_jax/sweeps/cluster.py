@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import distributed
 import jax
 import numpy as np
 from distributed import CancelledError, Client, LocalCluster, WorkerPlugin, as_completed
@@ -26,15 +27,18 @@ from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import versions
 
-_RETRIES = 5
+_RETRIES = 5  # of a chunk whose task fails; how often workers may die with it dask counts itself
+# Chunks that each thread of a worker has in hand or waiting: with one it would idle while its
+# result travels; all at once, the results of a large sweep would wait in this process's memory.
 _AHEAD = 3
-"""chunks that each thread of a worker has in hand or waiting"""
-_CONNECT_S = 20
+_CONNECT_S = 20  # [s] without an answer, before an address is taken to be wrong
 _IMPORTS = (
-    "wanted is that modules of your own can be imported there too: begin scheduler and workers "
-    "with PYTHONPATH set to their folder"
+    "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
+    "to their folder"
 )
 
+# In a worker process: what is compiled there, by sweep, and who compiles it. Several threads of one
+# process would otherwise compile the same program at the same time.
 _workers: dict[str, Worker] = {}
 _building = threading.Lock()
 
@@ -42,13 +46,15 @@ _building = threading.Lock()
 class Prepared(WorkerPlugin):
     """A worker process that computes as the one that asks does."""
 
+    # dask keeps one plugin of a name: a second sweep on the same scheduler replaces the first's.
     name: Any = "heli_jax"
 
     def __init__(self, x64: bool, folder: str | None, cache: str | None) -> None:
         self.x64, self.folder, self.cache = x64, folder, cache
 
-    def setup(self, worker: Any) -> None:
+    def setup(self, worker: distributed.Worker) -> None:
         """Called by dask in every worker, later ones too."""
+        # JAX's setting is of a process and is not sent with the job: float32 would come back.
         jax.config.update("jax_enable_x64", self.x64)
         if self.cache:
             jax.config.update("jax_compilation_cache_dir", self.cache)
@@ -62,8 +68,12 @@ def connected(
     workers: int | None = None,
     folder: Path | None = None,
 ) -> Iterator[Client]:
-    """A client of a scheduler at an address, or of a cluster of `workers` processes on this
-    machine that ends with it. `folder` is where modules of one's own lie.
+    """A client of a scheduler at an address, or of a cluster on this machine that ends with it.
+
+    Args:
+        scheduler: address, as tcp://HOST:8786; a cluster of one's own unless given.
+        workers: processes of that cluster; as many as dask thinks fit unless given.
+        folder: where the user's own modules lie.
 
     Raises:
         InputError: nothing answers there, or workers have other versions than this process.
@@ -77,13 +87,15 @@ def connected(
             except (OSError, ValueError) as e:
                 raise InputError(
                     f"--scheduler {scheduler}: no scheduler answers there ({e or type(e).__name__})"
-                    ", wanted is the address that `dask scheduler` printed, as tcp://HOST:8786"
+                    ", expected the address that `dask scheduler` printed, as tcp://HOST:8786"
                 ) from e
-            cache = None
+            cache = None  # a folder of this machine; theirs may have none of that name
         else:
-            made: Any = LocalCluster  # which takes None too
+            local: Any = LocalCluster  # whose annotations leave out that workers may be None
             with _ignore_sigint():
-                cluster = made(
+                # One thread a process: a chunk takes all devices of its process already. No
+                # dashboard: it would open a port.
+                cluster = local(
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
@@ -101,6 +113,8 @@ def connected(
 def _ignore_sigint() -> Iterator[None]:
     """Processes that are started meanwhile do not hear Ctrl-C: they end with this one, which
     does."""
+    # A terminal sends it to all of them, and each would print a traceback of its own. They inherit
+    # what is ignored here. Python lets only its main thread change this.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -134,18 +148,20 @@ def _answering() -> Iterator[None]:
         yield
     except (CancelledError, CommClosedError, KilledWorker, TimeoutError) as e:
         raise InputError(
-            f"dask: the scheduler or its workers are lost ({type(e).__name__}), wanted is that "
-            "they run to the end; what is finished is kept: --resume goes on"
+            f"dask: the scheduler or its workers are lost ({type(e).__name__}), expected "
+            "them to run to the end; what is finished is kept: --resume goes on"
         ) from e
     except ImportError as e:
         raise InputError(f"dask: {e} on the scheduler or a worker, {_IMPORTS}") from e
     except RuntimeError as e:
+        # The scheduler's own word for a class that it cannot import; dask has no error for it.
         if "deserialization" not in str(e):
             raise
         raise InputError(f"dask: the scheduler cannot read the sweep, {_IMPORTS}") from e
 
 
 def _versions() -> dict[str, str]:
+    """Of what computes; the versions of what reads and draws may differ."""
     return {n: v for n, v in versions().items() if n in ("heli_jax", "jax", "jaxlib")}
 
 
@@ -154,44 +170,66 @@ def _check_versions(client: Client, where: str) -> None:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError:
         raise InputError(
-            f"{where}: the scheduler has no worker, wanted is `dask worker ADDRESS` on each host"
+            f"{where}: the scheduler has no worker, expected `dask worker ADDRESS` on each host"
         ) from None
     here = _versions()
     run: Any = client.run
     try:
         there = run(_versions)
     except ImportError as e:
-        raise InputError(f"{where}: a worker has no heli_jax ({e}), wanted is {here}") from e
-    for worker, found in there.items():
-        wrong = [f"{n} {found[n]} (here {v})" for n, v in here.items() if found.get(n) != v]
-        if wrong:
+        needed = ", ".join(f"{n} {v}" for n, v in here.items())
+        raise InputError(f"{where}: a worker has no heli_jax ({e}), expected {needed}") from e
+    for address, installed in there.items():
+        other = [n for n, v in here.items() if installed.get(n) != v]
+        if other:
+            expected = ", ".join(f"{n} {here[n]}" for n in other)
+            got = ", ".join(f"{n} {installed.get(n)}" for n in other)
             raise InputError(
-                f"{where}: the worker {worker} has {', '.join(wrong)}, wanted is the same: the "
-                "last digits may differ"
+                f"{where}: the worker {address}: expected {expected} as in this process, got "
+                f"{got}: the last digits may differ"
             )
 
 
-def split_there(client: Client, job: Job, **asked: Any) -> Split:
-    """How a worker would cut the sweep: it may have other devices than this process."""
-    asked.pop("memory", None)  # a file of this machine
-    asked["shares"] = _threads(client)
+def split_there(client: Client, job: Job, **options: Any) -> Split:
+    """How a worker would cut the sweep, with `options` of `split_for`: it may have other devices
+    than this process."""
+    options.pop("memory", None)  # a file of this machine
+    options["shares"] = _threads(client)
     with _answering():
-        return Split(*client.submit(_split, job, asked, pure=False).result())
+        # Not pure: dask would give the answer that it remembers of an equal job, which may be of
+        # other workers.
+        return Split(*client.submit(_split, job, options, pure=False).result())
 
 
 def _threads(client: Client) -> int:
-    found: Any = client.nthreads()
-    return max(1, sum(found.values()))
+    """Threads of all workers; at least one, since workers may come later."""
+    by_worker: Any = client.nthreads()
+    return max(1, sum(by_worker.values()))
 
 
-def _split(job: Job, asked: dict[str, Any]) -> tuple[int, int]:
-    return tuple(split_for(job, **asked))  # pyright: ignore[reportReturnType]
+def _split(job: Job, options: dict[str, Any]) -> tuple[int, int]:
+    return tuple(split_for(job, **options))  # pyright: ignore[reportReturnType]
 
 
 def computed(
     client: Client, job: Job, split: Split, todo: list[int]
 ) -> Iterable[tuple[int, dict[str, np.ndarray]]]:
-    """The chunks as they are done, in any order."""
+    """The chunks as they are done, in any order.
+
+    Args:
+        client: of the scheduler whose workers compute.
+        job: the sweep.
+        split: how it is cut.
+        todo: numbers of the chunks to compute.
+
+    Yields:
+        The number of a chunk and its variables, arrays (elements of the chunk, ...).
+
+    Raises:
+        InputError: the scheduler or too many workers are gone.
+    """
+    # Keys of this run alone: a scheduler remembers results by key, and one that still holds the
+    # chunks of an earlier run would give those.
     token = uuid.uuid4().hex
     # A task and no scattered data: where its copies die with their workers, dask makes it again.
     shipped = client.submit(_received, job, key=f"job-{token}")
@@ -207,6 +245,7 @@ def computed(
     for future in running:
         with _answering():
             chunk, results = future.result()
+        # Before the chunk is written, or the worker would keep its results for as long.
         future.release()
         following = next(waiting, None)
         if following is not None:
@@ -215,6 +254,7 @@ def computed(
 
 
 def _received(job: Job) -> Job:
+    """A task that gives the job, so that each worker gets it once and not with every chunk."""
     return job
 
 
@@ -224,7 +264,7 @@ def _chunk(
     """In a worker process: a chunk, with the program compiled at the first."""
     with _building:
         if token not in _workers:
-            _workers.clear()
+            _workers.clear()  # of an earlier sweep: its programs would stay in memory
             _workers[token] = Worker(job, Split(*split))
         worker = _workers[token]
     return chunk, worker.run(chunk)

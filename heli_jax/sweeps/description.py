@@ -11,14 +11,16 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.regular_file import read_regular
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import digest
+from heli_jax.sweeps.axes import digest
 from heli_jax.sweeps.reducers import Reduce
 from heli_jax.sweeps.spec import Job, linear_inputs_of
 
 
-def described(one: Job) -> dict[str, Any]:
+def described(job: Job) -> dict[str, Any]:
     """What fixes the numbers of a sweep, as plain data; equal for two jobs that give the same."""
-    model = one.model
+    # Stored with each sweep and compared when it is resumed: another key, or another text for the
+    # same thing, refuses all stores there are. Large arrays stand in it as a digest.
+    model = job.model
     flights = [
         {
             "name": f.name,
@@ -26,50 +28,59 @@ def described(one: Job) -> dict[str, Any]:
             "dt": f.dt,
             "known": dict(f.known),
             "sha256": digest({**f.inputs, **{f"measured {n}": v for n, v in f.outputs.items()}}),
+            # Only where it is so: stores from before inputs could be linear have no such key.
             **({"linear": list(linear)} if (linear := linear_inputs_of(model, f)) else {}),
         }
-        for f in one.flights
+        for f in job.flights
     ]
-    kept = one.trajectories
+    kept = job.trajectories
     return {
         "model": model.name,
         "source": _source(model.vector_field),
-        "vehicle": {n: v for n, v in one.params.items() if np.isfinite(v)},
+        # A constant that is missing is NaN, which no JSON has and which equals nothing, itself
+        # neither.
+        "vehicle": {n: v for n, v in job.params.items() if np.isfinite(v)},
         "flights": flights,
-        "design": one.design.describe(),
-        "reduce": {n: _reducer(r) for n, r in one.reduce.items()},
-        "solver": one.solver,
-        "substeps": one.substeps,
-        "precision": one.precision,
+        "design": job.design.describe(),
+        "reduce": {n: _reducer(r) for n, r in job.reduce.items()},
+        "solver": job.solver,
+        "substeps": job.substeps,
+        "precision": job.precision,
         "trajectories": None if kept is None else [list(kept.signals), kept.every],
         "trimmed": None
-        if one.trimmed is None
+        if job.trimmed is None
         else [
-            [float(v) for v in one.trimmed.condition],
-            list(one.trimmed.wind),
-            one.trimmed.sticks,
+            [float(v) for v in job.trimmed.condition],
+            list(job.trimmed.wind),
+            job.trimmed.sticks,
         ],
         "pilot": None
-        if one.pilot is None
-        else digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(one.pilot))}),
+        if job.pilot is None
+        else digest({str(i): np.asarray(v) for i, v in enumerate(jax.tree.leaves(job.pilot))}),
     }
 
 
-def _reducer(one: Reduce) -> dict[str, Any]:
-    if isinstance(one.how, str):
-        found: dict[str, Any] = {"how": one.how}
+def _reducer(reduce: Reduce) -> dict[str, Any]:
+    how = reduce.how
+    if isinstance(how, str):
+        words: dict[str, Any] = {"how": how}
     else:
-        how = one.how.update if isinstance(one.how, reducers.Streaming) else one.how
-        found = {"how": getattr(how, "__qualname__", str(type(how))), "source": _source(how)}
-    found |= {k: v for k, v in (("signal", one.signal), ("input", one.input)) if v is not None}
-    return found | ({"gain": one.gain} if one.how == "margins" else {})
+        function = how.update if isinstance(how, reducers.Streaming) else how
+        # A name and a fingerprint: the repr of a function has its address in memory.
+        name = getattr(function, "__qualname__", str(type(function)))
+        words = {"how": name, "source": _source(function)}
+    words |= {
+        k: v for k, v in (("signal", reduce.signal), ("input", reduce.input)) if v is not None
+    }
+    return words | ({"gain": reduce.gain} if how == "margins" else {})
 
 
 def _source(function: Callable[..., Any]) -> str:
     """A fingerprint of the file that a function comes from, where it is not one of ours: another
     program gives other numbers."""
-    function = getattr(function, "func", function)
+    function = getattr(function, "func", function)  # of a functools.partial
     module = getattr(function, "__module__", "") or ""
+    # Ours change with the version, which is stored; a new comment here shall stop no sweep.
     if module.partition(".")[0] == "heli_jax":
         return ""
     try:
@@ -77,24 +88,31 @@ def _source(function: Callable[..., Any]) -> str:
         data = read_regular(file, "a module in Python", 10**7) if file else b""
         return hashlib.sha256(data).hexdigest() if file else ""
     except (TypeError, OSError, InputError):
+        # Typed into a session, or compiled: there is no file. Then the name alone tells it apart.
         return ""
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], above: str = "") -> list[str]:
-    """The keys in which two descriptions differ, each with what was and what is."""
-    found = []
+    """The keys in which two descriptions differ, each with what was and what is.
+
+    Args:
+        old: of the store.
+        new: of the sweep that would go on with it.
+        above: the keys that lead to these, with a dot behind each.
+    """
+    changes = []
     for key in {**old, **new}:
         a, b = old.get(key), new.get(key)
         if a == b:
             continue
         if isinstance(a, dict) and isinstance(b, dict):
-            found += differences(a, b, f"{above}{key}.")
+            changes += differences(a, b, f"{above}{key}.")
         else:
-            found.append(f"{above}{key} was {_short(a)} and is {_short(b)}")
-    return found
+            changes.append(f"{above}{key} was {_short(a)} and is {_short(b)}")
+    return changes
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     if value is None:
         return "not given"
     text = str(value)

@@ -6,37 +6,17 @@ Sobol sequence are computed where they are needed (a Latin hypercube and a table
 
 import dataclasses
 import functools
-import hashlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-Columns = dict[str, np.ndarray]
+from heli_jax.sweeps.axes import Columns, Range, axis_values, check_axes, check_range, digest
 
-
-class Range(NamedTuple):
-    """An axis from `lower` to `upper`, in SI, evenly in the value or in its logarithm."""
-
-    lower: float
-    upper: float
-    scale: Literal["linear", "log"] = "linear"
-    n: int | None = None
-    """points, for a grid"""
-
-    def at(self, fraction: np.ndarray) -> np.ndarray:
-        """The value at fractions (k,) of the way, 0 to 1; the ends are exact."""
-        low, high = float(self.lower), float(self.upper)
-        if self.scale == "log":
-            sign = math.copysign(1.0, low)
-            found = sign * np.exp(
-                (1.0 - fraction) * math.log(abs(low)) + fraction * math.log(abs(high))
-            )
-        else:
-            found = (1.0 - fraction) * low + fraction * high
-        return np.where(fraction == 0.0, low, np.where(fraction == 1.0, high, found))
+if TYPE_CHECKING:
+    import scipy.stats.qmc
 
 
 class Design(Protocol):
@@ -61,58 +41,12 @@ class Design(Protocol):
         ...
 
 
-def digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of named arrays, whatever their order."""
-    found = hashlib.sha256()
-    for name in sorted(arrays):
-        v = np.ascontiguousarray(arrays[name])
-        found.update(f"{name}:{v.dtype.str}:{v.shape}:".encode())
-        found.update(v.tobytes())
-    return found.hexdigest()
+class _Paired(NamedTuple):
+    """Columns that are held whole, the k-th of each for element k."""
 
-
-def _check_between(name: str, axis: Range) -> None:
-    low, high = axis.lower, axis.upper
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(
-            f"axes.{name}: lower is {low:g} and upper {high:g}, wanted is lower < upper"
-        )
-    if axis.scale not in ("linear", "log"):
-        raise ValueError(f"axes.{name}: scale is {axis.scale!r}, wanted is linear or log")
-    if axis.scale == "log" and low * high <= 0:
-        raise ValueError(
-            f"axes.{name}: from {low:g} to {high:g} on a log scale, wanted are two numbers of one "
-            "sign"
-        )
-
-
-def _check_axes(axes: Mapping[str, Any]) -> None:
-    if not axes:
-        raise ValueError("axes: none given, wanted is at least one")
-
-
-def _points(name: str, axis: Range | Sequence[float] | np.ndarray) -> np.ndarray:
-    """The values of one axis of a grid or a list."""
-    if isinstance(axis, Range):
-        _check_between(name, axis)
-        if axis.n is None or axis.n < 2:
-            found = "none" if axis.n is None else axis.n
-            raise ValueError(f"axes.{name}: found n: {found}, wanted are at least 2 points")
-        values = axis.at(np.linspace(0.0, 1.0, axis.n))
-        even = axis.scale == "linear" and (axis.upper - axis.lower) % (axis.n - 1) == 0.0
-        # From 0 to 9 in ten points: 7 and not 6.999999999999999, which as a seed would be 6.
-        return np.round(values) if even and axis.lower == round(axis.lower) else values
-    values = np.asarray(axis)
-    if values.ndim != 1 or values.size == 0:
-        raise ValueError(f"axes.{name}: no values, wanted is at least one")
-    if values.dtype.kind not in "iuf":
-        raise ValueError(f"axes.{name}: found {values[0]!r:.40}, wanted are numbers")
-    return values if values.dtype.kind in "iu" else values.astype(np.float64)
-
-
-class _Listed(NamedTuple):
     columns: Columns
     kind: str
+    """list or table: the word that stores have for it"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,11 +60,14 @@ class _Listed(NamedTuple):
         return {n: v[start:stop] for n, v in self.columns.items()}
 
     def describe(self) -> dict[str, Any]:
-        found = {"design": self.kind, "axes": list(self.columns), "n": self.size}
-        return {**found, "sha256": digest(self.columns)}
+        # A digest in place of the values: a table may be larger than all results.
+        words = {"design": self.kind, "axes": list(self.columns), "n": self.size}
+        return {**words, "sha256": digest(self.columns)}
 
 
 class _Grid(NamedTuple):
+    """Every combination of the axes' values."""
+
     axes: Columns
 
     @property
@@ -142,12 +79,14 @@ class _Grid(NamedTuple):
         return math.prod(v.size for v in self.axes.values())
 
     def values(self, start: int, stop: int) -> Columns:
+        # An element's number in mixed radix, a digit for each axis, the last one least: no product
+        # of the axes has to be held.
         k = np.arange(start, stop)
-        found = {}
+        columns = {}
         for name, v in reversed(self.axes.items()):
-            found[name] = v[k % v.size]
+            columns[name] = v[k % v.size]
             k = k // v.size
-        return {n: found[n] for n in self.axes}
+        return {n: columns[n] for n in self.axes}
 
     def describe(self) -> dict[str, Any]:
         return {"design": "grid", "axes": {n: v.tolist() for n, v in self.axes.items()}}
@@ -157,15 +96,15 @@ class _Sampled:
     """Points of the unit cube, mapped to the axes."""
 
     def __init__(self, axes: Mapping[str, Range], n: int, seed: int, kind: str) -> None:
-        _check_axes(axes)
+        check_axes(axes)
         for name, axis in axes.items():
             if not isinstance(axis, Range):
-                raise ValueError(f"axes.{name}: wanted are lower and upper, for {kind}")
-            _check_between(name, axis)
+                raise ValueError(f"axes.{name}: expected lower and upper, for {kind}")
+            check_range(name, axis)
         if n < 1:
-            raise ValueError(f"n is {n}, wanted is at least 1")
+            raise ValueError(f"n must be at least 1, got {n}")
         self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
-        self._idle: list[Any] = []
+        self._idle: list[Any] = []  # engines of the sequence, each somewhere along it
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,6 +118,7 @@ class _Sampled:
     def _hypercube(self) -> np.ndarray:
         import scipy.stats.qmc  # not before it is needed: slow
 
+        # Whole, since where a point lies depends on all others: a slice cannot be drawn alone.
         rng = np.random.default_rng(self.seed)
         return scipy.stats.qmc.LatinHypercube(len(self.axes), rng=rng).random(self._n)
 
@@ -187,16 +127,18 @@ class _Sampled:
         return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
 
     def _sobol(self, start: int, stop: int) -> np.ndarray:
-        """Points (stop - start, axes). SciPy walks through all that it leaves out, so slice after
-        slice goes on where the last one ended."""
+        """Points (stop - start, axes) of the sequence."""
         import scipy.stats.qmc
 
+        # SciPy walks through all points that it leaves out, so each slice goes on where the last
+        # ended: from the beginning, the cost of a chunk would grow with its place in the sweep.
         # Taken out while it is used: another thread makes its own.
         try:
             engine = self._idle.pop()
         except IndexError:
             engine = None
         if engine is None or engine.num_generated > start:
+            # It cannot walk back. The same seed makes the same scrambling, and so the same points.
             rng = np.random.default_rng(self.seed)
             engine = scipy.stats.qmc.Sobol(len(self.axes), rng=rng)
         if start > engine.num_generated:
@@ -210,9 +152,9 @@ class _Sampled:
         return {"design": self.kind, "axes": axes, "n": self._n, "seed": self.seed}
 
 
-def _quiet_random(engine: Any, n: int) -> np.ndarray:
-    """Points of a Sobol sequence; SciPy's warning that n is no power of two is left out, since a
-    slice of a sequence never is one."""
+def _quiet_random(engine: "scipy.stats.qmc.QMCEngine", n: int) -> np.ndarray:
+    """Points of a Sobol sequence, without SciPy's warning that n is no power of two."""
+    # It is right for the sequence and wrong for a slice of it, which seldom is a power of two.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The balance properties of Sobol")
         return engine.random(n)
@@ -220,6 +162,8 @@ def _quiet_random(engine: Any, n: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class _Combined:
+    """Designs that together are one, each with axes of its own."""
+
     parts: tuple[Design, ...]
 
     @property
@@ -234,14 +178,15 @@ class _Product(_Combined):
 
     def values(self, start: int, stop: int) -> Columns:
         k = np.arange(start, stop)
-        found: Columns = {}
+        columns: Columns = {}
         for part in reversed(self.parts):
             index = k % part.size
             k = k // part.size
+            # Only the rows of the part that the slice touches: the part may be as large as a sweep.
             low, high = (int(index.min()), int(index.max()) + 1) if index.size else (0, 0)
-            piece = part.values(low, high)
-            found = {**{n: v[index - low] for n, v in piece.items()}, **found}
-        return found
+            rows = part.values(low, high)
+            columns = {**{n: v[index - low] for n, v in rows.items()}, **columns}
+        return columns
 
     def describe(self) -> dict[str, Any]:
         return {"design": "product", "of": [part.describe() for part in self.parts]}
@@ -265,8 +210,8 @@ def grid(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     Raises:
         ValueError: no axis, one without points, or ends that do not fit.
     """
-    _check_axes(axes)
-    return _Grid({n: _points(n, a) for n, a in axes.items()})
+    check_axes(axes)
+    return _Grid({n: axis_values(n, a) for n, a in axes.items()})
 
 
 def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
@@ -275,13 +220,13 @@ def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     Raises:
         ValueError: no axis, one without values, or axes of different length.
     """
-    _check_axes(axes)
-    columns = {n: _points(n, a) for n, a in axes.items()}
+    check_axes(axes)
+    columns = {n: axis_values(n, a) for n, a in axes.items()}
     lengths = {n: v.size for n, v in columns.items()}
     if len(set(lengths.values())) > 1:
         words = ", ".join(f"{n} has {k}" for n, k in lengths.items())
-        raise ValueError(f"axes: {words} values, wanted is the same number in a list")
-    return _Listed(columns, "list")
+        raise ValueError(f"axes: {words} values, expected the same number in a list")
+    return _Paired(columns, "list")
 
 
 def table(columns: Mapping[str, np.ndarray]) -> Design:
@@ -290,15 +235,21 @@ def table(columns: Mapping[str, np.ndarray]) -> Design:
     Raises:
         ValueError: no column, no row, or columns of different length.
     """
-    _check_axes(columns)
-    found = {n: _points(n, v) for n, v in columns.items()}
-    if len({v.size for v in found.values()}) > 1:
-        raise ValueError("the table's columns differ in length")
-    return _Listed(found, "table")
+    check_axes(columns)
+    axes = {n: axis_values(n, v) for n, v in columns.items()}
+    if len({v.size for v in axes.values()}) > 1:
+        words = ", ".join(f"{n} has {v.size}" for n, v in axes.items())
+        raise ValueError(f"the table's columns differ in length: {words}, expected one length")
+    return _Paired(axes, "table")
 
 
 def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     """A Latin hypercube of n points (`scipy.stats.qmc.LatinHypercube`).
+
+    Args:
+        axes: by name, from where to where, SI.
+        n: elements.
+        seed: of the points; the same one gives the same.
 
     Raises:
         ValueError: no axis, ends that do not fit, or no points.
@@ -309,22 +260,15 @@ def lhs(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
 def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
     """The first n points of a scrambled Sobol sequence (`scipy.stats.qmc.Sobol`).
 
+    Args:
+        axes: by name, from where to where, SI.
+        n: elements; a power of two is most even.
+        seed: of the scrambling; the same one gives the same points.
+
     Raises:
         ValueError: no axis, ends that do not fit, or no points.
     """
     return _Sampled(axes, n, seed, "sobol")
-
-
-def whole_seeds(values: np.ndarray) -> np.ndarray:
-    """Seeds (k,) as whole numbers.
-
-    Raises:
-        ValueError: one is none.
-    """
-    whole = np.isfinite(values) & (values == np.round(values)) & (values >= 0)
-    if not np.all(whole & (values < 2**32)):
-        raise ValueError("axes.seed: wanted are whole numbers from 0 to 2^32 - 1")
-    return values.astype(np.int64)
 
 
 def log_axes(design: Design) -> set[str]:
@@ -338,11 +282,11 @@ def log_axes(design: Design) -> set[str]:
 
 def _check_parts(parts: tuple[Design, ...]) -> None:
     if not parts:
-        raise ValueError("of: no designs, wanted is at least one")
+        raise ValueError("of: no designs, expected at least one")
     seen: set[str] = set()
     for name in (n for part in parts for n in part.names):
         if name in seen:
-            raise ValueError(f"the axis {name!r} is in two designs, wanted is one")
+            raise ValueError(f"the axis {name!r} is in two designs, expected one")
         seen.add(name)
 
 
@@ -366,5 +310,5 @@ def zipped(*parts: Design) -> Design:
     sizes = [part.size for part in parts]
     if len(set(sizes)) > 1:
         words = " and ".join(str(s) for s in sizes)
-        raise ValueError(f"the designs have {words} elements, wanted is the same number in a zip")
+        raise ValueError(f"the designs have {words} elements, expected the same number in a zip")
     return _Zipped(parts)

@@ -5,11 +5,16 @@ result at the end, so that nothing of the run is stored. A function of a whole r
 place; the runs of one block are then held while it works.
 """
 
+# `Any` below: the running values of a Streaming of the user's are any pytree, and without a signal
+# it gets the model's Outputs. Those here have scalars, ().
+
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from heli_jax.errors import nearest
 
@@ -22,10 +27,17 @@ class Measured(NamedTuple):
     seen: Any
     """(N,), 1 where something was measured, else 0; or that at one sample; None: everywhere"""
     count: Any
-    spread: Any
-    """sum of squares about the mean"""
+    total_squares: Any
+    """sum of squares about the mean, as R^2 has it"""
     power: Any
     """sum of squares"""
+
+    @property
+    def spread(self) -> Any:
+        """Deprecated: the name that `total_squares` had."""
+        # A Streaming of the user's may read it.
+        warnings.warn("spread is deprecated, expected total_squares", DeprecationWarning, 2)
+        return self.total_squares
 
 
 class Streaming(NamedTuple):
@@ -56,84 +68,98 @@ class Reduce(NamedTuple):
     input: str | None = None
     """the input at which margins break the loop"""
     gain: float = 1.0
-    """of the loop whose margins are wanted: the input is -gain times the signal"""
+    """of the loop that the margins are of: the input is -gain times the signal"""
 
 
-def measured(values: np.ndarray, dtype: Any) -> Measured:
+def measured(values: np.ndarray, dtype: np.dtype) -> Measured:
     """A measured signal (N,), NaN where one is missing, for the reducers."""
     seen = np.isfinite(values)
     known = values[seen]
-    spread = float(np.sum((known - known.mean()) ** 2)) if known.size else 0.0
+    # In float64 and about the mean, once: sums that are gathered along the run would lose digits.
+    total_squares = float(np.sum((known - known.mean()) ** 2)) if known.size else 0.0
     return Measured(
+        # Zeros and a mask: one NaN would make every sum NaN, since 0 times NaN is NaN.
         np.where(seen, values, 0.0).astype(dtype),
+        # Where all is there, no mask: a product less in each sample.
         None if seen.all() else seen.astype(dtype),
         np.asarray(known.size, dtype),
-        np.asarray(spread, dtype),
+        np.asarray(total_squares, dtype),
         np.asarray(np.sum(known**2), dtype),
     )
 
 
-def _summed(value: Any, y: Any, _: Any) -> Any:
+_Two = tuple[Array, Array]
+
+# Updates (value, y, measured) and finishes (value, n, measured) of the reducers below; what one of
+# them does not need it calls _.
+
+
+def _summed(value: Array, y: Array, _: Measured | None) -> Array:
     return value + y
 
 
-def _squared(value: Any, y: Any, _: Any) -> Any:
+def _squared(value: Array, y: Array, _: Measured | None) -> Array:
     return value + y * y
 
 
-def _mean(value: Any, n: Any, _: Any) -> Any:
+def _mean(value: Array, n: Array, _: Measured | None) -> Array:
     return value / n
 
 
-def _root_mean(value: Any, n: Any, _: Any) -> Any:
+def _root_mean(value: Array, n: Array, _: Measured | None) -> Array:
     return jnp.sqrt(value / n)
 
 
-def _same(value: Any, n: Any, _: Any) -> Any:
+def _same(value: Array, n: Array, _: Measured | None) -> Array:
     return value
 
 
-def _where(v: Any, m: Measured) -> Any:
+def _where(v: Array, m: Measured) -> Array:
+    """Zero where nothing was measured."""
     return v if m.seen is None else v * m.seen
 
 
-def _misfit(value: Any, y: Any, m: Measured) -> Any:
+def _misfit(value: Array, y: Array, m: Measured) -> Array:
     e = _where(m.values - y, m)
     return value + e * e
 
 
-def _rmse(value: Any, n: Any, m: Measured) -> Any:
+def _rmse(value: Array, n: Array, m: Measured) -> Array:
     return jnp.sqrt(value / m.count)
 
 
-def _nrmse(value: Any, n: Any, m: Measured) -> Any:
-    return jnp.sqrt(value / m.spread)
+def _nrmse(value: Array, n: Array, m: Measured) -> Array:
+    return jnp.sqrt(value / m.total_squares)
 
 
-def _fit_percent(value: Any, n: Any, m: Measured) -> Any:
-    return 100.0 * (1.0 - jnp.sqrt(value / m.spread))
+def _fit_percent(value: Array, n: Array, m: Measured) -> Array:
+    # As MATLAB's `compare`: 100 is perfect, 0 is no better than the measured mean.
+    return 100.0 * (1.0 - jnp.sqrt(value / m.total_squares))
 
 
-def _misfit_and_sum(value: Any, y: Any, m: Measured) -> Any:
+def _misfit_and_sum(value: _Two, y: Array, m: Measured) -> _Two:
     e = _where(m.values - y, m)
     return (value[0] + e * e, value[1] + e)
 
 
-def _vaf(value: Any, n: Any, m: Measured) -> Any:
+def _vaf(value: _Two, n: Array, m: Measured) -> Array:
+    # 1 - var(e) / var(measured): sum (e - mean e)^2 = sum e^2 - (sum e)^2 / count, in one pass.
     squares, total = value
-    return 1.0 - (squares - total * total / m.count) / m.spread
+    return 1.0 - (squares - total * total / m.count) / m.total_squares
 
 
-def _misfit_and_power(value: Any, y: Any, m: Measured) -> Any:
+def _misfit_and_power(value: _Two, y: Array, m: Measured) -> _Two:
     e, seen = _where(m.values - y, m), _where(y, m)
     return (value[0] + e * e, value[1] + seen * seen)
 
 
-def _theil(value: Any, n: Any, m: Measured) -> Any:
+def _theil(value: _Two, n: Array, m: Measured) -> Array:
+    # Theil's inequality coefficient, 0 to 1: rms(e) / (rms(y) + rms(measured)); the counts cancel.
     return jnp.sqrt(value[0]) / (jnp.sqrt(value[1]) + jnp.sqrt(m.power))
 
 
 REDUCERS: dict[str, Streaming] = {
+    # Start, update, finish, whether it compares with the flight, unit of the result.
     "rms": Streaming(0.0, _squared, _root_mean),
     "mean": Streaming(0.0, _summed, _mean),
     "peak": Streaming(0.0, lambda v, y, _: jnp.maximum(v, jnp.abs(y)), _same),
@@ -154,44 +180,64 @@ LINEAR = ("modes", "margins")
 """Of the model linearised where the run begins: eigenvalues; gain and phase margin of a loop."""
 
 
-def check(name: str, one: Reduce, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> None:
     """Refuse a reducer that the model cannot have.
+
+    Args:
+        name: of the result.
+        reduce: what it is.
+        outputs: names of the model's outputs.
+        inputs: names of its inputs.
 
     Raises:
         ValueError: an unknown `how`, an output or input that the model lacks, or none where one is
             needed.
     """
-    where = f"reduce.{name}"
-    if isinstance(one.how, str) and one.how not in (*REDUCERS, *LINEAR):
+    where, how = f"reduce.{name}", reduce.how
+    if isinstance(how, str) and how not in (*REDUCERS, *LINEAR):
         known = [*REDUCERS, *LINEAR]
-        raise ValueError(f"{where}.how: unknown reducer {one.how!r}{nearest(one.how, known)}")
-    needs_signal = one.how == "margins" or one.how in REDUCERS
-    if needs_signal and one.signal is None:
-        raise ValueError(f"{where}.signal: missing, wanted is one of {', '.join(outputs)}")
-    if one.signal is not None and one.signal not in outputs:
-        raise ValueError(
-            f"{where}.signal: the model has no output {one.signal!r}{nearest(one.signal, outputs)}"
-        )
-    if one.how == "margins" and one.input is None:
-        raise ValueError(f"{where}.input: missing, wanted is one of {', '.join(inputs)}")
-    if one.input is not None and one.input not in inputs:
-        raise ValueError(
-            f"{where}.input: the model has no input {one.input!r}{nearest(one.input, inputs)}"
-        )
-    if one.input is not None and one.how != "margins":
-        raise ValueError(f"{where}.input: only margins take one")
-    if one.how != "margins" and one.gain != 1.0:
-        raise ValueError(f"{where}.gain: only margins take one")
-    whole = callable(one.how) and not isinstance(one.how, Streaming)
-    if one.signal is not None and (whole or one.how == "modes"):
-        what = "modes are" if one.how == "modes" else "a function of a Trajectory is"
-        raise ValueError(f"{where}.signal: {what} of no one signal, wanted is none")
-    if one.how == "margins" and not (np.isfinite(one.gain) and one.gain != 0):
-        raise ValueError(f"{where}.gain: found {one.gain}, wanted is a number that is not zero")
+        raise ValueError(f"{where}.how: unknown reducer {how!r}{nearest(how, known)}")
+    _check_signal(where, reduce, outputs)
+    _check_loop(where, reduce, inputs)
 
 
-def streaming(one: Reduce) -> Streaming | None:
+def _check_signal(where: str, reduce: Reduce, outputs: tuple[str, ...]) -> None:
+    """Refuse a signal that is missing, unknown or of no use."""
+    how, signal = reduce.how, reduce.signal
+    if (how == "margins" or how in REDUCERS) and signal is None:
+        raise ValueError(f"{where}.signal: missing, expected one of {', '.join(outputs)}")
+    if signal is not None and signal not in outputs:
+        raise ValueError(
+            f"{where}.signal: the model has no output {signal!r}{nearest(signal, outputs)}"
+        )
+    # A signal that would be ignored is refused too: a result of one output and of all of them look
+    # alike in a table.
+    whole = callable(how) and not isinstance(how, Streaming)
+    if signal is not None and (whole or how == "modes"):
+        what = "modes are" if how == "modes" else "a function of a Trajectory is"
+        raise ValueError(f"{where}.signal: {what} of no one signal, expected none")
+
+
+def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:
+    """Refuse margins without a loop, and a loop without margins."""
+    margins = reduce.how == "margins"
+    if margins and reduce.input is None:
+        raise ValueError(f"{where}.input: missing, expected one of {', '.join(inputs)}")
+    if reduce.input is not None and reduce.input not in inputs:
+        raise ValueError(
+            f"{where}.input: the model has no input {reduce.input!r}{nearest(reduce.input, inputs)}"
+        )
+    if reduce.input is not None and not margins:
+        raise ValueError(f"{where}.input: only margins take one, got {reduce.input!r}")
+    if reduce.gain != 1.0 and not margins:
+        raise ValueError(f"{where}.gain: only margins take one, got {reduce.gain}")
+    # A gain of zero is no loop: its margins would be infinite whatever the vehicle.
+    if margins and not (np.isfinite(reduce.gain) and reduce.gain != 0):
+        raise ValueError(f"{where}.gain: expected a number that is not zero, got {reduce.gain}")
+
+
+def streaming(reduce: Reduce) -> Streaming | None:
     """The reducer itself, or None where it is none that goes along with a run."""
-    if isinstance(one.how, Streaming):
-        return one.how
-    return REDUCERS.get(one.how) if isinstance(one.how, str) else None
+    if isinstance(reduce.how, Streaming):
+        return reduce.how
+    return REDUCERS.get(reduce.how) if isinstance(reduce.how, str) else None

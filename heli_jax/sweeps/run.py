@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from heli_jax import run_directory
+from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.sweeps import store as stores
@@ -23,8 +24,10 @@ from heli_jax.sweeps.summary import write_summary
 from heli_jax.sweeps.worker import Split, Worker
 from heli_jax.versions import versions
 
-_SAMPLED = 64
-"""elements on which float32 is compared with float64"""
+# `Any` below: Params of the user's own class, what may stand in JSON, and a dask Client, which is
+# not imported where no worker is asked for.
+
+_SAMPLED = 64  # elements on which float32 is compared with float64: enough to see its size
 
 
 class Progress(NamedTuple):
@@ -60,7 +63,7 @@ class Options(NamedTuple):
 
 
 def sweep(
-    model: Any,
+    model: Model,
     params: Any,
     flights: Flight | Sequence[Flight],
     design: Design,
@@ -120,6 +123,7 @@ def run_sweep(
     Raises:
         InputError: as `sweep`.
     """
+    # The notes are kept too: who opens the store a year later has not seen what was printed.
     notes = [*notes, *_notes(job)]
     for note in notes:
         options.say(note)
@@ -129,13 +133,15 @@ def run_sweep(
         _compute(job, store, store.done(), options)
         return store.dataset().load()
     where = f"--out {out}"
+    # --resume takes what is not there, or is an empty folder, for a sweep that was killed before it
+    # began: a job on a cluster is then started and restarted by the same command.
     empty = out.is_dir() and not any(out.iterdir())
     if not (options.resume and out.exists() and not empty):
         if not (options.resume and empty):
             run_directory.require_free(out, ", or --resume")
         _create(job, out, options, kept, files or {})
     if not out.is_dir() or not stores.writable(out):
-        raise InputError(f"{where}: is no directory that can be written to")
+        raise InputError(f"{where}: expected a directory that can be written to")
     return _resume(job, out, options)
 
 
@@ -172,9 +178,12 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
     where = f"--out {out}"
     stores.require_files(out, where)
     with stores.only_writer(out, where):
+        # A new store too is read as if it were an old one: it may have been made by a process that
+        # was killed, or by one that came first.
         store = stores.reopen(out / "sweep.zarr", job, where)
         done = store.whole()
         _same_cut(store, job, options, where)
+        # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
         for note in _changes(store.attributes.get("versions", {}), versions()):
             options.say(f"{where}: {note}")
         timing = _compute(job, store, done, options)
@@ -187,9 +196,10 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
 def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict[str, Any]]:
     """How the sweep is cut, and the attributes of its store."""
     for name in ("chunk", "lanes"):
-        given = getattr(options, name)
-        if given is not None and given < 1:
-            raise ValueError(f"{name} is {given}, wanted is at least 1")
+        number = getattr(options, name)
+        if number is not None and number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    # More lanes than elements would fill the memory with copies of the last one.
     lanes = None if options.lanes is None else min(options.lanes, job.design.size)
     asked = {"chunk": options.chunk, "lanes": lanes, "memory": options.memory}
     if options.client is not None:
@@ -204,17 +214,19 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
 
 
 def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> None:
+    """Refuse numbers other than those a store was begun with: its last digits depend on them."""
     for name in ("chunk", "lanes"):
-        given, kept = getattr(options, name), getattr(store.split, name)
-        taken = job.design.size if name == "lanes" else math.inf
-        if given is not None and min(given, taken) != kept:
+        number, kept = getattr(options, name), getattr(store.split, name)
+        at_most = job.design.size if name == "lanes" else math.inf  # as `_cut` takes it
+        if number is not None and min(number, at_most) != kept:
             raise InputError(
-                f"{where}: was begun with {name} {kept}, found {given}, wanted is the same"
+                f"{where}: was begun with {name} {kept}, expected the same, got {number}"
             )
 
 
 def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) -> dict[str, Any]:
     """Compute the chunks that are not done; returns what it took."""
+    # Workers may give them in any order: what counts is each chunk's own status in the store.
     todo = [int(k) for k in np.flatnonzero(~done)]
     total, size = job.design.size, store.split.chunk
     before = sum(min(size, total - int(k) * size) for k in np.flatnonzero(done))
@@ -225,6 +237,8 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
         nonlocal now, first
         store.write(chunk, results)
         now += len(results["status"])
+        # The first chunk waited for the compiler: counted, it would make the time that is left look
+        # ten times as long.
         rate = math.nan
         if first is None:
             first = time.perf_counter(), now
@@ -257,12 +271,14 @@ def _local(
     if not todo:
         return
     worker = Worker(job, split, devices)
-    ahead = worker.begin(todo[0])
-    for this, following in zip(todo, [*todo[1:], None], strict=True):
-        pending = ahead
+    # JAX returns before it has computed: one chunk ahead is enough to keep the devices busy, and
+    # more would only take memory.
+    begun = worker.begin(todo[0])
+    for chunk, following in zip(todo, [*todo[1:], None], strict=True):
+        pending = begun
         if following is not None:
-            ahead = worker.begin(following)
-        yield this, worker.finish(pending)
+            begun = worker.begin(following)
+        yield chunk, worker.finish(pending)
 
 
 def float32_error(job: Job) -> dict[str, float | str]:
@@ -275,21 +291,24 @@ def float32_error(job: Job) -> dict[str, float | str]:
     columns = [job.design.values(int(k), int(k) + 1) for k in chosen]
     some = table({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
     split = Split(len(chosen), len(chosen))
+    # One device: for 64 elements the others would be compiled for in vain.
     devices = jax.local_devices()[:1]
     single = Worker(job._replace(design=some), split, devices).run(0)
     double = Worker(job._replace(design=some, precision="float64"), split, devices).run(0)
-    found: dict[str, float | str] = {}
+    errors: dict[str, float | str] = {}
     for name, exact in double.items():
         if name in some.names or exact.dtype.kind != "f":
             continue
         off = np.abs(single[name] - exact)
         off, size = off[np.isfinite(off)], np.abs(exact[np.isfinite(exact)])
+        # Of the largest and not of each value: one that is zero but for rounding has no digits.
         largest = size.max(initial=0.0)
-        found[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
-    return found
+        errors[name] = float(off.max(initial=0.0) / largest) if largest > 0 else 0.0
+    return errors
 
 
 def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    """That a store was begun with other versions, if it was."""
     changed = [f"{n} {old[n]} then, {v} now" for n, v in new.items() if n in old and old[n] != v]
     if not changed:
         return []

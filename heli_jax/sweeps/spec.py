@@ -17,10 +17,14 @@ from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import substeps_for
 from heli_jax.simulation.solvers import solver_named
 from heli_jax.sweeps import reducers
-from heli_jax.sweeps.design import Design, whole_seeds
+from heli_jax.sweeps.axes import whole_seeds
+from heli_jax.sweeps.design import Design
 from heli_jax.sweeps.reducers import Reduce
 
 Precision = Literal["float64", "float32"]
+
+
+# `Any` below: Params are the user's own class, a NamedTuple that the model names.
 
 
 class Trajectories(NamedTuple):
@@ -65,6 +69,9 @@ class RunOptions(NamedTuple):
 class Plan(NamedTuple):
     """What is compiled for a sweep; sweeps of the same plan share the program."""
 
+    # The key under which `program` remembers what it compiled: every field can be hashed, and no
+    # number of a vehicle or a flight is among them.
+
     model: Model
     reduce: tuple[tuple[str, Reduce], ...]
     solver: str
@@ -77,7 +84,7 @@ class Plan(NamedTuple):
     linear: tuple[str, ...] = ()
     """inputs that are linear between samples; the others are held"""
 
-    def simulation(self, **numbers: Any) -> SimulationOptions:
+    def simulation(self, **numbers: Any) -> SimulationOptions:  # fields of several types
         """How a run is simulated; `numbers` are the fields that an element has of its own."""
         return SimulationOptions(
             solver=solver_named(self.solver),
@@ -88,14 +95,14 @@ class Plan(NamedTuple):
 
 
 DEFAULT = RunOptions()
-_MOST = 10**10
-"""elements: more take months"""
-_LOOKED_AT = 1 << 16
-"""elements whose seeds are checked"""
+_MOST = 10**10  # elements: more take months, and are a slip of the pen in one of the axes
+_LOOKED_AT = 1 << 16  # elements whose seeds are checked: all of 10^10 would take minutes
 
 
 class Job(NamedTuple):
     """All that a chunk of a sweep needs."""
+
+    # It travels to workers on other machines: what is in it must be pickled, the functions by name.
 
     model: Model
     params: dict[str, float]
@@ -127,9 +134,12 @@ class Job(NamedTuple):
     @property
     def streamed(self) -> bool:
         """Whether every run is reduced while it goes on, and nothing of it has to be kept."""
-        own = any(_needs_whole_run(r) for r in self.reduce.values())
-        moved = {"delay", "seed"} & set(special_axes(self.model, self.design))
-        return not own and not moved and self.trajectories is None and self.pilot is None
+        whole = any(_needs_whole_run(r) for r in self.reduce.values())
+        # `accumulate` has no delay, no noise and no feedback, which `simulate` has: such runs are
+        # simulated whole and reduced then.
+        drawn_or_late = {"delay", "seed"} & set(special_axes(self.model, self.design))
+        kept = self.trajectories is not None
+        return not whole and not drawn_or_late and not kept and self.pilot is None
 
     @property
     def simulated(self) -> bool:
@@ -139,11 +149,12 @@ class Job(NamedTuple):
 
 
 def linear_inputs_of(model: Model, flight: Flight) -> tuple[str, ...]:
+    """The model's inputs that are straight lines between this flight's samples."""
     return tuple(n for n in naming.names(model.Inputs) if flight.hold.get(n) == "linear")
 
 
-def _needs_whole_run(one: Reduce) -> bool:
-    return callable(one.how) and not isinstance(one.how, reducers.Streaming)
+def _needs_whole_run(reduce: Reduce) -> bool:
+    return callable(reduce.how) and not isinstance(reduce.how, reducers.Streaming)
 
 
 def special_axes(model: Model, design: Design) -> list[str]:
@@ -197,9 +208,11 @@ def job(
         )
     substeps = options.substeps
     if substeps is None:
+        # One program serves all flights alike, so the slowest rate says how many steps it needs.
         substeps = substeps_for(max(f.dt for f in flights))
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
+    # Plain numbers and no arrays: they are compared with those that a store remembers, as JSON.
     numbers = {n: float(v) for n, v in naming.asdict(params).items()}
     checked = options._replace(solver=solver, substeps=substeps)
     return Job(model, numbers, flights, design, dict(reduce), **checked._asdict())
@@ -208,6 +221,7 @@ def job(
 def _check_precision(precision: str) -> None:
     if precision not in ("float64", "float32"):
         raise ValueError(f"precision: expected float64 or float32, got {precision!r}")
+    # JAX would compute in float32 without a word, under the heading float64.
     if precision == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
         raise ValueError(
             "precision: float64 is switched off in JAX, expected "
@@ -233,23 +247,28 @@ def _check_axes(model: Model, design: Design, flights: tuple[Flight, ...]) -> No
         if name in params:
             for flight in flights:
                 if name in flight.known:
+                    # The axis would win, and what the flight says of the machine be lost unseen.
                     raise ValueError(
-                        f"axes.{name}: the flight {flight.name!r} states it as known, wanted is "
+                        f"axes.{name}: the flight {flight.name!r} states it as known, expected "
                         "one of the two"
                     )
         elif name not in special:
+            # 'gain.x_rol' is a slip in the input's name: no parameter is suggested for it.
             kind = name.partition(".")[0]
             among = [n for n in special if n.startswith(f"{kind}.")] or [*params, *special]
             raise ValueError(
                 f"axes.{name}: model {model.name} has nothing of that name{nearest(name, among)}"
             )
+    # A model's own parameter of this name is an axis like any other.
     if "seed" in design.names and "seed" not in params:
         if model.noise_intensity is None:
             raise ValueError(
-                f"axes.seed: model {model.name} draws nothing at random, wanted is a disturbance"
+                f"axes.seed: model {model.name} draws nothing at random, expected a disturbance"
             )
         if "delay" in design.names and "delay" not in params:
-            raise ValueError("axes.seed: noise is drawn without a delay only")
+            raise ValueError(
+                "axes.seed: noise is drawn without a delay only, got an axis delay too"
+            )
         whole_seeds(design.values(0, min(design.size, _LOOKED_AT))["seed"])
 
 
@@ -261,7 +280,7 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
                     f"flight {flight.name!r} has no input {name!r}, which {model.name} needs"
                 )
         if flight.n_samples < 2:
-            raise ValueError(f"flight {flight.name!r} has one sample, wanted are two at least")
+            raise ValueError(f"flight {flight.name!r}: expected at least two samples, got one")
 
 
 def _check_results(
@@ -273,24 +292,33 @@ def _check_results(
 ) -> None:
     outputs, inputs = naming.names(model.Outputs), naming.names(model.Inputs)
     if not reduce and trajectories is None:
-        raise ValueError("reduce: nothing is to be kept, wanted is a result or trajectories")
-    for name, one in reduce.items():
-        reducers.check(name, one, outputs, inputs)
-        stream = reducers.streaming(one)
+        raise ValueError("reduce: nothing is to be kept, expected a result or trajectories")
+    for name, reducer in reduce.items():
+        reducers.check(name, reducer, outputs, inputs)
+        # Of the store's own; names that its format cannot have are refused where it is laid out.
         if name in design.names or name in ("status", "element"):
-            raise ValueError(f"reduce.{name}: the name is taken, wanted is another")
-        if stream is None or not stream.against_flight:
-            continue
-        for flight in flights:
-            if one.signal not in flight.outputs:
-                raise ValueError(
-                    f"reduce.{name}: flight {flight.name!r} measured no {one.signal!r}"
-                    f"{nearest(str(one.signal), flight.outputs)}"
-                )
-    if trajectories is None:
-        return
+            raise ValueError(f"reduce.{name}: the name is taken, expected another")
+        stream = reducers.streaming(reducer)
+        if stream is not None and stream.against_flight:
+            _check_measured(name, str(reducer.signal), flights)
+    if trajectories is not None:
+        _check_trajectories(trajectories, outputs, flights)
+
+
+def _check_measured(name: str, signal: str, flights: tuple[Flight, ...]) -> None:
+    for flight in flights:
+        if signal not in flight.outputs:
+            raise ValueError(
+                f"reduce.{name}: flight {flight.name!r} measured no {signal!r}"
+                f"{nearest(signal, flight.outputs)}"
+            )
+
+
+def _check_trajectories(
+    trajectories: Trajectories, outputs: tuple[str, ...], flights: tuple[Flight, ...]
+) -> None:
     if not trajectories.signals:
-        raise ValueError("trajectories.signals: none given, wanted is at least one")
+        raise ValueError("trajectories.signals: none given, expected at least one")
     for signal in trajectories.signals:
         if signal not in outputs:
             raise ValueError(
@@ -298,10 +326,11 @@ def _check_results(
                 f"{nearest(signal, outputs)}"
             )
     if trajectories.every < 1:
-        raise ValueError(f"trajectories.every is {trajectories.every}, wanted is at least 1")
+        raise ValueError(f"trajectories.every must be at least 1, got {trajectories.every}")
+    # They share the store's dimension `time`, which has one step and one length.
     if len({(f.dt, f.n_samples) for f in flights}) > 1:
         raise ValueError(
-            "trajectories: the flights differ in rate or length, wanted are flights of one grid"
+            "trajectories: the flights differ in rate or length, expected flights of one grid"
         )
 
 
@@ -317,21 +346,22 @@ def axis_unit(model: Model, name: str) -> str | None:
     return {"delay": "s", "gain": "1"}.get(kind)
 
 
-def unread(one: Job) -> list[str]:
+def unread(job: Job) -> list[str]:
     """The axes that are parameters which the model does not read, so that no run depends on them.
 
     Tried at one point of the states and inputs; a model that reads a parameter elsewhere alone has
     it here by mistake.
     """
-    model = one.model
-    params = model.Params(**one.params)
-    axes = [n for n in one.design.names if n in naming.names(model.Params)]
-    drawn = model.noise_intensity if "seed" in one.design.names else None
+    model = job.model
+    params = model.Params(**job.params)
+    axes = [n for n in job.design.names if n in naming.names(model.Params)]
+    drawn = model.noise_intensity if "seed" in job.design.names else None
 
-    def else_read(name: str) -> bool:
+    def read_elsewhere(name: str) -> bool:
+        # What is computed from NaN is NaN: whatever reads the parameter shows it.
         missing = plain(params, **{name: np.nan})
         with np.errstate(all="ignore"):
             parts = (model.initial_state(missing), None if drawn is None else drawn(missing))
         return any(bool(np.isnan(float(v))) for v in jax.tree.leaves(parts))
 
-    return [n for n in axes if not reads(model, params, n) and not else_read(n)]
+    return [n for n in axes if not reads(model, params, n) and not read_elsewhere(n)]

@@ -21,10 +21,13 @@ from zarr.storage import MemoryStore
 from heli_jax.errors import InputError
 from heli_jax.regular_file import require_regular
 from heli_jax.sweeps.description import described, differences
-from heli_jax.sweeps.program import NOT_RUN
+from heli_jax.sweeps.design_point import NOT_RUN
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import Split, Variable, variables
 
+# What stands where nothing was written: not a number, and for the status (unsigned) 'not run', by
+# which an unfinished chunk is known. Seeds (signed) are written before it and need no such
+# mark.
 _FILL = {"f": np.nan, "u": NOT_RUN, "i": 0}
 
 
@@ -33,7 +36,7 @@ class Store:
 
     def __init__(self, group: zarr.Group, where: str) -> None:
         self.group, self.where = group, where
-        attributes: Any = dict(group.attrs)
+        attributes: dict[str, Any] = dict(group.attrs)
         self.split = Split(**attributes["split"])
         self.attributes = attributes
         self._results: list[str] = list(attributes["results"])
@@ -49,6 +52,8 @@ class Store:
 
     def done(self) -> np.ndarray:
         """Which chunks are finished, (number of chunks,)."""
+        # The first element of each tells: the status of a chunk is one file, which is there as a
+        # whole or not at all.
         status = self._arrays["status"]
         count = self.split.chunks(status.shape[0])
         firsts = [status[k * self.split.chunk] for k in range(count)]
@@ -63,12 +68,13 @@ class Store:
         with readable(self.where):
             done = self.done()
             finished = int(np.count_nonzero(done))
+            # Zarr reads a file that is not there as its fill value: NaN that nobody computed.
             for name in self._results:
-                found = self._arrays[name].nchunks_initialized
-                if found < finished:
+                there = self._arrays[name].nchunks_initialized
+                if there < finished:
                     raise InputError(
-                        f"{self.where}: {name} has {found} chunks of {finished} that are finished, "
-                        "wanted is a store from which nothing was taken, or another --out"
+                        f"{self.where}: {name} has {there} chunks of {finished} that are finished, "
+                        "expected a store from which nothing was taken, or another --out"
                     )
         return done
 
@@ -88,9 +94,10 @@ class Store:
 
     def dataset(self) -> xr.Dataset:
         """The store as an xarray Dataset, read as it is used."""
-        found = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
-        # The order of files in a directory is none.
-        return found[self.attributes["results"]]
+        # chunks=None: no dask arrays, which would need dask where nobody asked for it.
+        dataset = xr.open_zarr(self.group.store, consolidated=False, chunks=None)
+        # In the order asked for: that of files in a directory is none.
+        return dataset[self.attributes["results"]]
 
 
 @contextlib.contextmanager
@@ -102,18 +109,19 @@ def readable(where: str) -> Iterator[None]:
         raise
     except (OSError, RuntimeError, ValueError) as e:
         raise InputError(
-            f"{where}: a file of sweep.zarr cannot be read ({e}), wanted is an undamaged store, or "
+            f"{where}: a file of sweep.zarr cannot be read ({e}), expected an undamaged store, or "
             "another --out"
         ) from e
 
 
 @contextlib.contextmanager
 def _words(where: str) -> Iterator[None]:
+    """What the system says of a file that cannot be written, as a sentence."""
     try:
         yield
     except OSError as e:
         full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        hint = ", wanted is room for the rest" if full else ""
+        hint = ", expected room for the rest" if full else ""
         raise InputError(
             f"{where}: cannot be written ({e.strerror or e}){hint}; what is finished is kept"
         ) from e
@@ -122,7 +130,14 @@ def _words(where: str) -> Iterator[None]:
 def create(
     path: Path | None, job: Job, split: Split, attributes: Mapping[str, Any], where: str
 ) -> Store:
-    """A new store at `path`, or in memory.
+    """A new store, without any element.
+
+    Args:
+        path: where it is made; None for one in memory.
+        job: the sweep.
+        split: how it is cut; a chunk of the sweep is one of Zarr's, and so one file.
+        attributes: kept with the store, as JSON has them.
+        where: what a message begins with.
 
     Raises:
         OSError: the place cannot be written to.
@@ -131,9 +146,9 @@ def create(
     group = zarr.create_group(store, zarr_format=3)
     laid_out = variables(job)
     size = job.design.size
-    for name, one in laid_out.items():
-        _array(group, name, one, size, split)
-    dims = {d for one in laid_out.values() for d in one.dims}
+    for name, variable in laid_out.items():
+        _array(group, name, variable, size, split)
+    dims = {d for variable in laid_out.values() for d in variable.dims}
     if "flight" in dims:
         _labels(group, "flight", np.asarray([_label(job, i) for i in range(len(job.flights))]))
     if "time" in dims and job.trajectories is not None:
@@ -145,7 +160,7 @@ def create(
             **attributes,
             "title": f"sweep of {job.model.name}",
             "axes": list(job.design.names),
-            "results": [n for n, one in laid_out.items() if not one.axis and n != "status"],
+            "results": [n for n, v in laid_out.items() if not v.axis and n != "status"],
             "split": split._asdict(),
             "description": json.dumps(described(job), sort_keys=True),
             # xarray makes coordinates of what is named here.
@@ -157,6 +172,7 @@ def create(
 
 def _label(job: Job, i: int) -> str:
     """The flight's name; with its place where another has the same."""
+    # As a label it has to be one flight's alone: xarray's sel() would give both.
     name = job.flights[i].name
     if not name:
         return f"flight {i + 1}"
@@ -164,34 +180,40 @@ def _label(job: Job, i: int) -> str:
     return name if alone else f"{name} ({i + 1})"
 
 
-def _array(group: zarr.Group, name: str, one: Variable, size: int, split: Split) -> None:
-    dtype = np.dtype(one.dtype)
+def _array(group: zarr.Group, name: str, variable: Variable, size: int, split: Split) -> None:
+    dtype = np.dtype(variable.dtype)
     group.create_array(
         name,
-        shape=(size, *one.shape),
-        chunks=(split.chunk, *one.shape),
+        shape=(size, *variable.shape),
+        # Zarr's chunks are those of the sweep: a chunk is written without reading what lies beside.
+        chunks=(split.chunk, *variable.shape),
         dtype=dtype,
         fill_value=_FILL[dtype.kind],
-        dimension_names=one.dims,
-        attributes=one.attributes,
+        dimension_names=variable.dims,
+        attributes=variable.attributes,
     )
 
 
 def _labels(
     group: zarr.Group, name: str, values: np.ndarray, attributes: dict[str, Any] | None = None
 ) -> None:
-    made = group.create_array(
+    labels = group.create_array(
         name,
         shape=values.shape,
         dtype=values.dtype if values.dtype.kind != "U" else str,
         dimension_names=(name,),
         attributes=attributes or {},
     )
-    made[:] = values
+    labels[:] = values
 
 
 def reopen(path: Path, job: Job, where: str) -> Store:
     """The store of the same sweep, to go on with.
+
+    Args:
+        path: of the store.
+        job: the sweep that goes on.
+        where: what a message begins with.
 
     Raises:
         InputError: it is no store of a sweep, or one of another sweep.
@@ -201,11 +223,12 @@ def reopen(path: Path, job: Job, where: str) -> Store:
         old = json.loads(store.attributes["description"])
     except (OSError, KeyError, ValueError, TypeError) as e:
         raise InputError(f"{where}: {path} is no store of a sweep ({e})") from e
-    wrong = differences(old, json.loads(json.dumps(described(job))))
-    if wrong:
-        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+    # Through JSON and back, as the stored one went: a tuple is a list there.
+    changes = differences(old, json.loads(json.dumps(described(job))))
+    if changes:
+        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
         raise InputError(
-            f"{where}: {path} is of another sweep: {wrong[0]}{more}; wanted is the same, or "
+            f"{where}: {path} is of another sweep: {changes[0]}{more}; expected the same, or "
             "another --out"
         )
     missing = sorted(variables(job).keys() - store.names)
@@ -214,9 +237,9 @@ def reopen(path: Path, job: Job, where: str) -> Store:
     return store
 
 
+# [bytes] of a file in a store: Zarr reads each as a whole.
 _LARGEST_METADATA = 10**8
 _LARGEST_CHUNK = 4 * 10**9
-"""bytes of a file in a store: Zarr reads each as a whole"""
 
 
 def require_files(directory: Path, where: str) -> None:
@@ -226,6 +249,7 @@ def require_files(directory: Path, where: str) -> None:
     Raises:
         InputError: naming the file.
     """
+    # Before the lock is taken: opening a pipe in its place would wait for ever.
     beside = (directory / ".lock", directory / "summary.json")
     for path in beside:
         if os.path.lexists(path):
@@ -238,6 +262,7 @@ def require_files(directory: Path, where: str) -> None:
         except OSError as e:
             raise InputError(f"{where}: {folder} is no store of a sweep ({e.strerror})") from e
         for entry in entries:
+            # Links to folders are not followed: one may lead back here, for ever.
             if entry.is_dir(follow_symlinks=False):
                 folders.append(Path(entry.path))
                 continue
@@ -259,13 +284,14 @@ def only_writer(directory: Path, where: str) -> Iterator[None]:
     Raises:
         InputError: another process holds it, or the directory cannot be written to.
     """
+    # Refused at once: the other process may go on for hours.
     lock = filelock.FileLock(directory / ".lock", timeout=0)
     with _words(where):
         try:
             lock.acquire()
         except filelock.Timeout:
             raise InputError(
-                f"{where}: another process is writing to it, wanted is only one"
+                f"{where}: another process is writing to it, expected only one"
             ) from None
     try:
         yield

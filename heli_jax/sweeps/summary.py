@@ -10,11 +10,11 @@ import xarray as xr
 
 from heli_jax import run_directory
 from heli_jax.sweeps.chunks import chunks_of
-from heli_jax.sweeps.program import MEANINGS, OK
+from heli_jax.sweeps.design_point import MEANINGS, OK
 from heli_jax.sweeps.spec import Job
 
-_WORST = 5
-_SMALL_IS_BAD = ("fit", "vaf")
+_WORST_COUNT = 5  # elements of each result: as many as the figure of them has dashes
+_SMALL_IS_BAD = ("fit", "vaf")  # 100 % and 1 are perfect, and there is no lower end
 
 
 def write_summary(
@@ -22,21 +22,35 @@ def write_summary(
 ) -> None:
     """Write summary.json, which appears whole or not at all.
 
+    Args:
+        path: of the file.
+        dataset: the finished sweep.
+        job: what was computed.
+        timing: what it took, as JSON has it.
+        where: what a message begins with.
+
     Raises:
         InputError: it cannot be written.
     """
-    found = summary(dataset, job, timing)
+    content = summary(dataset, job, timing)
     if not timing["computed_chunks"] and path.exists():
         # Resumed when it was finished: what it took stays.
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            found["timing"] = json.loads(path.read_text(encoding="utf-8"))["timing"]
-    text = json.dumps(found, indent=1, allow_nan=False)
+            content["timing"] = json.loads(path.read_text(encoding="utf-8"))["timing"]
+    # NaN is no JSON, though Python writes it: other programs could not read the file.
+    text = json.dumps(content, indent=1, allow_nan=False)
     with run_directory.whole_file(path, f"{where}: summary.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
-    """Counts by status, quantiles of every result over the elements that are ok, the worst."""
+    """Counts by status, quantiles of every result over the elements that are ok, the worst.
+
+    Args:
+        dataset: the finished sweep; read in pieces.
+        job: what was computed.
+        timing: what it took, as JSON has it.
+    """
     status = dataset["status"].to_numpy()
     fine = status == OK
     results = {
@@ -44,11 +58,11 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         for name in dataset.data_vars
         if not str(name).startswith("trajectory_")
     }
-    found = {
+    content = {
         "model": job.model.name,
         "elements": int(status.size),
         "status": {word: int(np.count_nonzero(status == k)) for k, word in MEANINGS.items()},
-        "axes": {n: found for n in job.design.names if (found := _ends(dataset[n]))},
+        "axes": {n: ends for n in job.design.names if (ends := _ends(dataset[n]))},
         "results": results,
         "worst": {name: _rows(dataset, job, name, k) for name, k in worst(dataset, job).items()},
         "split": dataset.attrs["split"],
@@ -58,8 +72,8 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "notes": dataset.attrs.get("notes", []),
     }
     if "float32_error" in dataset.attrs:
-        found["float32_error"] = dataset.attrs["float32_error"]
-    return found
+        content["float32_error"] = dataset.attrs["float32_error"]
+    return content
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -72,24 +86,29 @@ def _unit(variable: xr.DataArray) -> dict[str, str]:
 
 def _ends(variable: xr.DataArray) -> dict[str, Any]:
     """The least and the largest finite value; nothing where there is none."""
-    finite = [found for _, values in chunks_of(variable) if (found := _finite(values)).size]
-    if not finite:
+    parts = [part for _, values in chunks_of(variable) if (part := _finite(values)).size]
+    if not parts:
         return {}
-    ends = {"min": min(float(v.min()) for v in finite), "max": max(float(v.max()) for v in finite)}
+    ends = {"min": min(float(v.min()) for v in parts), "max": max(float(v.max()) for v in parts)}
     return {**ends, **_unit(variable)}
 
 
 def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
-    # The values are held once: the partition for the quantiles is made where they are.
+    """Of the finite values of the elements that are ok, and how many values are none.
+
+    Over flights and modes too, where a result has them.
+    """
+    # The values are held once: the partition for the quantiles is made where they are. A list of
+    # parts that are joined would take twice the memory, of a million elements that counts.
     values, n = np.empty(np.count_nonzero(fine) * (variable.size // max(1, fine.size))), 0
     infinite = nan = 0
-    for which, piece in chunks_of(variable):
-        used = piece[fine[which]]
+    for which, part in chunks_of(variable):
+        used = part[fine[which]]
         infinite += int(np.count_nonzero(np.isinf(used)))
         nan += int(np.count_nonzero(np.isnan(used)))
-        found = _finite(used)
-        values[n : n + found.size] = found
-        n += found.size
+        finite = _finite(used)
+        values[n : n + finite.size] = finite
+        n += finite.size
     others = {"infinite": infinite, "nan": nan}
     counts = {"n": n} | {k: v for k, v in others.items() if v}
     if not n:
@@ -99,30 +118,47 @@ def _quantiles(variable: xr.DataArray, fine: np.ndarray) -> dict[str, Any]:
     return {**_unit(variable), **counts, **dict(zip(names, map(float, q), strict=True))}
 
 
-def worst(dataset: xr.Dataset, job: Job, count: int = _WORST) -> dict[str, np.ndarray]:
-    """By result, the elements that are ok and worst in it: the largest, or for what agrees with a
-    flight the smallest; of several flights the worst one counts."""
+def worst(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, np.ndarray]:
+    """By result, the elements that are ok and worst in it, worst first: the largest, or for what
+    agrees with a flight the smallest; of several flights the worst one counts.
+
+    Args:
+        dataset: the finished sweep; read in pieces.
+        job: what was computed.
+        count: elements of each result at most.
+    """
     fine = dataset["status"].to_numpy() == OK
-    found = {}
-    for name, one in job.reduce.items():
+    by_result = {}
+    for name, reduce in job.reduce.items():
+        # Modes, margins and functions of several numbers have no variable of their own name, and
+        # which of theirs should be small is not known.
         if name not in dataset.data_vars:
             continue
-        badness, element = np.empty(0), np.empty(0, np.int64)
-        for which, piece in chunks_of(dataset[name]):
-            values = piece.astype(np.float64)
-            bad = -values if one.how in _SMALL_IS_BAD else np.abs(values)
-            bad = bad.reshape(len(values), -1).max(axis=1)
-            usable = np.flatnonzero(fine[which] & np.isfinite(bad))
-            most = min(count, usable.size)
-            top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
-            badness = np.concatenate([badness, bad[top]])
-            element = np.concatenate([element, top + which.start])
-        if element.size:
-            found[name] = element[np.lexsort((element, -badness))[:count]]
-    return found
+        elements = _worst(dataset[name], fine, reduce.how in _SMALL_IS_BAD, count)
+        if elements.size:
+            by_result[name] = elements
+    return by_result
+
+
+def _worst(variable: xr.DataArray, fine: np.ndarray, small_is_bad: bool, count: int) -> np.ndarray:
+    """The elements that are fine and worst in a variable, worst first, (count,) or fewer."""
+    badness, element = np.empty(0), np.empty(0, np.int64)
+    for which, part in chunks_of(variable):
+        values = part.astype(np.float64)  # a bool or an integer has no minus
+        bad = -values if small_is_bad else np.abs(values)
+        bad = bad.reshape(len(values), -1).max(axis=1)
+        usable = np.flatnonzero(fine[which] & np.isfinite(bad))
+        most = min(count, usable.size)
+        # Of each part the worst few, and of those the worst: all are never sorted, nor held.
+        top = usable[np.argpartition(bad[usable], -most)[-most:]] if most else usable
+        badness = np.concatenate([badness, bad[top]])
+        element = np.concatenate([element, top + which.start])
+    # Equal ones by their place, so that the order does not depend on how it was read.
+    return element[np.lexsort((element, -badness))[:count]]
 
 
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
+    """Elements with their value of a result and their axes, as JSON has it."""
     few = dataset.isel(element=elements)
     values = few[name].transpose("element", ...).to_numpy().tolist()
     axes = {n: few[n].to_numpy().astype(np.float64) for n in job.design.names}

@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,26 +12,26 @@ from heli_jax import naming
 from heli_jax.analysis.margins import margins
 from heli_jax.sweeps import reducers
 from heli_jax.sweeps.design import log_axes
-from heli_jax.sweeps.program import (
-    DIVERGED,
-    MEANINGS,
-    OUT_OF_RANGE,
-    Found,
-    Program,
-    arguments,
-    shapes,
-)
+from heli_jax.sweeps.design_point import DIVERGED, MEANINGS, OUT_OF_RANGE, ElementResults
+from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job, axis_unit
 from heli_jax.vehicle import of_helicopter, possible
 
+# Blocks that a device has at least, unless it is alone: XLA writes other code for one block than
+# for several, and how many devices there are shall change no digit.
 BLOCKS = 2
-"""Blocks that a device has at least, unless it is alone: XLA writes other code for one block than
-for several, and how many devices there are shall change no digit."""
 
-
+# Of a result, which is a folder of the store: no path, nothing hidden, and nothing that Zarr keeps
+# for itself.
 _NAME = re.compile(r"(?!\.|__)[^/\\\x00-\x1f]+")
-"""of a result: it is a folder of the store"""
+# Dimensions, which xarray would take the result for, and Zarr's own file.
 _TAKEN = ("element", "flight", "time", "mode", "zarr.json")
+# Of the status, as the CF conventions name them: xarray and others decode the words.
+_FLAGS = {
+    "flag_values": list(MEANINGS),
+    "flag_meanings": " ".join(MEANINGS.values()),
+    "long_name": "what became of the element",
+}
 
 
 class Variable(NamedTuple):
@@ -61,73 +61,89 @@ class Split(NamedTuple):
 
 
 def variables(job: Job) -> dict[str, Variable]:
-    """The variables of the job's store, without the coordinates of their other dimensions."""
-    found: dict[str, Variable] = {}
+    """The variables of the job's store, without the coordinates of their other dimensions.
+
+    Raises:
+        ValueError: a result that is no number, or a name that a store cannot have.
+    """
+    laid_out: dict[str, Variable] = {}
     for name, column in job.design.values(0, 1).items():
         kind = "int64" if column.dtype.kind in "iu" else "float64"
-        found[name] = Variable(("element",), (), kind, _axis_words(job, name), True)
-    flags = {
-        "flag_values": list(MEANINGS),
-        "flag_meanings": " ".join(MEANINGS.values()),
-        "long_name": "what became of the element",
-    }
-    found["status"] = Variable(("element",), (), "uint8", flags)
-    shape, several = shapes(job, 0), len(job.flights) > 1
-    more = (("flight", len(job.flights)),) if several else ()
-
-    def add(name: str, dims: tuple[tuple[str, int], ...], kind: str, words: dict[str, Any]) -> None:
-        dims = (*more, *dims)
-        if not _NAME.fullmatch(name) or name in _TAKEN:
-            raise ValueError(
-                f"reduce: a result would be called {name!r}, wanted is another name: not "
-                f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
-            )
-        if name in found:
-            raise ValueError(f"reduce: two results or axes would be called {name!r}")
-        found[name] = Variable(
+        laid_out[name] = Variable(("element",), (), kind, _axis_words(job, name), True)
+    laid_out["status"] = Variable(("element",), (), "uint8", dict(_FLAGS))
+    flights = (("flight", len(job.flights)),) if len(job.flights) > 1 else ()
+    for name, (dims, kind, words) in _result_variables(job):
+        dims = (*flights, *dims)
+        _check_name(name, laid_out)
+        laid_out[name] = Variable(
             ("element", *(d for d, _ in dims)), tuple(k for _, k in dims), kind, words
         )
+    return laid_out
 
-    order = list(job.reduce)
-    for name, one in sorted(shape.results.items(), key=lambda r: _place(r[0], order)):
-        if one.shape:
+
+def _check_name(name: str, laid_out: Mapping[str, Variable]) -> None:
+    """Refuse a name that a store cannot have, or has already."""
+    if not _NAME.fullmatch(name) or name in _TAKEN:
+        raise ValueError(
+            f"reduce: a result would be called {name!r}, expected another name: not "
+            f"{', '.join(_TAKEN)}, no slash, no '.' or '__' at its beginning"
+        )
+    if name in laid_out:
+        raise ValueError(f"reduce: two results or axes would be called {name!r}")
+
+
+_Sized = tuple[tuple[tuple[str, int], ...], str, dict[str, Any]]
+"""dimensions with their lengths, beyond elements and flights; data type; attributes"""
+
+
+def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
+    """By name, the variables of results and trajectories of one flight, in the order asked for."""
+    # All flights give the same ones; where lengths differ trajectories are refused before.
+    shape, order = shapes(job, 0), list(job.reduce)
+    # JAX sorts dictionaries by key, so the order of the results has to be found again.
+    for name, result in sorted(shape.results.items(), key=lambda r: _place(r[0], order)):
+        if result.shape:
             raise ValueError(
-                f"reduce.{name}: the result has shape {one.shape}, wanted is one number"
+                f"reduce.{name}: the result has shape {result.shape}, expected one number"
             )
-        add(name, (), job.precision, _result_words(job, name))
-    for name in job.reduce:
-        if job.reduce[name].how == "modes":
+        yield name, ((), job.precision, _result_words(job, name))
+    for name, reduce in job.reduce.items():
+        if reduce.how == "modes":
             n = len(naming.names(job.model.State))
             for part in ("real", "imag"):
                 words = {"units": "1/s", "long_name": f"eigenvalues, {part} part, slowest first"}
-                add(f"{name}_{part}", (("mode", n),), "float64", words)
-        elif job.reduce[name].how == "margins":
-            of = f"{job.reduce[name].signal} to {job.reduce[name].input}"
-            add(f"{name}_gain", (), "float64", {"units": "dB", "long_name": f"gain margin, {of}"})
-            add(f"{name}_phase", (), "float64", {"units": "deg", "long_name": f"phase, {of}"})
-            words = {"long_name": f"whether the loop {of} is stable", "flag_values": [0, 1]}
-            add(f"{name}_stable", (), "uint8", words | {"flag_meanings": "unstable stable"})
-    for name, one in shape.trajectories.items():
-        words = _words(
-            naming.unit(job.model.Outputs, name), naming.meaning(job.model.Outputs, name)
-        )
-        add(f"trajectory_{name}", (("time", one.shape[0]),), job.precision, words)
-    return found
+                yield f"{name}_{part}", ((("mode", n),), "float64", words)
+        elif reduce.how == "margins":
+            yield from _margin_variables(name, f"{reduce.signal} to {reduce.input}")
+    outputs = job.model.Outputs
+    for name, kept in shape.trajectories.items():
+        words = _words(naming.unit(outputs, name), naming.meaning(outputs, name))
+        yield f"trajectory_{name}", ((("time", kept.shape[0]),), job.precision, words)
+
+
+def _margin_variables(name: str, loop: str) -> Iterator[tuple[str, _Sized]]:
+    yield f"{name}_gain", ((), "float64", _words("dB", f"gain margin, {loop}"))
+    yield f"{name}_phase", ((), "float64", _words("deg", f"phase, {loop}"))
+    words = {"long_name": f"whether the loop {loop} is stable", "flag_values": [0, 1]}
+    yield f"{name}_stable", ((), "uint8", words | {"flag_meanings": "unstable stable"})
 
 
 def _place(name: str, order: list[str]) -> int:
     """Where a result stands: with the reducer that it is of, named alike or before a key."""
+    # A function of several numbers gives NAME_KEY.
     if name in order:
         return order.index(name)
     return next((i for i, n in enumerate(order) if name.startswith(f"{n}_")), len(order))
 
 
 def _words(unit: str | None, meaning: str) -> dict[str, Any]:
+    """Attributes as the CF conventions name them, which xarray labels its plots by."""
     words = {"units": unit} if unit is not None else {}
     return words | ({"long_name": meaning} if meaning else {})
 
 
 def _axis_words(job: Job, name: str) -> dict[str, Any]:
+    """Unit and meaning of an axis, and whether it is even in the logarithm."""
     kind, _, of = name.partition(".")
     if name in naming.names(job.model.Params):
         meaning = naming.meaning(job.model.Params, name)
@@ -144,14 +160,15 @@ def _axis_words(job: Job, name: str) -> dict[str, Any]:
 
 
 def _result_words(job: Job, name: str) -> dict[str, Any]:
-    one = job.reduce.get(name)
-    stream = None if one is None else reducers.streaming(one)
-    if one is None or not isinstance(one.how, str) or one.signal is None or stream is None:
+    """Unit and meaning of a result, as far as they are known: not of a function of the user's."""
+    reduce = job.reduce.get(name)
+    stream = None if reduce is None else reducers.streaming(reduce)
+    if reduce is None or not isinstance(reduce.how, str) or reduce.signal is None or stream is None:
         return {} if stream is None or stream.unit is None else {"units": stream.unit}
     unit = stream.unit
     if unit is None:
-        unit = naming.unit(job.model.Outputs, one.signal)
-    return _words(unit, f"{one.how} of {one.signal}")
+        unit = naming.unit(job.model.Outputs, reduce.signal)
+    return _words(unit, f"{reduce.how} of {reduce.signal}")
 
 
 class Pending(NamedTuple):
@@ -160,7 +177,9 @@ class Pending(NamedTuple):
     start: int
     stop: int
     columns: dict[str, np.ndarray]
-    found: tuple[Found, ...]
+    """values of the axes, (stop - start,)"""
+    by_flight: tuple[ElementResults, ...]
+    """of arrays with the filled chunk's size, which JAX may still be computing"""
 
 
 class Worker:
@@ -169,6 +188,7 @@ class Worker:
     def __init__(self, job: Job, split: Split, devices: Sequence[Any] | None = None) -> None:
         self.job, self.split = job, split
         devices = jax.local_devices() if devices is None else devices
+        # Fewer where a chunk has no BLOCKS blocks for each: the others would compute copies.
         used = max(1, min(len(devices), split.chunk // (BLOCKS * split.lanes)))
         self.devices = tuple(devices[:used])
         self._programs = [
@@ -177,6 +197,7 @@ class Worker:
 
     def begin(self, chunk: int) -> Pending:
         """Set the devices to work on a chunk; `finish` waits for it."""
+        # Axes stay in float64 for the store, whatever the sweep's precision.
         start = chunk * self.split.chunk
         stop = min(start + self.split.chunk, self.job.design.size)
         columns = self.job.design.values(start, stop)
@@ -188,44 +209,45 @@ class Worker:
     def finish(self, pending: Pending) -> dict[str, np.ndarray]:
         """The chunk's variables, arrays (stop - start, ...)."""
         count = pending.stop - pending.start
-        found = jax.tree.map(lambda v: np.asarray(v)[:count], pending.found)
-        parts = [self._results(one) for one in found]
+        # Without the elements that the last chunk was filled up with.
+        by_flight = jax.tree.map(lambda v: np.asarray(v)[:count], pending.by_flight)
+        parts = [self._results(computed) for computed in by_flight]
         results = parts[0]
         if len(parts) > 1:
             results = {n: np.stack([p[n] for p in parts], axis=1) for n in results}
-        status = functools.reduce(_worst, [one.status for one in found])
         impossible = self._impossible(pending.columns)
-        finite = [np.isfinite(v) for v in pending.columns.values()]
-        status = np.where(impossible, OUT_OF_RANGE, status)
-        status = np.where(functools.reduce(np.logical_and, finite), status, DIVERGED)
+        status = _status(by_flight, pending.columns, impossible)
         # What a run that diverged or a vehicle that cannot be left behind is no result.
         lost = impossible | (status == DIVERGED)
-        names = (*found[0].results, *(f"trajectory_{n}" for n in found[0].trajectories))
+        # Modes and margins stay: they are of where the run begins, and NaN if that is.
+        first = by_flight[0]
+        names = (*first.results, *(f"trajectory_{n}" for n in first.trajectories))
         for name in names if lost.any() else ():
             results[name] = _blanked(results[name], lost)
         columns = {
             n: v if v.dtype.kind in "iu" else v.astype(np.float64)
             for n, v in pending.columns.items()
         }
-        return {**columns, **results, "status": status.astype(np.uint8)}
+        return {**columns, **results, "status": status}
 
     def run(self, chunk: int) -> dict[str, np.ndarray]:
         """A chunk from beginning to end."""
         return self.finish(self.begin(chunk))
 
-    def _results(self, found: Found) -> dict[str, np.ndarray]:
-        results = dict(found.results)
-        results |= {f"trajectory_{n}": v for n, v in found.trajectories.items()}
+    def _results(self, computed: ElementResults) -> dict[str, np.ndarray]:
+        """The variables of one flight's results, (elements, ...)."""
+        results = dict(computed.results)
+        results |= {f"trajectory_{n}": v for n, v in computed.trajectories.items()}
         model = self.job.model
-        for name, one in self.job.reduce.items():
-            if one.how == "modes":
-                values: Any = _eigenvalues(np.asarray(found.matrices.A, np.float64))
+        for name, reduce in self.job.reduce.items():
+            if reduce.how == "modes":
+                values: Any = _eigenvalues(np.asarray(computed.matrices.A, np.float64))
                 results[f"{name}_real"], results[f"{name}_imag"] = values.real, values.imag
-            elif one.how == "margins":
-                i = naming.names(model.Outputs).index(str(one.signal))
-                j = naming.names(model.Inputs).index(str(one.input))
-                A, B, C, D = (np.asarray(M, np.float64) for M in found.matrices)
-                loop = margins(A, B[:, :, j], C[:, i], D[:, i, j], one.gain)
+            elif reduce.how == "margins":
+                i = naming.names(model.Outputs).index(str(reduce.signal))
+                j = naming.names(model.Inputs).index(str(reduce.input))
+                A, B, C, D = (np.asarray(M, np.float64) for M in computed.matrices)
+                loop = margins(A, B[:, :, j], C[:, i], D[:, i, j], reduce.gain)
                 results[f"{name}_gain"], results[f"{name}_phase"] = loop.gain, loop.phase
                 results[f"{name}_stable"] = loop.stable.astype(np.uint8)
         return results
@@ -241,19 +263,34 @@ class Worker:
         return ~np.broadcast_to(possible({**both, **swept}), count)
 
 
+def _status(
+    by_flight: Sequence[ElementResults], columns: dict[str, np.ndarray], impossible: np.ndarray
+) -> np.ndarray:
+    """The status (elements,) of a chunk's elements over all flights."""
+    status = functools.reduce(_worst, [computed.status for computed in by_flight])
+    finite = functools.reduce(np.logical_and, [np.isfinite(v) for v in columns.values()])
+    # A vehicle that cannot be is out of range even where its run diverged: that is why it did. An
+    # axis that is no number says nothing of the vehicle, and goes before.
+    status = np.where(impossible, OUT_OF_RANGE, status)
+    return np.where(finite, status, DIVERGED).astype(np.uint8)
+
+
 def _worst(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Diverged before out of range before ok."""
+    # By hand, since diverged is the lesser number of the two.
     both = (a == DIVERGED) | (b == DIVERGED)
     return np.where(both, DIVERGED, np.maximum(a, b)).astype(np.uint8)
 
 
 def _blanked(values: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Values (elements, ...) with NaN for some elements (elements,)."""
     lost = lost.reshape(-1, *(1,) * (values.ndim - 1))
     return np.where(lost, np.asarray(np.nan, values.dtype), values)
 
 
 def _eigenvalues(A: np.ndarray) -> np.ndarray:
     """(k, n), slowest first, the lower one of a pair first; NaN where A is not finite."""
+    # NumPy raises where one matrix has NaN, and then no element of the chunk had eigenvalues.
     finite = np.all(np.isfinite(A), axis=(1, 2))
     values = np.linalg.eigvals(np.where(finite[:, None, None], A, 0.0)).astype(np.complex128)
     order = np.lexsort((values.imag, np.abs(values)), axis=1)

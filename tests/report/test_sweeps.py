@@ -245,6 +245,21 @@ def test_wide_axes_of_one_sign_are_logarithmic(low, high, scale):
     assert steps == pytest.approx(np.full(steps.size, steps[0]))
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("low", "high"), [(2.1e-5, 4.9e-5), (0.021, 0.049), (1.0, 1e9)])
+def test_logarithmic_axes_have_different_labels_however_narrow(low, high, sign):
+    ds = dataset({"x": sign * np.geomspace(low, high, 50)}, {"misfit": np.linspace(0.0, 1.0, 50)})
+    ds["x"].attrs["scale"] = "log"
+    figure = sweeps.slices(ds, "misfit")
+    figure.draw_without_rendering()
+    [ax] = figure.axes
+    assert ax.get_xscale() == ("log" if sign > 0 else "symlog")
+    ticks, labels = ax.get_xticks(), [t.get_text() for t in ax.get_xticklabels()]
+    assert 3 <= len(set(labels)) == len(ticks) <= 20
+    left, right = ax.get_xlim()
+    assert all(left <= v <= right for v in ticks)
+
+
 def test_single_elements_do_not_press_the_others_flat():
     rng = np.random.default_rng(2)
     y = rng.standard_normal(2000)

@@ -1,6 +1,7 @@
 """heli-jax sweep: from a configuration to a directory, and what is refused in words."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -116,6 +117,18 @@ def test_a_seed_and_a_function_of_ones_own(write, tmp_path):
     assert found["seed"].dtype == np.int64
 
 
+def test_the_python_of_the_documentation_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    page = (ROOT / "docs" / "sweeps.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    for block in blocks:
+        exec(block.replace('"DIR', f'"{tmp_path}/out'), names)
+    assert len(blocks) == 2
+    assert names["ds"].sizes["element"] == 128
+    assert not names["ds"]["status"].any()
+
+
 WRONG = {
     "no sweep": (lambda c: c.pop("sweep"), ["sweep: missing"]),
     "no inputs": (lambda c: c.pop("simulate"), ["sweep: no inputs"]),
@@ -217,7 +230,7 @@ WRONG = {
         lambda c: c["sweep"]["axes"]["Ixx"].update(unit="m"), ["axes.Ixx.unit"],
     ),
     "a seed without disturbance": (
-        lambda c: c["sweep"].update(axes={"seed": {"values": [1]}}), ["wanted is a disturbance"],
+        lambda c: c["sweep"].update(axes={"seed": {"values": [1]}}), ["expected a disturbance"],
     ),
     "an unknown solver": (lambda c: c["sweep"].update(solver="Tsit6"), ["solver", "Tsit5"]),
     "an abstract solver": (
@@ -229,7 +242,7 @@ WRONG = {
     "trim of a roll model": (
         lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
     ),
-    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk is 0"]),
+    "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk must be at least 1"]),
     "margins without input": (
         lambda c: c["sweep"]["reduce"].update(m={"how": "margins", "signal": "roll"}),
         ["m.input: missing"],
@@ -255,7 +268,7 @@ def test_seeds_that_are_no_whole_numbers_are_refused(design, axis, write, tmp_pa
     more = {"n": 4} if design == "sobol" else {}
     config = content(design=design, axes={"seed": axis}, **more) | DRAWN
     assert cli.main(["sweep", str(write(config)), "--out", str(tmp_path / "out")]) == 2
-    assert "axes.seed: wanted are whole numbers from 0 to 2^32 - 1" in capsys.readouterr().err
+    assert "axes.seed: expected whole numbers from 0 to 2^32 - 1, got" in capsys.readouterr().err
 
 
 def test_seeds_from_a_range_are_exact(write, tmp_path):
@@ -302,11 +315,11 @@ OWN = {
     "a branch": ("1.0 if run.outputs.roll[0] > 0 else 2.0", "TracerBoolConversionError"),
     "no such output": ("run.outputs.rol", "no attribute 'rol'"),
     "nothing": ("None", "None is not a valid value"),
-    "complex": ("run.outputs.roll[0].astype(complex)", "wanted is a real number"),
+    "complex": ("run.outputs.roll[0].astype(complex)", "expected a real number"),
     "a text": ("'hello'", "TypeError"),
     "its own error": ("1 / 0", "ZeroDivisionError: division by zero"),
-    "an array": ("run.outputs.roll", "has shape (50,), wanted is one number"),
-    "a name that is none": ("{'a/b': 1.0}", "'own_a/b', wanted is another name"),
+    "an array": ("run.outputs.roll", "has shape (50,), expected one number"),
+    "a name that is none": ("{'a/b': 1.0}", "'own_a/b', expected another name"),
 }
 
 

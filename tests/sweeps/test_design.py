@@ -11,6 +11,7 @@ from hypothesis import given
 
 from heli_jax import sweeps
 from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
+from heli_jax.sweeps.axes import whole_seeds
 
 AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
 
@@ -117,7 +118,7 @@ def test_descriptions_tell_designs_apart():
         (lambda: sobol({}, 3), "none given"),
         (lambda: grid({"a": []}), "axes.a: no values"),
         (lambda: table({"a": np.array([])}), "axes.a: no values"),
-        (lambda: grid({"a": ["x"]}), "wanted are numbers"),
+        (lambda: grid({"a": ["x"]}), "expected numbers"),
         (lambda: grid({"a": Range(1.0, 2.0)}), "at least 2 points"),
         (lambda: grid({"a": Range(1.0, 2.0, n=1)}), "at least 2 points"),
         (lambda: grid({"a": Range(2.0, 1.0, n=3)}), "lower < upper"),
@@ -126,7 +127,7 @@ def test_descriptions_tell_designs_apart():
         (lambda: lhs({"a": Range(1.0, np.inf)}, 3), "lower < upper"),
         (lambda: lhs({"a": Range(1.0, 2.0, "cubic")}, 3), "linear or log"),
         (lambda: lhs({"a": [1.0, 2.0]}, 3), "lower and upper"),
-        (lambda: sobol(AXES, 0), "n is 0"),
+        (lambda: sobol(AXES, 0), "n must be at least 1, got 0"),
         (lambda: paired({"a": [1.0, 2.0], "Ixx": [1.0]}), "a has 2, Ixx has 1"),
         (lambda: table({"a": np.ones(2), "Ixx": np.ones(3)}), "differ in length"),
         (lambda: zipped(lhs(AXES, 3), paired({"B": [1.0, 2.0]})), "3 and 2 elements"),
@@ -138,6 +139,15 @@ def test_descriptions_tell_designs_apart():
 def test_what_cannot_be_a_design_is_refused_in_words(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_messages_say_what_was_expected_and_what_was_got():
+    with pytest.raises(ValueError, match=r"axes.a.n: expected at least 2 points, got 1"):
+        grid({"a": Range(1.0, 2.0, n=1)})
+    with pytest.raises(ValueError, match=r"axes.a: expected finite lower < upper, got 2 and 1"):
+        lhs({"a": Range(2.0, 1.0)}, 3)
+    with pytest.raises(ValueError, match=r"axes.seed: expected whole numbers .* got 6.5"):
+        whole_seeds(np.array([1.0, 6.5]))
 
 
 @pytest.mark.parametrize(("old", "new"), [("Between", "Range"), ("listed", "paired")])

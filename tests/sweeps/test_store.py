@@ -195,8 +195,8 @@ def test_resuming_what_never_began_begins_it(run, whole, tmp_path):
         ({"reduce": {"rms": Reduce("rms", "roll")}}, "reduce.fit"),
         ({"solver": "rk4"}, "solver was exact and is rk4"),
         ({"precision": "float32"}, "precision was float64 and is float32"),
-        ({"chunk": 64}, "chunk 32, found 64"),
-        ({"lanes": 64}, "lanes 16, found 64"),
+        ({"chunk": 64}, "chunk 32, expected the same, got 64"),
+        ({"lanes": 64}, "lanes 16, expected the same, got 64"),
     ],
 )  # fmt: skip
 def test_the_store_of_another_sweep_is_refused(run, whole, changed, words):

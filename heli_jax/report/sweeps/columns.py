@@ -5,27 +5,31 @@ A place is a value as it lies on the paper: its logarithm where the scale is log
 
 import functools
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from heli_jax.sweeps.chunks import chunks_of
 
+# Factor over which numbers of one sign are drawn logarithmically: on a linear scale the lower half
+# of that range, in decades, would lie within a sixth of the panel.
 WIDE = 30.0
-"""factor over which numbers of one sign are drawn logarithmically"""
+# Elements that are ok and drawn at most, and of the others half as many: more change no quantile
+# that the eye could see, and memory shall not grow with the sweep.
 DRAWN = 1 << 18
-"""elements that are ok and drawn at most, and of the others half as many"""
+# Elements that are marked in a panel at most.
 MARKS = 300
-"""elements that are marked in a panel at most"""
+# The status of an element that counts; that of heli_jax.sweeps, whose import takes JAX.
 _OK = 0
-"""the status of an element that counts"""
+# Distinct values that are cells of their own: even ones would leave gaps between so many.
 _FEW_CELLS = 40
-"""distinct values that are cells of their own: even ones would leave gaps between so many"""
 
 
 class Column:
-    """An axis or a result: a number (n,) for each element drawn, NaN where it is not finite."""
+    """An axis or a result: a number (n,) for each element drawn, NaN where it is not finite.
+
+    `alone` says that it is the only axis of the sweep.
+    """
 
     def __init__(
         self, variable: xr.DataArray, elements: np.ndarray, ok: np.ndarray, *, axis: bool,
@@ -35,6 +39,7 @@ class Column:
         unit = variable.attrs.get("units")
         self.unit = None if unit is None else str(unit)
         self.flights = variable.sizes.get("flight", 0)
+        # The mean over flights of whole numbers is none.
         self.whole = variable.dtype.kind in "biu" and not self.flights
         self.values = _numbers(variable, elements)
         self.finite = np.isfinite(self.values)
@@ -42,10 +47,12 @@ class Column:
         self.axis = axis
         self._declared_log = axis and variable.attrs.get("scale") == "log"
         self._alone = alone
+        # An axis shows where elements failed, too; of a result the failed have no value.
         self._seen = self.finite if axis else self.used
         self._cells: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def title(self) -> str:
+        """Its name, and of what it is the mean."""
         if self.flights:
             return f"{self.name}, mean over {self.flights} flights"
         return self.name
@@ -53,6 +60,7 @@ class Column:
     @functools.cached_property
     def _order(self) -> np.ndarray:
         """Elements that set the scale, by value."""
+        # Sorted once for all panels: quantiles, medians of cells and distinct values come of it.
         order = np.argsort(self.values)
         return order[self._seen[order]]
 
@@ -63,6 +71,7 @@ class Column:
 
     @functools.cached_property
     def empty(self) -> bool:
+        """Whether it has no finite value."""
         return not self._seen.any()
 
     @functools.cached_property
@@ -75,9 +84,11 @@ class Column:
         """The distinct values of an axis, or of whole numbers, if there are few for so many
         elements."""
         k = self.distinct.size
+        # A sample of a continuous axis has few values where it has few elements: each must come
+        # twice to be a value that was chosen. A single axis is taken at its word.
         often = 2 * k <= self._order.size or self._alone
-        found = (self.axis or self.whole) and k <= most and often
-        return self.distinct if found or k == 1 else None
+        discrete = (self.axis or self.whole) and k <= most and often
+        return self.distinct if discrete or k == 1 else None
 
     def _at(self, share: float) -> float:
         """The value that a share of the elements is below."""
@@ -96,32 +107,36 @@ class Column:
 
     @functools.cached_property
     def sign(self) -> float:
+        """Of all its values, where it is drawn logarithmically."""
         return -1.0 if self._at(1.0) < 0.0 else 1.0
 
-    def bent(self, values: Any) -> Any:
+    def transform(self, values: np.ndarray | float) -> np.ndarray:
         """The places of values."""
+        # Ascending for negative numbers too, as matplotlib's symlog has them.
         return self.sign * np.log10(np.abs(values)) if self.log else np.asarray(values, float)
 
-    def unbent(self, places: Any) -> Any:
+    def inverse(self, places: np.ndarray | float) -> np.ndarray:
         """The values at places."""
-        return self.sign * 10.0 ** (self.sign * np.asarray(places)) if self.log else places
+        places = np.asarray(places)
+        return self.sign * 10.0 ** (self.sign * places) if self.log else places
 
     @functools.cached_property
     def _places(self) -> np.ndarray:
         with np.errstate(invalid="ignore", divide="ignore"):
-            return self.bent(self.values)
+            return self.transform(self.values)
 
     @functools.cached_property
     def _range(self) -> tuple[float, float]:
-        return float(self.bent(self._at(0.0))), float(self.bent(self._at(1.0)))
+        return float(self.transform(self._at(0.0))), float(self.transform(self._at(1.0)))
 
     @functools.cached_property
     def view(self) -> tuple[float, float]:
         """From the least to the largest place drawn: all of an axis, and of a result without
         single elements that would press the others flat."""
         low, high = self._range
-        inner = [float(self.bent(self._at(q))) for q in (0.01, 0.99)]
+        inner = [float(self.transform(self._at(q))) for q in (0.01, 0.99)]
         bulk = inner[1] - inner[0]
+        # Only where they press hard: most results have tails that belong in the picture.
         if not self.axis and 0.0 < 4.0 * bulk < high - low:
             low, high = max(low, inner[0] - 0.3 * bulk), min(high, inner[1] + 0.3 * bulk)
         return widened(low, high)
@@ -137,17 +152,19 @@ class Column:
         There are k even cells, or one for each of few values.
         """
         if k not in self._cells:
-            own = self.few(_FEW_CELLS)
-            if own is None:
+            values = self.few(_FEW_CELLS)
+            if values is None:
                 low, high = self.view
                 edges = np.linspace(low, high, k + 1)
                 with np.errstate(invalid="ignore"):
+                    # Even cells need no search among the edges. With some slack, or rounding would
+                    # put the ends of the view outside.
                     scaled = (self._places - low) * (k / (high - low))
                     inside = (scaled >= -1e-9) & (scaled <= k + 1e-9) & self.finite
                 which = np.where(inside, scaled, 0.0).astype(np.int16).clip(0, k - 1)
             else:
-                edges, inside = _around(self.bent(own), self.view), self.finite
-                which = np.searchsorted(0.5 * (own[1:] + own[:-1]), self.values)
+                edges, inside = _around(self.transform(values), self.view), self.finite
+                which = np.searchsorted(0.5 * (values[1:] + values[:-1]), self.values)
             self._cells[k] = edges, np.where(inside, which, -1).astype(np.int16)
         return self._cells[k]
 
@@ -173,6 +190,7 @@ class Table:
         self._columns: dict[str, Column] = {}
 
     def column(self, name: str) -> Column:
+        """An axis or a result, read when it is first asked for."""
         if name not in self._columns:
             axis, alone = name in self._axes, len(self._axes) == 1
             self._columns[name] = Column(
@@ -195,7 +213,7 @@ class Table:
         return np.searchsorted(self.elements, elements)
 
     def failed(self, *columns: Column, most: int = MARKS) -> np.ndarray:
-        """Elements that are not ok where these are finite, so many at most."""
+        """Elements that are not ok where these columns are finite, so many at most."""
         where = ~self.ok
         for c in columns:
             where = where & c.finite
@@ -219,10 +237,11 @@ def widened(low: float, high: float) -> tuple[float, float]:
 
 
 def by_lot(elements: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the elements, drawn by lot: every k-th of a grid would show a few values
-    of an axis alone."""
+    """At most so many of the elements, drawn by lot."""
     if elements.size <= most:
         return elements
+    # Not every k-th: of a grid that would show a few values of an axis alone. The seed is always
+    # the same, so that a figure that is drawn again is the same.
     return elements[np.sort(np.random.default_rng(0).choice(elements.size, most, replace=False))]
 
 
@@ -249,19 +268,20 @@ def _numbers(variable: xr.DataArray, elements: np.ndarray) -> np.ndarray:
     Numbers that no picture can hold are taken as infinite, or as zero.
     """
     parts = []
-    for which, piece in chunks_of(variable):
+    for which, part in chunks_of(variable):
         first, last = np.searchsorted(elements, [which.start, which.stop])
-        parts.append(piece[elements[first:last] - which.start].astype(np.float64))
+        parts.append(part[elements[first:last] - which.start].astype(np.float64))
     values = np.concatenate(parts) if parts else np.empty(0)
     if values.ndim > 1:
         with np.errstate(invalid="ignore", over="ignore"):
             values = values.mean(axis=1)
+    # matplotlib multiplies and divides them, which near the ends of float64 makes infinities.
     sizes = np.abs(values)
     return np.where(sizes < 1e100, np.where(sizes > 1e-100, values, 0.0), np.nan)
 
 
 def _around(places: np.ndarray, view: tuple[float, float]) -> np.ndarray:
-    """Edges of cells around places."""
+    """Edges (k + 1,) of cells around places (k,), ascending."""
     if places.size == 1:
         return np.asarray(view)
     between = 0.5 * (places[1:] + places[:-1])

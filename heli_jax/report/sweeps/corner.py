@@ -23,11 +23,9 @@ from heli_jax.report.sweeps.panels import (
 )
 from heli_jax.report.sweeps.scales import named, scale, short
 
-_VARIABLES = 7
-"""rows at most"""
-_BARS = 30
-"""bars of a histogram, and cells along an axis, at most"""
-_MARKS = MARKS // 2
+_VARIABLES = 7  # rows at most: more leave no room for a label
+_BARS = 30  # bars of a histogram, and cells along an axis, at most
+_MARKS = MARKS // 2  # the panels are smaller than those of other figures
 _COLOURS = "Blues"
 
 
@@ -40,6 +38,7 @@ def draw_corner(table: Table) -> Figure | None:
     """`corner` of a table, which the figures of a sweep share."""
     considered = [table.column(r) for r in table.results[:_VARIABLES]]
     results = [c for c in considered if not c.empty]
+    # Four axes in any case: without them the results are seen, but not what they come from.
     axes = table.axes[: max(4, _VARIABLES - len(results))]
     if not axes:
         return None
@@ -49,8 +48,9 @@ def draw_corner(table: Table) -> Figure | None:
     width = (style.WIDTH - left - 0.2 - (n - 1) * gap) / n
     size = width, min(width, 2.2)
     cells = [row * n + column for row in range(n) for column in range(row + 1)]
-    made, panels = laid_out(cells, n, size, gap=(gap, gap), left=left, bottom=0.88)
+    figure, panels = laid_out(cells, n, size, gap=(gap, gap), left=left, bottom=0.88)
     drawn = np.count_nonzero(table.ok)
+    # Rice's rule; and about ten elements a cell, or a density is mostly empty.
     bars = int(np.clip(2.0 * drawn ** (1.0 / 3.0), 4, _BARS))
     dense = int(np.clip(math.sqrt(drawn / 10), 4, _BARS))
     for ax, cell in zip(panels, cells, strict=True):
@@ -71,8 +71,8 @@ def draw_corner(table: Table) -> Figure | None:
             ax.tick_params(axis="y", labelleft=column == 0)
             _density(ax, x, y, dense)
             if x.axis and y.axis:
-                lost = table.failed(x, y, most=_MARKS)
-                crosses(ax, x.values[lost], y.values[lost], ms=2.5, alpha=0.6)
+                failed = table.failed(x, y, most=_MARKS)
+                crosses(ax, x.values[failed], y.values[failed], ms=2.5, alpha=0.6)
         ax.tick_params(labelsize=7.0)
     empty = [c for c in considered if c.empty]
     there = len(table.axes) + len(table.results) - len(empty)
@@ -84,14 +84,15 @@ def draw_corner(table: Table) -> Figure | None:
         *([without] if empty and table.n_ok else []),
         *first(n, there, "variables"),
     ])  # fmt: skip
-    return made
+    return figure
 
 
 def _histogram(ax: Axes, x: Column, bars: int, table: Table) -> None:
+    """How many elements that are ok each cell has."""
     edges, cells = x.cells(bars)
     inside = cells[x.used]
     count = np.bincount(inside[inside >= 0], minlength=edges.size - 1)
-    ax.stairs(count, x.unbent(edges), fill=True, color=style.BLUE, alpha=0.75, lw=0)
+    ax.stairs(count, x.inverse(edges), fill=True, color=style.BLUE, alpha=0.75, lw=0)
     ax.set_yticks([])
     ax.set_ylim(0.0, 1.08 * max(1, int(count.max())))
     ax.spines["left"].set_visible(False)
@@ -112,7 +113,9 @@ def _density(ax: Axes, x: Column, y: Column, k: int) -> None:
     inside = (ix >= 0) & (iy >= 0)
     cell = ix[inside].astype(np.int32) * shape[1] + iy[inside]
     count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
+    # The root, or a few full cells would leave all others white; and lighter than its darkest, so
+    # that the marks of what failed can be seen.
     norm = PowerNorm(0.5, 0.0, 1.3 * max(1.0, float(count.max())))
     count[count == 0] = np.nan
-    ax.pcolormesh(x.unbent(ex), y.unbent(ey), count.T, cmap=_COLOURS, norm=norm, rasterized=True)
+    ax.pcolormesh(x.inverse(ex), y.inverse(ey), count.T, cmap=_COLOURS, norm=norm, rasterized=True)
     ax.grid(visible=False)

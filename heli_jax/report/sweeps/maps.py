@@ -2,11 +2,11 @@
 
 import itertools
 import math
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 
@@ -24,10 +24,8 @@ from heli_jax.report.sweeps.panels import (
 )
 from heli_jax.report.sweeps.scales import even_ticks, linear_axis, log_axis, named, scale
 
-_PAIRS = 6
-"""panels at most"""
-_CELLS = 24
-"""cells along an axis at most"""
+_PAIRS = 6  # panels at most
+_CELLS = 24  # cells along an axis at most
 _COLOURS, _EMPTY = "viridis", "#F3F3F3"
 
 
@@ -48,7 +46,8 @@ def draw_maps(table: Table, result: str) -> Figure | None:
     left, gap, right = 0.72, 0.8, 1.12
     width = (style.WIDTH - left - right - (columns - 1) * gap) / columns
     size = width, 3.2 if columns == 1 else 2.0
-    made, panels = laid_out(range(len(pairs)), columns, size, gap=(gap, 0.58), left=left)
+    figure, panels = laid_out(range(len(pairs)), columns, size, gap=(gap, 0.58), left=left)
+    # About four elements a cell: the median of fewer is as rough as they are.
     k = int(np.clip(math.sqrt(np.count_nonzero(z.used) / 4), 4, _CELLS))
     medians = [_medians(x, y, z, k) for x, y in pairs]
     norm = _norm(medians)
@@ -56,32 +55,31 @@ def draw_maps(table: Table, result: str) -> Figure | None:
     for ax, (x, y), m in zip(panels, pairs, medians, strict=True):
         ax.set_facecolor(_EMPTY)
         ax.grid(visible=False)
-        lost = table.failed(x, y)
-        crosses(ax, x.values[lost], y.values[lost], ms=2.8, alpha=0.8)
+        failed = table.failed(x, y)
+        crosses(ax, x.values[failed], y.values[failed], ms=2.8, alpha=0.8)
         named(ax, "x", x, scale(ax, "x", x, x.ends(k), margin=0.0))
         named(ax, "y", y, scale(ax, "y", y, y.ends(k), margin=0.0))
         ax.yaxis.set_label_coords(-0.5 / width, 0.5)
         if norm is None:
             say(ax, nothing(table))
         else:
-            ex, ey = (c.unbent(c.cells(k)[0]) for c in (x, y))
+            ex, ey = (c.inverse(c.cells(k)[0]) for c in (x, y))
             mesh = ax.pcolormesh(ex, ey, m.T, cmap=_COLOURS, norm=norm, rasterized=True)
     if mesh is not None:
-        _colour_bar(made, panels, mesh, z, medians)
+        _colour_bar(figure, panels, mesh, z, medians)
     head(panels[0], z.title(), table, [
         "median of each cell", *marked(table), *not_finite(table, z),
         *first(len(pairs), len(every), "pairs of axes"),
     ])  # fmt: skip
-    return made
+    return figure
 
 
 def _medians(x: Column, y: Column, z: Column, k: int) -> np.ndarray:
-    """The median of z in each cell of x and y, (cells of x, cells of y); NaN where there is none.
-
-    z is sorted once for all pairs of axes; then a stable sort by cell leaves each cell sorted.
-    """
+    """The median of z in each cell, (cells of x, cells of y); NaN where there is none."""
     (ex, ix), (ey, iy) = x.cells(k), y.cells(k)
     shape = ex.size - 1, ey.size - 1
+    # z is sorted once for all pairs of axes; then a stable sort by cell leaves each cell sorted,
+    # and its median stands in its middle: no loop over the cells.
     elements = z.ranked
     cell = np.where((ix < 0) | (iy < 0), -1, ix * np.int16(shape[1]) + iy)[elements]
     elements, cell = elements[cell >= 0], cell[cell >= 0].astype(np.int16)  # sorts fast
@@ -91,13 +89,14 @@ def _medians(x: Column, y: Column, z: Column, k: int) -> np.ndarray:
     some = count > 0
     lower = (ends - count + (count - 1) // 2)[some]
     upper = (ends - count + count // 2)[some]
-    found = np.full(count.size, np.nan)
-    found[some] = 0.5 * (values[lower] + values[upper])
-    return found.reshape(shape)
+    medians = np.full(count.size, np.nan)
+    medians[some] = 0.5 * (values[lower] + values[upper])
+    return medians.reshape(shape)
 
 
 def _norm(medians: list[np.ndarray]) -> Normalize | None:
     """Colours of all panels of a figure; a few cells far from the others do not count."""
+    # One scale for all, so that a colour means one value wherever it stands.
     values = np.concatenate([m[np.isfinite(m)] for m in medians])
     if not values.size:
         return None
@@ -110,19 +109,19 @@ def _norm(medians: list[np.ndarray]) -> Normalize | None:
 
 
 def _colour_bar(
-    made: Figure, panels: list[Axes], mesh: Any, z: Column, medians: list[np.ndarray]
+    figure: Figure, panels: list[Axes], mesh: QuadMesh, z: Column, medians: list[np.ndarray]
 ) -> None:
     """A colour bar for all panels, on their right; pointed where cells lie beyond it."""
-    width, height = made.get_size_inches()
+    width, height = figure.get_size_inches()
     boxes = [ax.get_position() for ax in panels]
     bottom, top = min(b.y0 for b in boxes), max(b.y1 for b in boxes)
     tall = min(top - bottom, 3.2 / height)
-    at = made.add_axes((1.0 - 0.95 / width, top - tall, 0.14 / width, tall))
+    cax = figure.add_axes((1.0 - 0.95 / width, top - tall, 0.14 / width, tall))
     low, high = mesh.get_clim()
     below = any(np.nanmin(m, initial=low) < low for m in medians)
     above = any(np.nanmax(m, initial=high) > high for m in medians)
     extend = "both" if below and above else "min" if below else "max" if above else "neither"
-    bar = made.colorbar(mesh, cax=at, extend=extend)
+    bar = figure.colorbar(mesh, cax=cax, extend=extend)
     if isinstance(mesh.norm, LogNorm | SymLogNorm):
         taken = log_axis(bar.ax.yaxis, low, high, 9)
     else:

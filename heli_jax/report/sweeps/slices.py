@@ -23,14 +23,11 @@ from heli_jax.report.sweeps.panels import (
 )
 from heli_jax.report.sweeps.scales import Taken, named, scale
 
-_AXES = 8
-"""panels at most"""
+_AXES = 8  # panels at most
+# Bins at most, and elements in each at least: a band from 5 to 95 % of fewer is their range.
 _BINS, _A_BIN = 20, 5
-"""bins at most, and elements in each at least"""
-_FEW = 20
-"""distinct values of an axis that are bins of their own"""
-_MARGIN = 0.07
-"""of the result's scale, beyond its view"""
+_FEW = 20  # distinct values of an axis that are bins of their own
+_MARGIN = 0.07  # of the result's scale, beyond its view: the marks of what failed lie there
 
 
 def slices(ds: xr.Dataset, result: str) -> Figure | None:
@@ -52,7 +49,7 @@ def draw_slices(table: Table, result: str) -> Figure | None:
     left, gap = 0.82, 0.22
     width = (style.WIDTH - left - 0.2 - (columns - 1) * gap) / columns
     size = width, 2.9 if columns == 1 else 1.9
-    made, panels = laid_out(range(len(axes)), columns, size, gap=(gap, 0.55), left=left)
+    figure, panels = laid_out(range(len(axes)), columns, size, gap=(gap, 0.55), left=left)
     binned = [_binned(x, y) for x in axes]
     view = _view(y, binned)
     shown = by_lot(np.flatnonzero(y.used), DOTS)
@@ -60,10 +57,11 @@ def draw_slices(table: Table, result: str) -> Figure | None:
         dots(ax, x.values[shown], y.values[shown])
         if bins is not None:
             _draw_bins(ax, bins)
-        lost = table.failed(x)
-        foot = np.full(lost.size, 0.03)
+        # What failed has no result to be placed by: it is marked at the foot of the panel.
+        failed = table.failed(x)
+        foot = np.full(failed.size, 0.03)
         below = ax.get_xaxis_transform()
-        crosses(ax, x.values[lost], foot, transform=below, marker="|", ms=7.0, alpha=0.4)
+        crosses(ax, x.values[failed], foot, transform=below, marker="|", ms=7.0, alpha=0.4)
         named(ax, "x", x, scale(ax, "x", x, x.view))
         if view is None:
             ax.set_yticks([])
@@ -82,10 +80,11 @@ def draw_slices(table: Table, result: str) -> Figure | None:
         *marked(table), *not_finite(table, y), *_beyond(y, view),
         *first(len(axes), len(table.axes), "axes"),
     ])  # fmt: skip
-    return made
+    return figure
 
 
 def _side_by_side(count: int) -> int:
+    # Four panels are two rows of two, and no row of three with one alone.
     return count if count < 3 else 2 if count == 4 else 3
 
 
@@ -111,7 +110,7 @@ def _binned(x: Column, y: Column) -> _Bins | None:
     else:
         count = min(_BINS, along.size // _A_BIN)
         starts = np.linspace(0, along.size, count + 1).astype(int)[:-1]
-        # Equal values stay together.
+        # Equal values stay together: an element's bin shall not hang on the order of the sweep.
         starts = np.unique(np.searchsorted(along, along[starts]))
     if starts.size < 2:
         return None
@@ -135,7 +134,7 @@ def _view(y: Column, binned: list[_Bins | None]) -> tuple[float, float] | None:
     """The result's view, with every median."""
     if y.empty:
         return None
-    medians = [y.bent(b.median) for b in binned if b is not None]
+    medians = [y.transform(b.median) for b in binned if b is not None]
     places = np.concatenate([y.view, *medians])
     return float(places.min()), float(places.max())
 
@@ -145,7 +144,7 @@ def _beyond(y: Column, view: tuple[float, float] | None) -> list[str]:
     if view is None:
         return []
     slack = _MARGIN * (view[1] - view[0])
-    low, high = y.unbent(np.array([view[0] - slack, view[1] + slack]))
+    low, high = y.inverse(np.array([view[0] - slack, view[1] + slack]))
     values = y.values[y.used]
     count = int(np.count_nonzero((values < low) | (values > high)))
     return [f"{count} beyond the panel"] if count else []

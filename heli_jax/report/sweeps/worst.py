@@ -16,55 +16,56 @@ from heli_jax.report.sweeps.columns import Column, Table, by_lot
 from heli_jax.report.sweeps.panels import crosses, dots, first, head, marked
 from heli_jax.report.sweeps.scales import LETTER, inches, short
 
-_AXES = 12
-"""axes at most"""
-_LINES = 300
-"""faint lines at most"""
+_AXES = 12  # at most: more leave no room for their names
+_LINES = 300  # faint ones at most: more are a grey area
 # As many results as colours, as many elements of each as dashes.
 _COLOURS = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.BLACK, style.SKY)
 _DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)))
 
 
-def worst(ds: xr.Dataset, found: Mapping[str, np.ndarray]) -> Figure | None:
+def worst(ds: xr.Dataset, elements: Mapping[str, np.ndarray]) -> Figure | None:
     """Where the worst elements of each result lie: a line through its axes for each.
 
-    `found` has the elements of each result, worst first. None where it has none.
+    `elements` has those of each result, worst first. None where it has none.
     """
-    return draw_worst(Table(ds, found.values()), found)
+    return draw_worst(Table(ds, elements.values()), elements)
 
 
-def draw_worst(table: Table, found: Mapping[str, np.ndarray]) -> Figure | None:
+def draw_worst(table: Table, by_result: Mapping[str, np.ndarray]) -> Figure | None:
     """`worst` of a table, which the figures of a sweep share."""
     axes = table.axes[:_AXES]
     chosen = [
         (table.column(name), np.asarray(elements)[: len(_DASHES)])
-        for name, elements in found.items()
+        for name, elements in by_result.items()
         if name in table.results and len(elements)
     ][: len(_COLOURS)]
     if not axes or not chosen:
         return None
     entries = sum(e.size for _, e in chosen)
     below = 0.62 + 0.175 * -(-entries // 2)
-    made = style.figure(0.52 + 2.8 + below)
-    width, height = made.get_size_inches()
-    ax = made.add_axes((0.6 / width, below / height, 1.0 - 1.2 / width, 2.8 / height))
-    places = np.stack([(c.bent(c.values) - c.view[0]) / (c.view[1] - c.view[0]) for c in axes])
+    figure = style.figure(0.52 + 2.8 + below)
+    width, height = figure.get_size_inches()
+    ax = figure.add_axes((0.6 / width, below / height, 1.0 - 1.2 / width, 2.8 / height))
+    # Each axis by its own scale, from 0 to 1: they have no unit in common.
+    places = np.stack([(c.transform(c.values) - c.view[0]) / (c.view[1] - c.view[0]) for c in axes])
     x = np.arange(len(axes), dtype=float)
     _bundle(ax, x, places[:, by_lot(np.flatnonzero(table.ok), _LINES)])
-    lost = table.failed()
-    aside = ax.transData + ScaledTranslation(0.06, 0.0, made.dpi_scale_trans)
-    at = np.repeat(x, lost.size)
-    crosses(ax, at, places[:, lost].ravel(), ms=2.5, alpha=0.5, transform=aside)
+    # What failed is marked beside the axes, or it would hide among the lines.
+    failed = table.failed()
+    aside = ax.transData + ScaledTranslation(0.06, 0.0, figure.dpi_scale_trans)
+    at = np.repeat(x, failed.size)
+    crosses(ax, at, places[:, failed].ravel(), ms=2.5, alpha=0.5, transform=aside)
     for k, (column, elements) in enumerate(chosen):
         for dashes, e in zip(_DASHES, elements, strict=False):
             here = int(table.at(e))
             text = f"{short(column.name, 24)}: element {e}, {_value(column, here)}"
+            # Thinner for each further result: where lines coincide the one below still shows.
             ax.plot(
                 x, places[:, here], color=_COLOURS[k], ls=dashes, lw=2.6 - 0.3 * k, marker="o",
                 ms=5.0 - 0.5 * k, label=text, zorder=4 + k,
             )  # fmt: skip
     _upright(ax, axes)
-    made.legend(
+    figure.legend(
         loc="lower left", ncols=2, bbox_to_anchor=(0.35 / width, 0.05 / height), borderaxespad=0.0,
         handlelength=2.6,
     )  # fmt: skip
@@ -74,7 +75,7 @@ def draw_worst(table: Table, found: Mapping[str, np.ndarray]) -> Figure | None:
         *[f"values are means over {c.flights} flights" for c, _ in chosen if c.flights][:1],
         *first(len(axes), len(table.axes), "axes"),
     ])  # fmt: skip
-    return made
+    return figure
 
 
 def _bundle(ax: Axes, x: np.ndarray, places: np.ndarray) -> None:
@@ -84,11 +85,13 @@ def _bundle(ax: Axes, x: np.ndarray, places: np.ndarray) -> None:
         return
     lines = [np.column_stack([x, p]) for p in places.T]
     alpha = 0.7 if len(lines) < 50 else 0.3
+    # One collection: hundreds of artists of their own are slow to draw.
     drawn = LineCollection(lines, colors=style.PALE, linewidths=0.6, alpha=alpha, zorder=1)
     ax.add_collection(drawn, autolim=False)
 
 
 def _value(column: Column, at: int) -> str:
+    """The number of the element at a place of the columns, with its unit."""
     unit = "" if pretty(column.unit) == "–" else f" {pretty(column.unit)}"
     return f"{number(float(column.values[at]))}{unit}"
 
@@ -111,6 +114,6 @@ def _upright(ax: Axes, axes: list[Column]) -> None:
     for k, c in enumerate(axes):
         ax.vlines(k, 0.0, 1.0, color="#444444", lw=0.8, zorder=2)
         for place, y, va in ((c.view[0], -0.03, "top"), (c.view[1], 1.03, "bottom")):
-            # Rounded before: 0.09998 is 0.1.
-            end = number(float(f"{float(c.unbent(place)):.{digits}g}"), digits)
+            # Rounded before, since `number` would take a power of ten out of 0.09998, which is 0.1.
+            end = number(float(f"{float(c.inverse(place)):.{digits}g}"), digits)
             ax.text(k, y, end, size=size, ha="center", va=va, color=style.GREY)

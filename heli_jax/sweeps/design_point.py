@@ -1,0 +1,349 @@
+"""One element of a sweep: values of the axes in, results and status out; traced by JAX."""
+
+# `Any` below: State, Inputs, Outputs and Params are the user's own classes, and what a function of
+# the user's returns is theirs too.
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
+from heli_jax.simulation.accumulate import accumulated
+from heli_jax.simulation.simulate import simulate
+from heli_jax.simulation.trajectory import Trajectory
+from heli_jax.sweeps import reducers
+from heli_jax.sweeps.reducers import Measured, Reduce
+from heli_jax.sweeps.spec import Job, Plan
+
+Scalars = dict[str, jax.Array]
+"""numbers () by name"""
+_Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
+"""results, trajectories (samples kept,), the last State, and whether each limit was left"""
+
+OK, DIVERGED, OUT_OF_RANGE, NOT_RUN = 0, 1, 2, 255
+MEANINGS = {OK: "ok", DIVERGED: "diverged", OUT_OF_RANGE: "out_of_range", NOT_RUN: "not_run"}
+"""The status of an element. Diverged: a state or an axis is not finite, or a state is beyond
+`RUNAWAY`. Out of range: a parameter no helicopter can have, the model's range was left, or there is
+no steady flight to begin with."""
+
+RUNAWAY = 1e12
+"""Where a state [SI] no longer is that of a helicopter."""
+
+# Samples per step of the exact solver: fastest where many elements are side by side (see
+# `SimulationOptions.block`).
+_BLOCK = 4
+# Accelerations [SI] below which a flight is steady. `trim` asks for 1e-10 and tries from several
+# places; an element of a batch has one try, and may end a little above.
+_TRIMMED = 1e-6
+
+
+class FlightNumbers(NamedTuple):
+    """The numbers of a flight and of the vehicle, in the sweep's precision."""
+
+    # Arguments of the compiled part and no constants in it: another flight of the same length, or
+    # another vehicle, needs no new program.
+
+    base: dict[str, Any]
+    """the vehicle's"""
+    dt: Any
+    inputs: Any
+    known: dict[str, Any]
+    measured: dict[str, Measured]
+    """by result, of those that compare with the flight"""
+    pilot: Any
+
+
+class ElementResults(NamedTuple):
+    """What the compiled part gives for an element."""
+
+    results: dict[str, Any]
+    trajectories: dict[str, Any]
+    matrices: Any
+    """the linearisation where the run begins, if a result needs it"""
+    status: Any
+
+
+def flight_numbers(job: Job, index: int) -> FlightNumbers:
+    """The numbers of one of the job's flights."""
+    dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
+    inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
+    against = {
+        name: reducers.measured(flight.outputs[str(r.signal)], dtype)
+        for name, r in job.reduce.items()
+        if (s := reducers.streaming(r)) is not None and s.against_flight
+    }
+    return FlightNumbers(
+        {n: np.asarray(v, dtype) for n, v in job.params.items()},
+        np.asarray(flight.dt, dtype),
+        model.Inputs(**inputs),
+        {n: np.asarray(v, dtype) for n, v in flight.known.items()},
+        against,
+        jax.tree.map(lambda v: np.asarray(v, dtype), job.pilot),
+    )
+
+
+class InitialTrim(NamedTuple):
+    """The steady flight that an element begins in."""
+
+    state: Any
+    sticks: Any
+    """the model's Inputs, added to the flight's"""
+    sound: Any
+    """whether there is such a flight"""
+
+
+def design_point(
+    plan: Plan, numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None
+) -> ElementResults:
+    """One element.
+
+    Args:
+        plan: what is compiled.
+        numbers: of the flight and the vehicle, SI.
+        values: of the axes, scalars, SI.
+        trim: the steady flight to begin in; None for the model's initial state.
+    """
+    model, dtype = plan.model, numbers.dt.dtype
+    params, special = _params(plan, numbers, values)
+    state, inputs = _beginning(model, params, numbers, special, trim)
+    if trim is not None and numbers.pilot is not None:
+        # The gains are those for the vehicle as it is given, the flight is this one's own.
+        numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=trim.state))
+    status = jnp.asarray(OK)
+    results: Scalars = {}
+    kept: dict[str, jax.Array] = {}
+    if plan.simulated:
+        if plan.streamed:
+            run = _streamed(plan, numbers, params, state, inputs)
+        else:
+            run = _whole(plan, numbers, params, state, inputs, special)
+        results, kept, last, outside = run
+        for left in outside:
+            status = jnp.where(left, OUT_OF_RANGE, status)
+        # NaN is below nothing, so it counts here too. After the range: a run that left it and then
+        # diverged has no number to show.
+        sound = jnp.stack([jnp.abs(v) < RUNAWAY for v in jax.tree.leaves(last)])
+        status = jnp.where(jnp.all(sound), status, DIVERGED)
+    if trim is not None:
+        # Last: the NaN that such an element began with would otherwise pass for a divergence.
+        status = jnp.where(trim.sound, status, OUT_OF_RANGE)
+    matrices = None
+    if any(r.how in reducers.LINEAR for _, r in plan.reduce):
+        # Eigenvalues and margins are made of these by NumPy after the chunk, in float64 whatever
+        # the device.
+        at_start = jax.tree.map(lambda u: u[0], inputs)
+        matrices = jacobians(model, params, state, at_start)
+    results = {n: jnp.asarray(v, dtype) for n, v in results.items()}
+    return ElementResults(results, kept, matrices, status.astype(np.uint8))
+
+
+def _beginning(
+    model: Model, params: Any, numbers: FlightNumbers, special: Scalars, trim: InitialTrim | None
+) -> tuple[Any, Any]:
+    """The state at the first sample and the inputs (N,) of an element."""
+    inputs = numbers.inputs
+    if trim is None:
+        dtype = numbers.dt.dtype
+        state = jax.tree.map(lambda v: jnp.asarray(v, dtype), model.initial_state(params))
+    else:
+        # Without a steady flight there is no run: what would come of it is no result.
+        state = jax.tree.map(lambda v: jnp.where(trim.sound, v, jnp.nan), trim.state)
+        inputs = jax.tree.map(lambda u, stick: u + stick, inputs, trim.sticks)
+    initial = {
+        n.removeprefix("initial."): v for n, v in special.items() if n.startswith("initial.")
+    }
+    return naming.replace(state, **initial), _gained_and_offset(inputs, special)
+
+
+def _params(plan: Plan, numbers: FlightNumbers, values: Scalars) -> tuple[Any, Scalars]:
+    """The element's parameters, and the axes that are not among them."""
+    names = naming.names(plan.model.Params)
+    swept = {n: v for n, v in values.items() if n in names}
+    # In this order: what a flight knows of its machine goes before the vehicle's, an axis before
+    # both.
+    params = plan.model.Params(**{**numbers.base, **numbers.known, **swept})
+    return params, {n: v for n, v in values.items() if n not in names}
+
+
+def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
+    """The steady flight of one element.
+
+    Args:
+        plan: what is compiled; its `trimmed` says which flight.
+        numbers: of the flight and the vehicle, SI.
+        values: of the axes, scalars, SI.
+    """
+    assert plan.trimmed is not None
+    whole, dtype = plan.trimmed.of or plan.model, numbers.dt.dtype
+    params, _ = _params(plan, numbers, values)
+    plain = whole.Params(**{n: getattr(params, n) for n in naming.names(whole.Params)})
+    # In the default precision whatever the sweep's: an iteration in float32 ends at residuals that
+    # are no proof of a steady flight.
+    plain, condition, wind = jax.tree.map(
+        lambda v: jnp.asarray(v, jnp.result_type(float)),
+        (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
+    )
+    trim = equilibrium(whole, plain, condition, wind)
+    sound = _is_trimmed(trim)
+    # The states of a disturbance have no trim and keep their own beginning.
+    state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
+    share = 1.0 if plan.trimmed.sticks else 0.0
+    sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
+    state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
+    return InitialTrim(state, sticks, sound)
+
+
+def _is_trimmed(trim: Trim) -> jax.Array:
+    """Whether it is a steady flight that the sticks' travel allows."""
+    # `trim` raises where there is none; one of a batch can only be flagged.
+    sound = plausible(trim) & (trim.residual < _TRIMMED)
+    for name, (low, high) in STICKS.items():
+        stick = getattr(trim.inputs, name)
+        sound = sound & (stick >= low) & (stick <= high)
+    return sound
+
+
+def _gained_and_offset(inputs: Any, special: Scalars) -> Any:
+    """The inputs of this element: the flight's times a gain, and an offset."""
+    changed = {}
+    for name, u in naming.asdict(inputs).items():
+        gain, offset = special.get(f"gain.{name}"), special.get(f"offset.{name}")
+        u = u if gain is None else gain * u
+        changed[name] = u if offset is None else u + offset
+    return type(inputs)(**changed)
+
+
+def _streaming(plan: Plan, numbers: FlightNumbers) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """What all streaming reducers do at a sample, their values before the first, and the measured
+    signals (N,) that they compare with."""
+    dtype = numbers.dt.dtype
+    reduce = dict(plan.reduce)
+    streams = {n: s for n, r in plan.reduce if (s := reducers.streaming(r)) is not None}
+    start = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), s.start) for n, s in streams.items()}
+    data = {n: (m.values, m.seen) for n, m in numbers.measured.items()}
+
+    def measured(name: str, now: dict[str, Any]) -> Measured | None:
+        if name not in now:
+            return None
+        # The signal's moments stay those of the whole record.
+        return numbers.measured[name]._replace(values=now[name][0], seen=now[name][1])
+
+    def update(value: dict[str, Any], outputs: Any, now: dict[str, Any]) -> dict[str, Any]:
+        """The running values with one sample more.
+
+        Args:
+            value: running values by result.
+            outputs: the model's Outputs at the sample, scalars.
+            now: what was measured there and whether, by result.
+        """
+        return {
+            name: stream.update(value[name], _signal(reduce[name], outputs), measured(name, now))
+            for name, stream in streams.items()
+        }
+
+    return update, start, data
+
+
+def _signal(reducer: Reduce, outputs: Any) -> Any:
+    return outputs if reducer.signal is None else getattr(outputs, reducer.signal)
+
+
+def _finished(plan: Plan, numbers: FlightNumbers, value: dict[str, Any], n: int) -> Scalars:
+    """The results of the streaming reducers after n samples, by name."""
+    results: Scalars = {}
+    count = jnp.asarray(n, numbers.dt.dtype)
+    for name, reducer in plan.reduce:
+        stream = reducers.streaming(reducer)
+        if stream is not None:
+            result = stream.finish(value[name], count, numbers.measured.get(name))
+            results |= _named(name, result)
+    return results
+
+
+def _of_function(name: str, how: Callable[[Trajectory], Any], run: Trajectory) -> Scalars:
+    """What a function of the user's gives for a run, by name.
+
+    Raises:
+        ValueError: it fails, or gives no real number.
+    """
+    called = getattr(how, "__qualname__", str(how))
+    try:
+        results = {n: jnp.asarray(v) for n, v in _named(name, how(run)).items()}
+    except Exception as e:  # whatever the function raises
+        # JAX's own sentences go on for pages.
+        first = str(e).partition("\n")[0]
+        raise ValueError(
+            f"reduce.{name}: {called} cannot be computed ({type(e).__name__}: {first:.200}), "
+            "expected a function of a Trajectory, of jax.numpy and without branches on its "
+            "values, that gives a number or numbers by name"
+        ) from e
+    for n, v in results.items():
+        if not (jnp.issubdtype(v.dtype, jnp.number) or v.dtype == jnp.bool_) or (
+            jnp.issubdtype(v.dtype, jnp.complexfloating)
+        ):
+            raise ValueError(
+                f"reduce.{name}: {called} gives {n} as {v.dtype}, expected a real number"
+            )
+    return results
+
+
+def _named(name: str, result: Any) -> dict[str, Any]:
+    """A result by name; several of one function by name and key."""
+    if isinstance(result, dict):
+        return {f"{name}_{key}": v for key, v in result.items()}
+    return {name: result}
+
+
+def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, inputs: Any) -> _Run:
+    """The run reduced while it goes on."""
+    update, start, data = _streaming(plan, numbers)
+    options = plan.simulation(
+        dt=numbers.dt, initial_state=state, block=_BLOCK if plan.solver == "exact" else 1
+    )
+    reduced = accumulated(
+        plan.model,
+        params,
+        inputs,
+        update,
+        start,
+        data=data,
+        limits=True,
+        options=options,
+    )
+    n = jax.tree.leaves(inputs)[0].shape[0]
+    results = _finished(plan, numbers, reduced.value, n)
+    return results, {}, reduced.state, list(reduced.outside.values())
+
+
+def _whole(
+    plan: Plan, numbers: FlightNumbers, params: Any, state: Any, inputs: Any, special: Scalars
+) -> _Run:
+    """The whole run, for functions of it and for trajectories to keep."""
+    options = plan.simulation(
+        dt=numbers.dt,
+        initial_state=state,
+        delay=special.get("delay"),
+        key=jax.random.key(special["seed"]) if "seed" in special else None,
+        feedback=numbers.pilot,
+    )
+    run: Trajectory = simulate(plan.model, params, inputs, options)
+    update, start, data = _streaming(plan, numbers)
+    # Sample by sample here too, so that each result has one definition however the run is made.
+    value, _ = jax.lax.scan(lambda v, now: (update(v, *now), None), start, (run.outputs, data))
+    n = run.times.shape[0]
+    results = _finished(plan, numbers, value, n)
+    for name, reducer in plan.reduce:
+        if callable(reducer.how) and reducers.streaming(reducer) is None:
+            results |= _of_function(name, reducer.how, run)
+    kept = {}
+    if plan.trajectories is not None:
+        every = plan.trajectories.every
+        kept = {n: getattr(run.outputs, n)[::every] for n in plan.trajectories.signals}
+    last = jax.tree.map(lambda v: v[-1], run.states)
+    return results, kept, last, [jnp.any(out) for out in run.outside.values()]
