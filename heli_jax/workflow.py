@@ -239,7 +239,7 @@ def compare_models(
         InputError: no axis of the model can be disturbed, or a model cannot be fitted.
     """
     config = config if isinstance(config, Experiment) else load_config(config)
-    candidates = configuration.rivals(config, problem or configuration.problem(config))
+    candidates = configuration.candidate_models(config, problem or configuration.problem(config))
     try:
         return choose(candidates.problems, candidates.nested, progress=progress)
     except ValueError as e:

@@ -239,7 +239,7 @@ WRONG = {
     ),
     "fixed but not given": (
         lambda c: c.update(disturbance={"axis": "roll", "fixed": ["tau_w"]}),
-        ["disturbance", "tau_w is fixed but not given"],
+        ["disturbance: tau_w: missing, expected its value, since it is fixed"],
     ),
     "noise parameter free": (
         lambda c: (
