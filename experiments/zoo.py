@@ -428,7 +428,9 @@ def complaint(puzzle: Puzzle, result: Fit) -> str:
         return ""
     for name, value in puzzle.hardly.items():
         e = result.estimates[name]
-        if e.sd is not None and not (e.lower95 < min(value, 0.0) and e.upper95 > max(value, 0.0)):
+        if e.sd is None or e.lower95 is None or e.upper95 is None:
+            continue
+        if not (e.lower95 < min(value, 0.0) and e.upper95 > max(value, 0.0)):
             return f"silent success: {name} is {e.value:.4g} +- {e.sd:.2g}"
     if puzzle.hardly:
         return ""

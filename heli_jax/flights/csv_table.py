@@ -8,7 +8,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,11 @@ from heli_jax.flights.table import (
     wrong,
 )
 from heli_jax.regular_file import read_regular
+
+# Imported again within the functions that need it: it takes a quarter of a second, which
+# flights made in Python need not wait for.
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 # What counts as a number. float() would also take 1_000, and digits of any script.
 _NUMBER = re.compile(
@@ -160,7 +165,7 @@ class CsvTable:
                 return record
         raise IndexError(row)
 
-    def _texts(self, indices: Sequence[int]) -> list[Any]:
+    def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """The cells of some columns as pyarrow string arrays (N,)."""
         # pyarrow takes a line break within quotes for one within a cell or for the end of a row, by
         # an option; either way the lines that it counts are not those of the file.
@@ -171,7 +176,7 @@ class CsvTable:
             raise wrong(self.path, "holds a header alone, expected rows of numbers")
         return texts
 
-    def _texts_by_pyarrow(self, indices: Sequence[int]) -> list[Any] | None:
+    def _texts_by_pyarrow(self, indices: Sequence[int]) -> list["pa.ChunkedArray"] | None:
         """As `_texts`; None where pyarrow finds anything wrong."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
@@ -207,7 +212,7 @@ class CsvTable:
             return None
         return None if ragged else [table.column(name) for name in columns]
 
-    def _texts_row_by_row(self, indices: Sequence[int]) -> list[Any]:
+    def _texts_row_by_row(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """As `_texts`; cells are packed as they come: as objects of Python they take many times
         the file's size."""
         import pyarrow as pa
@@ -253,7 +258,7 @@ class _TwoDecimalSigns(Exception):
     """A file holds both decimal commas and decimal points."""
 
 
-def _decimal_points(texts: list[Any], delimiter: str) -> list[Any]:
+def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.ChunkedArray"]:
     """The cells with decimal points for commas, where the comma is not the delimiter.
 
     Raises:
@@ -277,14 +282,14 @@ def _decimal_points(texts: list[Any], delimiter: str) -> list[Any]:
     return [pc.replace_substring(text, ",", ".") for text in texts]
 
 
-def _filled(text: Any) -> Any:
+def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     """Cells without the blanks around them, null where nothing is left."""
     pc = _compute()
     trimmed = pc.utf8_trim_whitespace(text)
     return pc.if_else(pc.equal(trimmed, ""), None, trimmed)
 
 
-def _floats(text: Any) -> np.ndarray | int:
+def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
     """Cells as float64 (N,), NaN where empty; or the first row that holds no number."""
     import pyarrow as pa
 
@@ -295,7 +300,7 @@ def _floats(text: Any) -> np.ndarray | int:
         return _floats_one_by_one(filled)
 
 
-def _floats_one_by_one(filled: Any) -> np.ndarray | int:
+def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:
     # In pieces: as objects of Python all cells at once take many times the file's size.
     values = np.full(len(filled), np.nan)
     pieces = (filled.slice(at, _CELLS_AT_ONCE) for at in range(0, len(filled), _CELLS_AT_ONCE))

@@ -4,12 +4,17 @@ import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from heli_jax.flights.table import Survey, column, require_columns, require_few_columns, wrong
 from heli_jax.regular_file import open_regular, size_words
+
+# Imported again within the functions that need it, as in `csv_table`.
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 _LARGEST = 16 * 10**9
 """bytes: the whole file goes through sha256, the columns asked for into memory"""
@@ -81,7 +86,7 @@ class ParquetTable:
 
     format = "parquet"
 
-    def __init__(self, path: str, size: int, sha256: str, file: Any) -> None:
+    def __init__(self, path: str, size: int, sha256: str, file: "pq.ParquetFile") -> None:
         self.path, self.size, self.sha256 = path, size, sha256
         self._file = file
         self._schema = file.schema_arrow
@@ -143,7 +148,7 @@ class ParquetTable:
             problem = f"expected at most {_MOST_CELLS} values in the columns read, got {cells}"
             raise wrong(self.path, f"{problem}; read fewer columns, or resample the log")
 
-    def _read(self, names: Sequence[str] | None) -> Any:
+    def _read(self, names: Sequence[str] | None) -> "pa.Table":
         import pyarrow as pa
 
         self._require_few(names)
@@ -155,16 +160,17 @@ class ParquetTable:
             raise wrong(self.path, "is no whole Parquet file") from e
 
 
-def _is_text(kind: Any) -> bool:
+def _is_text(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
     types = pa.types
     return types.is_string(kind) or types.is_binary(kind)
 
 
-def _is_number(kind: Any) -> bool:
+def _is_number(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
+    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
     types = pa.types
     return (
         types.is_integer(kind)
@@ -177,7 +183,7 @@ def _is_number(kind: Any) -> bool:
     )
 
 
-def _floats(values: Any) -> np.ndarray:
+def _floats(values: "pa.ChunkedArray") -> np.ndarray:
     """Numbers, or ticks of a clock, as float64 (N,), NaN where null."""
     import pyarrow as pa
     import pyarrow.compute as pc
