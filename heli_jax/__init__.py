@@ -94,4 +94,5 @@ def __getattr__(name: str) -> Any:  # any of them
 
 
 def __dir__() -> list[str]:
+    # For completion in a session: without it only the names used so far would be offered.
     return sorted(_HOMES)

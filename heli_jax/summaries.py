@@ -18,6 +18,7 @@ from heli_jax.numbers import NOTHING, measured, number, percent
 type Row = tuple[str, ...]
 
 
+# Between objects and their layout, so that text and HTML cannot differ in what they show.
 class Summary(NamedTuple):
     """What is shown of an object."""
 

@@ -120,6 +120,7 @@ def run_fit(
         run_directory.require_free(Path(out))  # before the work, not after it
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
+    # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for note in reading_notes(problem):
         progress(note)
     options = config.config.fit

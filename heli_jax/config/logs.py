@@ -2,11 +2,11 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FlightConfig, SignalsConfig
+from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
@@ -91,7 +91,7 @@ def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
 def signals(
     model: Model,
     role: Literal["inputs", "outputs"],
-    stated: Mapping[str, Any],
+    stated: Mapping[str, InputConfig] | Mapping[str, OutputConfig],
     where: str,
     gain: bool = False,
 ) -> dict[str, Signal]:
@@ -100,7 +100,7 @@ def signals(
     Args:
         model: what the names are of.
         role: whether they are its inputs or its outputs.
-        stated: a configuration's signals by the model's name (InputConfig or OutputConfig).
+        stated: a configuration's signals by the model's name.
         where: what a sentence about a wrong one begins with.
         gain: whether a plain number is allowed for an input with a unit.
 

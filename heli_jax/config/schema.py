@@ -12,8 +12,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-# The records that a script fills (`Free`, `Prior`, `Nuisance`, `Condition`, `Reduce`) have sections
-# of their own here, field for field. Two, not one: pydantic would read a NamedTuple from a list as
+# The records that a script fills (`Free`, `Prior`, `Nuisance`) have sections of their own, with
+# the same fields (a test holds that). Two, not one: pydantic would read a NamedTuple from a list as
 # well, call a misspelt key an unexpected argument, and write a list into the run's config.yaml; and
 # made of pydantic's classes they would bring it into the identification.
 class _Strict(BaseModel):

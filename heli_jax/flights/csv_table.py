@@ -181,8 +181,8 @@ class CsvTable:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
-        # By number, since two columns may have one name. As text, since pyarrow would read 1,5 as
-        # text, true as a truth value, and take no column for numbers that has one bad cell.
+        # By number, since two columns may have one name. As text, since pyarrow's own guess
+        # knows no decimal comma, and gives up a column of numbers for one bad cell.
         names = [str(i) for i in range(len(self.names))]
         columns = [names[i] for i in indices]
         ragged: list[Any] = []
