@@ -10,14 +10,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import run_directory
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from distributed import Client
-
     from heli_jax.identification.result import Fit
 
 # 2 is what argparse ends with, 130 what a shell reports of a program ended by SIGINT (128 + 2).
@@ -50,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return DONE
         except Exception as e:
-            # pyarrow and JAX's callbacks make errors of their own of an interrupt.
+            # Whatever it says: an interrupt of which a library has made an error of its own.
             if seen:
                 _say("interrupted")
                 return INTERRUPTED
@@ -177,7 +175,7 @@ def _prepare_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
-    # together take longer than the rest of it.
+    # add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(_cache()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -301,9 +299,8 @@ def _sweep(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _client(
-    options: argparse.Namespace, config: Path
-) -> contextlib.AbstractContextManager["Client | None"]:
+# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
+def _client(options: argparse.Namespace, config: Path) -> contextlib.AbstractContextManager[Any]:
     """A dask client where one is asked for."""
     if options.scheduler is None and options.workers is None:
         return contextlib.nullcontext()

@@ -27,7 +27,6 @@ from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
     from heli_jax.sweeps.spec import Job
 
@@ -57,8 +56,9 @@ class FitRun:
     began: float = field(default_factory=time.perf_counter)
     """when the work began, by `time.perf_counter` [s]"""
 
-    # Drawn anew each time: a figure that is kept could be changed by who got it before.
-    def figure(self, name: str) -> "Figure":
+    # Drawn anew each time: a figure that is kept could be changed by who got it before. Any, since
+    # matplotlib's classes are named in `report` alone.
+    def figure(self, name: str) -> Any:
         """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`, `bode`,
         `starts`, ...
 
