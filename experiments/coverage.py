@@ -26,10 +26,10 @@ jax.config.update("jax_enable_x64", True)
 
 
 def all_cases() -> list[Case]:
-    found = []
+    cases = []
     for module in pkgutil.iter_modules(coverage_cases.__path__):
-        found += importlib.import_module(f"coverage_cases.{module.name}").cases()
-    return found
+        cases += importlib.import_module(f"coverage_cases.{module.name}").cases()
+    return cases
 
 
 def run_case(case: Case, runs: int, folder: Path) -> list[Run]:
@@ -38,10 +38,10 @@ def run_case(case: Case, runs: int, folder: Path) -> list[Run]:
     lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
     done = {}
     for line in lines:
-        one = json.loads(line)
-        seed = one.pop("seed")
-        one["parameters"] = {n: Interval(*v) for n, v in one["parameters"].items()}
-        done[seed] = Run(**one)
+        record = json.loads(line)
+        seed = record.pop("seed")
+        record["parameters"] = {n: Interval(*v) for n, v in record["parameters"].items()}
+        done[seed] = Run(**record)
     begin = time.monotonic()
     for seed in range(runs):
         if seed in done:
@@ -63,23 +63,23 @@ HEAD = "| case | parameter | runs | mean error | reported/real sd | coverage | n
 def rows(case: Case, runs: list[Run]) -> list[str]:
     """A line for each parameter, then one for what must not happen."""
     good = [r for r in runs if r.status != "not-converged"]
-    lost, lines = len(runs) - len(good), []
+    failures, lines = len(runs) - len(good), []
     names = list(dict.fromkeys(n for r in good for n in r.parameters))
     for name in names:
-        found = [r.parameters[name] for r in good if name in r.parameters]
-        error = np.array([i.value - i.truth for i in found])
+        intervals = [r.parameters[name] for r in good if name in r.parameters]
+        error = np.array([i.value - i.truth for i in intervals])
         real = error.std(ddof=1) if error.size > 1 else np.nan
         # The median: one run that reports absurdly much must not speak for all.
-        reported = np.median([i.sd for i in found])
-        covered = np.mean([i.lower < i.truth < i.upper for i in found])
+        reported = np.median([i.sd for i in intervals])
+        covered = np.mean([i.lower < i.truth < i.upper for i in intervals])
         lines.append(
-            f"| {case.name} | {name} | {len(found)} | {error.mean() / real:+.2f} sd "
-            f"| {reported / real:.2f} | {100 * covered:.1f} % | {lost} |"
+            f"| {case.name} | {name} | {len(intervals)} | {error.mean() / real:+.2f} sd "
+            f"| {reported / real:.2f} | {100 * covered:.1f} % | {failures} |"
         )
     flags = dict.fromkeys(n for r in runs for n in r.flags)
     for name in flags:
         count = sum(r.flags.get(name, False) for r in runs)
-        lines.append(f"| {case.name} | {name}: {count} of {len(runs)} | | | | | {lost} |")
+        lines.append(f"| {case.name} | {name}: {count} of {len(runs)} | | | | | {failures} |")
     return lines
 
 

@@ -21,10 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, load_vehicle, models, simulate, trim
+from heli_jax import Fit, Flight, Free, Nuisance, Problem, fit, load_vehicle, models, simulate, trim
 from heli_jax.analysis.trim import Trim
 from heli_jax.dynamics.disturbance import with_disturbance
-from heli_jax.identification.result import Fit
 from heli_jax.naming import asdict, replace
 
 jax.config.update("jax_enable_x64", True)
@@ -127,16 +126,16 @@ def identify_in_gusts() -> Fit:
     """Fitted by filter error from values that are off by 10 %."""
     params = in_gusts()
     free = {n: Free(1.1 * float(getattr(params, n))) for n in IN_GUSTS}
-    how = {"method": "filter-error", "substeps": 1}
-    problem = Problem(DISTURBED, params, [gusty()], free, Nuisance(bias=False), **how)
+    options = {"method": "filter-error", "substeps": 1}
+    problem = Problem(DISTURBED, params, [gusty()], free, Nuisance(bias=False), **options)
     return fit(problem, progress=print)
 
 
-def table(found: Fit) -> list[str]:
+def table(result: Fit) -> list[str]:
     params = in_gusts()
     rows = ["| parameter | estimate over truth | sd | error in sd |", "|---|---|---|---|"]
-    of_gusts = {n: e for n, e in found.nuisance.items() if n in GUSTS}
-    for name, e in {**found.estimates, **of_gusts}.items():
+    of_gusts = {n: e for n, e in result.nuisance.items() if n in GUSTS}
+    for name, e in {**result.estimates, **of_gusts}.items():
         truth = float(getattr(params, name))
         if e.sd is None:
             rows.append(f"| {name} | not determined | | |")
@@ -162,15 +161,15 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     page, results = ["# What separates a from the inertias", ""], {}
     for title, identified in CASES.items():
-        found = identified()
-        page += [f"## {title}", "", *table(found), "", f"{found.status}: {found.verdict.text}"]
-        page += [*found.notes, ""]
+        result = identified()
+        page += [f"## {title}", "", *table(result), "", f"{result.status}: {result.verdict.text}"]
+        page += [*result.notes, ""]
         results[title] = {
-            "status": found.status,
-            "condition": found.verdict.condition,
-            "values": {n: e.value for n, e in found.estimates.items()},
-            "sd": {n: e.sd for n, e in found.estimates.items()},
-            "pairs": [list(p) for p in found.verdict.pairs],
+            "status": result.status,
+            "condition": result.verdict.condition,
+            "values": {n: e.value for n, e in result.estimates.items()},
+            "sd": {n: e.sd for n, e in result.estimates.items()},
+            "pairs": [list(p) for p in result.verdict.pairs],
         }
     (folder / "page.md").write_text("\n".join(page))
     (folder / "results.json").write_text(json.dumps(results, indent=1))

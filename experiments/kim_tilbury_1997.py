@@ -122,17 +122,17 @@ def run() -> Run:
     )
 
 
-def inertias(bench: Any, found: Baseline) -> dict[str, float]:
+def inertias(bench: Any, rls: Baseline) -> dict[str, float]:
     """Ixx and If by RLS where a is known."""
-    return {n: float(bench.a) / found.combinations[f"a/{n}"] for n in ("Ixx", "If")}
+    return {n: float(bench.a) / rls.combinations[f"a/{n}"] for n in ("Ixx", "If")}
 
 
 def agreements(r: Run) -> dict[str, Metrics]:
     """How simulations from the stick agree with the stand run."""
-    found = {"RLS": r.rls[STAND_RUN].metrics}
-    found |= {n: r.fits[n].metrics["roll"] for n in FITS if n.endswith("a known")}
+    agreement = {"RLS": r.rls[STAND_RUN].metrics}
+    agreement |= {n: r.fits[n].metrics["roll"] for n in FITS if n.endswith("a known")}
     y, truth = (r.flights[n].outputs["roll"] for n in (STAND_RUN, ALONE))
-    return found | {"the truth, undisturbed": metrics(y, truth)}
+    return agreement | {"the truth, undisturbed": metrics(y, truth)}
 
 
 def digits() -> list[dict[str, Any]]:
@@ -259,9 +259,10 @@ def _runs(r: Run) -> str:
 
 {N} samples at {1 / DT:.0f} Hz, as in Figure 5: random steps of the stick of {STICK * 1e6:.0f} µm at
 most, {NOISE * 1e3:g} mrad of measurement noise, and a random roll acceleration of {SIGMA_W} rad/s²
-(sd) with a memory of {TAU_W:g} s. Figure 6 is another run of the same machine, noise and kind of
-disturbance, the stick at neutral; its rms is {percent(rms[NEUTRAL] / rms[STAND_RUN], 0)} of the
-stand run's. The first row is the stand run without noise and disturbance.
+(sd) with a correlation time of {TAU_W:g} s. Figure 6 is another run of the same machine, noise and
+kind of disturbance, the stick at neutral; its rms is
+{percent(rms[NEUTRAL] / rms[STAND_RUN], 0)} of the stand run's. The first row is the stand run
+without noise and disturbance.
 
 {table(head, rows)}
 
@@ -272,10 +273,10 @@ def _recursive(r: Run) -> str:
     true = roll_transfer_function(r.bench, stand=True)
     _, den = c2d(np.array(true.num), np.array(true.den), DT)
     rows = [["truth", _poles(np.roots(den)), "", *(_truth(r.bench, n) for n in ("Ixx", "If"))]]
-    for name, found in r.rls.items():
-        kind = "zero-order hold" if found.exact else "real part of the logarithm"
-        values = [number(v, 3) for v in inertias(r.bench, found).values()]
-        rows.append([f"RLS, {name}", _poles(found.poles), kind, *values])
+    for name, rls in r.rls.items():
+        kind = "zero-order hold" if rls.exact else "real part of the logarithm"
+        values = [number(v, 3) for v in inertias(r.bench, rls).values()]
+        rows.append([f"RLS, {name}", _poles(rls.poles), kind, *values])
     agreed = ((n, percent(m.vaf, 1), f"{m.rmse:.3f}") for n, m in agreements(r).items())
     return f"""## RLS of order 4 (eqs 25-33), and Figure 5
 
@@ -306,7 +307,7 @@ def _there_and_back() -> str:
         rows.append((c["coefficient"], c["printed"], shown, f"{c['off_in_last_digits']:.2f}"))
     names = [f"{side} z^{4 - k}" for side in ("num", "den") for k in range(5)]
     pairs = zip(names, np.ravel(EQ_34), np.ravel(sampled_35()), strict=True)
-    again = ((name, f"{given:.4f}", f"{value:.4f}") for name, given, value in pairs)
+    again = ((name, f"{printed:.4f}", f"{value:.4f}") for name, printed, value in pairs)
     return f"""## Eq. 34 into eq. 35, and back
 
 Eq. 35 is the real part of the matrix logarithm of [[Ad, Bd], [0, 1]] of eq. 34, over {DT} s: no
@@ -380,12 +381,12 @@ def _estimate(e: Estimate | None) -> str:
     return f"{value} ({low} to {high})"
 
 
-def _directions(found: Fit) -> str:
+def _directions(fitted: Fit) -> str:
     shown = (
         ", ".join(f"{n} {v:.2f}" for n, v in direction.items() if abs(v) > 5e-3)
-        for direction in found.verdict.null_directions
+        for direction in fitted.verdict.null_directions
     )
-    return " and ".join(f"({one})" for one in shown)
+    return " and ".join(f"({text})" for text in shown)
 
 
 def _product(p: Any, exponents: dict[str, float]) -> float:

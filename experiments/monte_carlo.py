@@ -33,7 +33,7 @@ jax.config.update("jax_enable_x64", True)
 N, DT, NOISE, SIGMA_W, TAU_W = 6000, 0.02, 2e-3, 1.04, 1.0
 FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
 MODEL = with_disturbance(models.roll_on_stand, "roll")
-METHODS = ("filter error", "output error, white", "output error, coloured", "RLS")
+METHODS = ("filter error", "output error, white", "output error, autocorrelated", "RLS")
 
 
 def truth() -> Any:
@@ -62,18 +62,18 @@ def one_run(params: Any, seed: int) -> dict[str, Any]:
     out: dict[str, Any] = {"seed": seed}
     for method in ("filter-error", "output-error"):
         begin = time.perf_counter()
-        found = fit(Problem(MODEL, start, [flight], FREE, method=method))
+        result = fit(Problem(MODEL, start, [flight], FREE, method=method))
         seconds = time.perf_counter() - begin
         for name in METHODS:
             if not name.startswith(method.replace("-", " ")):
                 continue
-            sds = {n: e.sd_white if "white" in name else e.sd for n, e in found.estimates.items()}
-            reported = {n: (e.lower95, e.upper95) for n, e in found.estimates.items()}
+            sds = {n: e.sd_white if "white" in name else e.sd for n, e in result.estimates.items()}
+            reported = {n: (e.lower95, e.upper95) for n, e in result.estimates.items()}
             out[name] = {
-                "status": found.status,
-                "steps": found.steps,
+                "status": result.status,
+                "steps": result.steps,
                 "seconds": seconds,
-                "values": {n: e.value for n, e in found.estimates.items()},
+                "values": {n: e.value for n, e in result.estimates.items()},
                 "sd": sds,
                 "interval": {} if "white" in name else reported,
             }
@@ -100,7 +100,7 @@ def undisturbed(params: Any) -> Any:
 def fisher(params: Any, records: int = 5) -> dict[str, float]:
     """The Cramer-Rao sd of filter error at the truth, relative: no unbiased method does better."""
     free = {n: Free(float(getattr(params, n))) for n in FREE}
-    found = []
+    sds = []
     for seed in range(records):
         problem = Problem(MODEL, params, [record(params, seed)], free, method="filter-error")
         layout = layout_of(problem, problem.training)
@@ -109,8 +109,8 @@ def fisher(params: Any, records: int = 5) -> dict[str, float]:
         dtype = z.dtype
         noise = Noise(({"roll": np.asarray(NOISE, dtype)},), np.zeros((), dtype))
         noise = layout.estimator.with_level(data, evaluate(layout, data, noise, z), noise)
-        found.append(deviations(evaluate(layout, data, noise, z).J)[: len(FREE)])
-    mean = np.sqrt(np.mean(np.square(found), axis=0))
+        sds.append(deviations(evaluate(layout, data, noise, z).J)[: len(FREE)])
+    mean = np.sqrt(np.mean(np.square(sds), axis=0))
     return dict(zip(FREE, (float(v) for v in mean), strict=True))
 
 
@@ -188,6 +188,8 @@ def main(count: int, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "runs.jsonl"
     kept = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+    # Runs of earlier versions are kept too; they call autocorrelated residuals coloured.
+    kept = [line.replace("output error, coloured", METHODS[2]) for line in kept]
     runs = {r["seed"]: r for r in (json.loads(line) for line in kept)}
     params = truth()
     for seed in range(count):

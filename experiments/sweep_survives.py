@@ -70,19 +70,19 @@ def command(config: Path, out: Path, *more: str) -> list[str]:
 
 def finished(out: Path) -> dict[str, tuple[int, int]]:
     """The files of the finished chunks' status, and what changes when one is written again."""
-    found = {}
+    marks = {}
     for path in (out / "sweep.zarr" / "status" / "c").glob("*"):
         if path.suffix != ".partial":
             stat = path.stat()
-            found[path.name] = (stat.st_mtime_ns, stat.st_ino)
-    return found
+            marks[path.name] = (stat.st_mtime_ns, stat.st_ino)
+    return marks
 
 
 def same(a: Path, b: Path) -> bool:
     """Whether two stores hold the same bits."""
-    one, other = zarr.open_group(str(a), mode="r"), zarr.open_group(str(b), mode="r")
-    left: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in one.arrays()}
-    right: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in other.arrays()}
+    first, second = zarr.open_group(str(a), mode="r"), zarr.open_group(str(b), mode="r")
+    left: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in first.arrays()}
+    right: dict[str, bytes] = {n: np.asarray(v[...]).tobytes() for n, v in second.arrays()}
     return left == right
 
 
@@ -117,10 +117,10 @@ def kills(
     for k in range(times):
         with subprocess.Popen(command(config, out), stderr=subprocess.DEVNULL) as run:
             starts += 1
-            wanted = len(done) + rng.randint(1, max(1, chunks // (2 * times)))
+            target = len(done) + rng.randint(1, max(1, chunks // (2 * times)))
             until = time.monotonic() + (rng.uniform(0.0, 1.1 * first) if k % 2 else 120.0)
             while run.poll() is None and time.monotonic() < until:
-                if k % 2 == 0 and len(finished(out)) >= wanted:
+                if k % 2 == 0 and len(finished(out)) >= target:
                     break
                 time.sleep(0.002)
             time.sleep(rng.uniform(0.0, 0.05))
@@ -149,7 +149,7 @@ def worker_killed(config: Path, whole: Path, out: Path) -> bool:
 
 def workers_of(pid: int) -> list[int]:
     """The dask worker processes that a process started, by Linux's process table."""
-    found = []
+    pids = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
@@ -157,8 +157,8 @@ def workers_of(pid: int) -> list[int]:
         except OSError:
             continue
         if int(fields[1]) == pid and b"spawn_main" in line:
-            found.append(int(stat.parent.name))
-    return sorted(found)
+            pids.append(int(stat.parent.name))
+    return sorted(pids)
 
 
 def main() -> None:
@@ -169,15 +169,15 @@ def main() -> None:
         run_through(config, folder / "whole")
         # Again, with what JAX has compiled and kept, as the killed ones have it.
         first = run_through(config, folder / "again")
-        found = kills(config, folder / "whole", folder / "killed", times, first)
+        outcome = kills(config, folder / "whole", folder / "killed", times, first)
         print(
-            f"{found.kills} kills, {found.hit} of them between the first chunk and the last, "
-            f"{found.resumed} resumed: bits {'equal' if found.equal else 'DIFFER'}, "
-            f"{found.rewritten} finished chunks written again"
+            f"{outcome.kills} kills, {outcome.hit} of them between the first chunk and the last, "
+            f"{outcome.resumed} resumed: bits {'equal' if outcome.equal else 'DIFFER'}, "
+            f"{outcome.rewritten} finished chunks written again"
         )
         equal = worker_killed(config, folder / "whole", folder / "dask")
         print(f"two dask workers, one killed: bits {'equal' if equal else 'DIFFER'}")
-        raise SystemExit(0 if found.equal and equal and not found.rewritten else 1)
+        raise SystemExit(0 if outcome.equal and equal and not outcome.rewritten else 1)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -50,14 +50,14 @@ def one_run(seed: int) -> dict[str, Any]:
     out: dict[str, Any] = {"seed": seed}
     for poles, model in MODELS.items():
         start = parameters(poles, 0.0, 0.3)
-        found = fit(Problem(model, start, [flight], FREE, method="filter-error"))
+        result = fit(Problem(model, start, [flight], FREE, method="filter-error"))
         out[str(poles)] = {
-            "status": found.status,
-            "values": {n: e.value for n, e in found.estimates.items()},
-            "sd": {n: e.sd for n, e in found.estimates.items()},
-            "aic": found.aic,
-            "white": found.white,
-            "lag1": max(abs(w.lag1) for w in found.whiteness.values()),
+            "status": result.status,
+            "values": {n: e.value for n, e in result.estimates.items()},
+            "sd": {n: e.sd for n, e in result.estimates.items()},
+            "aic": result.aic,
+            "white": result.white,
+            "lag1": max(abs(w.lag1) for w in result.whiteness.values()),
         }
     return out
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit, load_vehicle, models
+from heli_jax import Fit, Flight, Free, Model, Nuisance, Prior, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
@@ -117,7 +117,7 @@ class Puzzle:
     problem: Problem
     truth: dict[str, float]
     """of the free parameters that the record determines"""
-    lost: tuple[str, ...] = ()
+    not_identifiable: tuple[str, ...] = ()
     """free parameters that it does not"""
     hardly: dict[str, float] = field(default_factory=dict)
     """of which it says next to nothing: not determined, or an interval with truth and zero in it"""
@@ -420,36 +420,38 @@ def zoo(small: bool = False) -> Iterator[Puzzle]:
             yield kind(seed)
 
 
-def complaint(puzzle: Puzzle, found: Any) -> str:
+def complaint(puzzle: Puzzle, result: Fit) -> str:
     """What is wrong with a fit's answer; empty where it is right."""
     if not puzzle.adequate:
-        if found.status == "converged" and found.adequate:
+        if result.status == "converged" and result.adequate:
             return "silent success: converged and adequate"
         return ""
     for name, value in puzzle.hardly.items():
-        e = found.estimates[name]
-        if e.sd is not None and not (e.lower95 < min(value, 0.0) and e.upper95 > max(value, 0.0)):
+        e = result.estimates[name]
+        if e.sd is None or e.lower95 is None or e.upper95 is None:
+            continue
+        if not (e.lower95 < min(value, 0.0) and e.upper95 > max(value, 0.0)):
             return f"silent success: {name} is {e.value:.4g} +- {e.sd:.2g}"
     if puzzle.hardly:
         return ""
-    if puzzle.lost:
-        told = [n for n in puzzle.lost if found.estimates[n].sd is not None]
-        if found.status == "converged" or told:
-            return f"silent success: {found.status}, {', '.join(told)} given"
-        if found.status != "not-identifiable":
-            return f"not said: {found.status}"
-        return _off(puzzle, found)
-    if found.status != "converged":
-        return f"false alarm: {found.status}"
-    if not found.adequate:
+    if puzzle.not_identifiable:
+        reported = [n for n in puzzle.not_identifiable if result.estimates[n].sd is not None]
+        if result.status == "converged" or reported:
+            return f"silent success: {result.status}, {', '.join(reported)} given"
+        if result.status != "not-identifiable":
+            return f"not said: {result.status}"
+        return _off(puzzle, result)
+    if result.status != "converged":
+        return f"false alarm: {result.status}"
+    if not result.adequate:
         return "false alarm: not adequate"
-    return _off(puzzle, found)
+    return _off(puzzle, result)
 
 
-def _off(puzzle: Puzzle, found: Any) -> str:
+def _off(puzzle: Puzzle, result: Fit) -> str:
     """Which of the parameters that the record determines is wrong."""
     for name, value in puzzle.truth.items():
-        e = found.estimates[name]
+        e = result.estimates[name]
         if e.sd is None:
             return f"false alarm: {name} not determined"
         if abs(e.value - value) > 5 * e.sd:
@@ -466,10 +468,10 @@ def main() -> int:
     for puzzle in zoo(options.small):
         if options.only not in puzzle.name:
             continue
-        found = fit(puzzle.problem)
-        said = complaint(puzzle, found)
+        result = fit(puzzle.problem)
+        said = complaint(puzzle, result)
         count, wrong = count + 1, wrong + bool(said)
-        print(f"{'WRONG' if said else 'right'}  {puzzle.name}: {said or found.status}", flush=True)
+        print(f"{'WRONG' if said else 'right'}  {puzzle.name}: {said or result.status}", flush=True)
     print(f"{count - wrong} of {count} right, {time.monotonic() - begin:.0f} s")
     return int(wrong > 0)
 

@@ -7,6 +7,7 @@ Importing the package changes no setting; names are loaded when they are first u
 import importlib
 from typing import TYPE_CHECKING, Any
 
+# For type checkers and editors, which know nothing of __getattr__; `as` marks a name as exported.
 if TYPE_CHECKING:
     from heli_jax import models as models
     from heli_jax.analysis.linear import linearize as linearize
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from heli_jax.workflow import run_sweep as run_sweep
     from heli_jax.workflow import write_report as write_report
 
+# Which module each name is of, loaded when the name is first used: `import heli_jax` and
+# `heli-jax --help` would otherwise wait seconds for JAX, diffrax and xarray.
 _HOMES = {
     "Helicopter": "vehicle",
     "load_vehicle": "vehicle",
@@ -81,13 +84,15 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> Any:  # any of them
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax' has no attribute {name!r}")
+    # A module itself: `heli_jax.models` has no attribute `models` to ask for.
     if name == "models":
         return importlib.import_module("heli_jax.models")
     return getattr(importlib.import_module(f"heli_jax.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
+    # For completion in a session: without it only the names used so far would be offered.
     return sorted(_HOMES)

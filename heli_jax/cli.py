@@ -9,16 +9,22 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from heli_jax import run_directory
 from heli_jax.errors import InputError
 
+if TYPE_CHECKING:
+    from heli_jax.identification.result import Fit
+
+# 2 is what argparse ends with, 130 what a shell reports of a program ended by SIGINT (128 + 2).
 DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 4, 130
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
+        # One line as all other errors; argparse would print the usage of the command before it.
         print(f"heli-jax: {message} (heli-jax --help lists the commands)", file=sys.stderr)
         raise SystemExit(WRONG_INPUT)
 
@@ -37,12 +43,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _say("interrupted; nothing was written")
             return INTERRUPTED
         except BrokenPipeError:
+            # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
+            # once more at the end, and complain.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return DONE
         except Exception as e:
+            # Whatever it says: an interrupt of which a library has made an error of its own.
             if seen:
                 _say("interrupted")
                 return INTERRUPTED
+            # Everything else is a fault of ours, and its traceback is what a report of it needs.
             if not isinstance(e, InputError):
                 raise
             _say(" ".join(str(e).split()))
@@ -54,12 +64,13 @@ def _interrupts() -> Iterator[list[int]]:
     """The interrupts that came, also those that a library on the way makes another error of."""
     seen: list[int] = []
     before = signal.getsignal(signal.SIGINT)
+    # Python sets handlers in its main thread alone; elsewhere signal.signal raises.
     ours = threading.current_thread() is threading.main_thread()
     if not ours or before is not signal.default_int_handler:
         yield seen  # another's, or interrupts are ignored
         return
 
-    def note(number: int, frame: Any) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         seen.append(number)
         signal.default_int_handler(number, frame)
 
@@ -76,9 +87,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Physical parameters of small helicopters from logged runs, with honest "
         "uncertainties.",
     )
+    # Each command's function becomes `options.run`, so that `main` needs no table of them.
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Callable[[argparse.Namespace], int], words: str) -> Any:
+    def command(
+        name: str, run: Callable[[argparse.Namespace], int], words: str
+    ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=words, description=words)
         added.set_defaults(run=run)
         return added
@@ -152,14 +166,19 @@ def _count(text: str) -> int:
 
 
 def _say(text: str) -> None:
+    # On standard error: standard output is for results, which may be piped on.
     print(f"heli-jax: {text}", file=sys.stderr, flush=True)
 
 
 def _prepare_jax() -> None:
     """float64, and a compilation cache that takes everything. Only entry points do this."""
+    # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
+    # option, --help and `info` need none of them.
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
+    # add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(_cache()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -175,7 +194,7 @@ def _fit(options: argparse.Namespace) -> int:
     began = time.perf_counter()  # before JAX is imported, which the user waits for too
     config = Path(options.config)
     out = Path(options.out) if options.out else run_directory.default_directory(config)
-    run_directory.require_free(out)
+    run_directory.require_free(out)  # at once, before the seconds of the imports
     _prepare_jax()
     from heli_jax import output, workflow
 
@@ -185,12 +204,14 @@ def _fit(options: argparse.Namespace) -> int:
     return _fit_code(run.fit)
 
 
-def _fit_code(found: Any) -> int:
+def _fit_code(fitted: "Fit") -> int:
     """The exit code of a fit; what is wrong with the model itself is said on standard error."""
-    for reason in found.adequacy.reasons:
+    for reason in fitted.adequacy.reasons:
         _say(f"the model is not adequate: {reason}")
-    code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(found.status, NOT_CONVERGED)
-    if code == DONE and found.adequacy.less_than_mean:
+    code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(fitted.status, NOT_CONVERGED)
+    # Converged onto a model worse than a constant: a script that looks at the code alone must not
+    # take these numbers.
+    if code == DONE and fitted.adequacy.less_than_mean:
         return NOT_CONVERGED
     return code
 
@@ -214,6 +235,7 @@ def _simulate(options: argparse.Namespace) -> int:
         view = Path(options.view) if options.view else beside
         if view.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--view {view}: expected a name ending in .html")
+    # Both places before the simulation: what cannot be written is known now.
     for option, place in (("--out", out), ("--view", view)):
         if place is not None:
             run_directory.require_place(place, f"{option} {place}")
@@ -257,6 +279,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import output, workflow
 
     experiment = workflow.load_config(config, options.set)
+    # Not by `main` like other commands': here there is something to go on with.
     try:
         with output.sweep_progress() as progress, _client(options, config) as client:
             workflow.run_sweep(
@@ -264,6 +287,7 @@ def _sweep(options: argparse.Namespace) -> int:
                 out,
                 figures=not options.no_figures,
                 resume=options.resume,
+                # Of GPUs there are as many as there are, so --devices takes the first of them.
                 devices=jax.local_devices()[: options.devices],
                 client=client,
                 memory=_cache() / "lanes.json",
@@ -278,7 +302,8 @@ def _sweep(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _client(options: argparse.Namespace, config: Path) -> Any:
+# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
+def _client(options: argparse.Namespace, config: Path) -> contextlib.AbstractContextManager[Any]:
     """A dask client where one is asked for."""
     if options.scheduler is None and options.workers is None:
         return contextlib.nullcontext()
@@ -290,6 +315,7 @@ def _client(options: argparse.Namespace, config: Path) -> Any:
             f"{option}: dask.distributed is not installed, expected the extra distributed: "
             "pip install 'heli_jax[distributed]'"
         ) from e
+    # Workers import models and reducers of one's own from the configuration's folder.
     return connected(options.scheduler, options.workers, config.absolute().parent)
 
 

@@ -28,7 +28,9 @@ def estimates_frame(estimates: Mapping[str, Any]) -> "pd.DataFrame":
     rows = {name: [getattr(e, c) for c in columns] for name, e in estimates.items()}
     frame = pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
     numeric = [c for c in columns if c != "unit"]
-    frame = frame.astype(dict.fromkeys(numeric, float))  # None, not determined, becomes NaN
+    # None, where the data do not determine a parameter, becomes NaN: a column with None is of
+    # objects, which pandas neither sums nor plots.
+    frame = frame.astype(dict.fromkeys(numeric, float))
     return frame.rename_axis("parameter")
 
 
@@ -45,22 +47,26 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
     """
     import xarray as xr
 
+    # vmap puts batch dimensions in front, so time is the last of every signal.
     times = np.asarray(run.times)
     batch = [f"run_{i}" for i in range(times.ndim - 1)]
+    # One coordinate for all runs: a Dataset has no `time` that differs from run to run.
     first = times.reshape(-1, times.shape[-1])[0]
     if not (times == first).all():
         raise ValueError("to_xarray: expected the same times in every run of the batch")
     variables: dict[str, Any] = {}
     for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs)):
         for name, values in naming.asdict(record).items():
-            known = name if name not in variables else f"{name}_{role}"
+            # States come first and keep their names; `roll` is usually both state and output.
+            unique = name if name not in variables else f"{name}_{role}"
             attributes = {"units": naming.unit(type(record), name) or "", "role": role}
-            variables[known] = ([*batch, "time"], np.asarray(values), attributes)
+            variables[unique] = ([*batch, "time"], np.asarray(values), attributes)
     status = (batch, np.asarray(run.status), {"meaning": "index into trajectory.STATUS"})
     coordinates = {"time": ("time", first, {"units": "s"}), "status": status}
     return xr.Dataset(variables, coordinates)
 
 
+# arviz is an extra, so its class cannot be named here.
 def posterior_tree(draws: Mapping[str, np.ndarray]) -> Any:
     """Posterior draws, each (chains, draws), as arviz' inference data with a group `posterior`.
 

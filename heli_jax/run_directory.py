@@ -30,23 +30,27 @@ def require_free(path: Path, otherwise: str = "") -> None:
     """
     if os.path.lexists(path):  # a link to nothing is in the way too
         raise InputError(f"--out {path}: exists already, expected a new directory{otherwise}")
+    # The nearest that exists: those between are made when the directory is.
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(f"--out {path}: {parent} is no folder that can be written to")
+        raise InputError(
+            f"--out {path}: expected a place in a folder that can be written to, got {parent}"
+        )
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A temporary directory beside `path`, renamed to it at the end, removed where that fails."""
+    # Beside it and not in /tmp: a rename is atomic within one file system only.
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.absolute().parent))
     try:
         yield temporary
-        temporary.chmod(0o755)
+        temporary.chmod(0o755)  # mkdtemp makes it for its owner alone
         os.rename(temporary, path)
-    except BaseException:
+    except BaseException:  # an interrupt too
         shutil.rmtree(temporary, ignore_errors=True)
         raise
 
@@ -70,6 +74,7 @@ def whole_file(path: Path, where: str) -> Iterator[Path]:
         InputError: the place cannot be written to, or is a folder, a pipe or a device.
     """
     require_place(path, where)
+    # With the ending of the file itself, by which writers choose the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

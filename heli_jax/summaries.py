@@ -18,6 +18,7 @@ from heli_jax.numbers import NOTHING, measured, number, percent
 type Row = tuple[str, ...]
 
 
+# Between objects and their layout, so that text and HTML cannot differ in what they show.
 class Summary(NamedTuple):
     """What is shown of an object."""
 
@@ -30,6 +31,7 @@ class Summary(NamedTuple):
 def as_text(summary: Summary) -> str:
     """A summary as lines of text, its columns in line."""
     rows = [row for row in (summary.head, *summary.rows) if row]
+    # Without rows and head there are no columns, and zip gives none.
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  " + "  ".join(map(str.ljust, row, widths)).rstrip() if any(row) else "" for row in rows
@@ -56,6 +58,7 @@ def of_flight(flight: Any) -> Summary:
     for role in ("inputs", "outputs"):
         for name, values in getattr(flight, role).items():
             hold = flight.hold[name] if role == "inputs" else ""
+            # Outputs have no hold: they are compared at their samples alone.
             rows.append((role[:-1], name, *_range(values), hold))
     used = ", held out" if flight.hold_out else ""
     known = [f"differs in {n} = {number(v, 6)}" for n, v in flight.known.items()]
@@ -70,6 +73,7 @@ def of_flight(flight: Any) -> Summary:
 
 def of_problem(problem: Any) -> Summary:
     """What is free, with bounds and priors, and which flights are fitted."""
+    # As stated, not as transformed: the search may be in logarithms.
     rows = []
     for name, free in problem.free.items():
         prior = "" if free.prior is None else f"{number(free.prior.mean)} ± {number(free.prior.sd)}"
@@ -88,12 +92,14 @@ def of_problem(problem: Any) -> Summary:
 
 def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
     """Head and rows: value, sd, 95 % interval, unit and prior share of each estimate."""
+    # prior share: of the posterior's precision (1/sd²), what the prior and not the data gives.
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     rows = []
     for name, e in estimates.items():
         if e.sd is None or e.lower95 is None or e.upper95 is None:
             cells = ("not determined", "", "")
         else:
+            # To the digits that the sd leaves, all four alike.
             value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
             cells = (value, sd, f"{low} to {high}")
         rows.append((name, *cells, e.unit, percent(e.prior_share, 0)))
@@ -106,6 +112,7 @@ def of_fit(fit: Any) -> Summary:
     agreement = [f"{name}: VAF {percent(m.vaf)}" for name, m in fit.metrics.items()]
     return Summary(
         f"Fit of {fit.model} by {fit.method}: {fit.status}",
+        # The interval's own name: whether it allows for autocorrelated residuals.
         (*head[:3], fit.interval, *head[4:]),
         rows,
         (fit.verdict.text, *agreement, *fit.notes),
@@ -120,11 +127,13 @@ def of_trajectory(run: Any, statuses: Sequence[str]) -> Summary:
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
         for name, values in naming.asdict(record).items()
     ]
+    # A repr must never fail: within jit there are no numbers, only shapes.
     if np.ndim(run.times) != 1 or not _concrete([run.times, run.finite, *(v for *_, v in signals)]):
         shape = tuple(np.shape(run.times))
         rows = tuple((role, name, str(tuple(np.shape(v)))) for role, name, v in signals)
         return Summary(f"Trajectory, times of shape {shape}", ("", "signal", "shape"), rows)
     times = np.asarray(run.times)
+    # By role as well: an output may have another unit than the state of the same name.
     units = {
         (role, name): naming.unit(type(record), name) or ""
         for role, record in (("state", run.states), ("output", run.outputs), ("input", run.inputs))
@@ -145,7 +154,7 @@ def of_vehicle(vehicle: Any) -> Summary:
     for name, value in naming.asdict(vehicle).items():
         if not _concrete([value]) or np.ndim(value) != 0:
             shown = f"shape {tuple(np.shape(value))}" if hasattr(value, "shape") else repr(value)
-        elif np.isnan(float(value)):
+        elif np.isnan(float(value)):  # how a Helicopter marks a constant that its file left out
             missing.append(name)
             continue
         else:
@@ -166,10 +175,11 @@ def _concrete(values: Iterable[Any]) -> bool:
 
 
 def _range(values: np.ndarray) -> tuple[str, str]:
-    seen = np.asarray(values, float)[np.isfinite(values)]
-    if not seen.size:
+    # NaN stands for samples that are missing, and for a run from where it diverged.
+    finite = np.asarray(values, float)[np.isfinite(values)]
+    if not finite.size:
         return NOTHING, NOTHING
-    return number(float(seen.min())), number(float(seen.max()))
+    return number(float(finite.min())), number(float(finite.max()))
 
 
 def _quoted(name: str) -> str:

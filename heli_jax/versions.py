@@ -8,5 +8,6 @@ _PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "n
 
 def versions() -> dict[str, str]:
     """The versions of Python and of the packages that numbers depend on."""
-    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {"python": platform.python_version(), **found}
+    # Of the installed distributions: not every package has a __version__, and none is imported.
+    packages = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version(), **packages}

@@ -30,9 +30,12 @@ if TYPE_CHECKING:
 
     from heli_jax.sweeps.spec import Job
 
+# Words for people as the work goes on. A function and not a logger, which a notebook would have to
+# set up and the command line to capture.
 type Say = Callable[[str], None]
 
 
+# A function of its own, so that the default of `progress` has a name in help().
 def _silent(_: str) -> None:
     pass
 
@@ -53,6 +56,8 @@ class FitRun:
     began: float = field(default_factory=time.perf_counter)
     """when the work began, by `time.perf_counter` [s]"""
 
+    # Drawn anew each time: a figure that is kept could be changed by who got it before. Any, since
+    # matplotlib's classes are named in `report` alone.
     def figure(self, name: str) -> Any:
         """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`, `bode`,
         `starts`, ...
@@ -60,7 +65,8 @@ class FitRun:
         Raises:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
-        from heli_jax.report.html import Analysis, drawings  # matplotlib: slow
+        # Here, since matplotlib takes a second, and a fit without report needs none of it.
+        from heli_jax.report.html import Analysis, drawings
         from heli_jax.report.style import styled
 
         draw = drawings(Analysis(self.fit, self.problem, self.baseline, self.supplementary))
@@ -103,7 +109,7 @@ def run_fit(
     Args:
         config: of `load_config`, or the path of a configuration.
         out: a new directory for the report, as of `write_report`; none is written unless given.
-        progress: told in words what the log's reader assumed and what is going on.
+        progress: called with what the log's reader assumed and what is going on, in words.
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
@@ -114,6 +120,7 @@ def run_fit(
         run_directory.require_free(Path(out))  # before the work, not after it
     config = config if isinstance(config, Experiment) else load_config(config)
     problem = configuration.problem(config)
+    # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for note in reading_notes(problem):
         progress(note)
     options = config.config.fit
@@ -126,7 +133,7 @@ def run_fit(
             max_steps=options.max_steps,
             progress=progress,
         )
-    except ValueError as e:
+    except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
     run = FitRun(
         config,
@@ -147,7 +154,7 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 
     Args:
         config: of `load_config`, or the path of a configuration.
-        progress: told in words what the log's reader assumed.
+        progress: called with what the log's reader assumed, in words.
 
     Raises:
         InputError: a log or something of the configuration is wrong.
@@ -171,6 +178,7 @@ def reading_notes(problem: Problem) -> list[str]:
         notes += [
             f"{where}: {name} is taken as linear between samples, since it {reason}"
             for name, reason in flight.hold_reason.items()
+            # Held inputs are what a reader expects of a stick, and need no word.
             if flight.hold[name] == "linear"
         ]
     return notes
@@ -182,12 +190,13 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
         return None
     progress("recursive least squares")
     started = time.perf_counter()
+    # A baseline that fails must not cost the fit: too short a record, or a model that has none.
     estimate = None
     try:
         estimate = baseline(
             config.model,
             config.vehicle.params,
-            problem.training[0],
+            problem.training[0],  # RLS takes one record; the paper has no other
             order=options.order,
             forgetting=options.forgetting,
         )
@@ -233,13 +242,14 @@ def compare_models(
         config: of `load_config`, or the path of a configuration.
         problem: the configuration's problem where it is at hand (`FitRun.problem`), so that the
             logs need not be read again.
-        progress: told in words what is going on.
+        progress: called with what is going on, in words.
 
     Raises:
         InputError: no axis of the model can be disturbed, or a model cannot be fitted.
     """
     config = config if isinstance(config, Experiment) else load_config(config)
-    candidates = configuration.rivals(config, problem or configuration.problem(config))
+    # All share the fitted problem's flights: likelihoods of different data do not compare.
+    candidates = configuration.candidate_models(config, problem or configuration.problem(config))
     try:
         return choose(candidates.problems, candidates.nested, progress=progress)
     except ValueError as e:
@@ -254,11 +264,12 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     Raises:
         InputError: `out` exists or cannot be written to.
     """
-    from heli_jax.report.html import Analysis  # matplotlib: slow
+    from heli_jax.report.html import Analysis
     from heli_jax.report.html import write_report as write_page
 
     out = Path(out)
     run_directory.require_free(out)
+    # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, run.supplementary
     with run_directory.whole(out) as folder:
@@ -269,6 +280,7 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
         write_page(folder, analysis, title, vehicle.constants)
         run.fit.timing["report"] = time.perf_counter() - started
+        # fit.json comes last, since it holds how long all the rest took.
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)
         files.write_json(folder / "fit.json", content)
@@ -299,6 +311,7 @@ def run_sweep(
         InputError: something of the configuration is wrong, or `out` exists (without `resume`),
             is of another sweep, or cannot be written to.
     """
+    # Here, since xarray and zarr take a second, which a fit should not wait for.
     from heli_jax.sweeps.run import Options
     from heli_jax.sweeps.run import run_sweep as run_job
 
@@ -308,15 +321,18 @@ def run_sweep(
     assert design is not None  # `_sweep_job` refuses a configuration without
     resolved = as_yaml(configuration.resolved(config))
     notes = []
+    # Not refused: a fit's configuration has its disturbance, and a sweep over Ixx may do without.
     if config.config.disturbance is not None and "seed" not in job.design.names:
         notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
     out = None if out is None else Path(out)
+    # What is given here goes before what the configuration says.
     carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
     try:
         dataset = run_job(
             job,
             out,
             carrying,
+            # In the directory to be run again, in the store to travel with the numbers.
             files={"config.yaml": resolved},
             attributes={"configuration": resolved, "seed": design.seed or 0},
             notes=notes,
@@ -332,6 +348,7 @@ def run_sweep(
 
 
 def _sweep_job(config: Experiment) -> "Job":
+    # `drive` gives the experiment anew, since wind adds inputs to its model.
     from heli_jax import generate
     from heli_jax.config.sweeps import simulates, sweep_job
 
@@ -349,8 +366,9 @@ def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
 
     try:
         write_figures(out / "figures", dataset, worst(dataset, job))
-    except OSError as e:
+    except OSError as e:  # the results are safe in the store by now
         raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
+    # A figure for each result and axis: of dozens nobody would look at any.
     count = len(results(dataset))
     if count > RESULTS:
         say(f"slices and maps are of the first {RESULTS} of {count} results")

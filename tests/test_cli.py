@@ -239,7 +239,7 @@ WRONG = {
     ),
     "fixed but not given": (
         lambda c: c.update(disturbance={"axis": "roll", "fixed": ["tau_w"]}),
-        ["disturbance", "tau_w is fixed but not given"],
+        ["disturbance: tau_w: missing, expected its value, since it is fixed"],
     ),
     "noise parameter free": (
         lambda c: (
@@ -481,10 +481,10 @@ def test_a_model_of_ones_own(tmp_path, capsys):
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(config))
     assert main(["fit", str(path), "--out", str(tmp_path / "run")]) == 0
-    found = json.loads((tmp_path / "run" / "fit.json").read_text())["parameters"]
-    assert found["Lp"]["value"] == pytest.approx(-4.0, abs=4 * found["Lp"]["sd"])
-    assert found["Lda"]["value"] == pytest.approx(2.5, abs=4 * found["Lda"]["sd"])
-    assert found["Lp"]["lower95"] < found["Lp"]["value"] < found["Lp"]["upper95"] < 0
+    estimates = json.loads((tmp_path / "run" / "fit.json").read_text())["parameters"]
+    assert estimates["Lp"]["value"] == pytest.approx(-4.0, abs=4 * estimates["Lp"]["sd"])
+    assert estimates["Lda"]["value"] == pytest.approx(2.5, abs=4 * estimates["Lda"]["sd"])
+    assert estimates["Lp"]["lower95"] < estimates["Lp"]["value"] < estimates["Lp"]["upper95"] < 0
 
 
 @pytest.mark.skipif(not TREX.exists(), reason="the real logs are not at ../shared/data")

@@ -7,7 +7,9 @@ import pytest
 import yaml
 
 from heli_jax import config as configuration
+from heli_jax.config import schema
 from heli_jax.errors import InputError
+from heli_jax.identification.problem import Free, Nuisance, Prior
 
 ROOT = Path(__file__).parents[1]
 XCELL = str(ROOT / "configs" / "vehicles" / "x-cell-60.yaml")
@@ -34,10 +36,10 @@ def load(tmp_path):
     ],
 )
 def test_the_helicopter_by_name(load, name, model):
-    found = load(model=name)
-    assert found.model.name == model
-    assert load(model=name).model is found.model
-    assert "beta_roll" in found.model.State._fields
+    experiment = load(model=name)
+    assert experiment.model.name == model
+    assert load(model=name).model is experiment.model
+    assert "beta_roll" in experiment.model.State._fields
 
 
 def test_a_slow_log_gets_more_steps_a_sample(load, tmp_path):
@@ -51,12 +53,12 @@ def test_a_slow_log_gets_more_steps_a_sample(load, tmp_path):
         "inputs": {"x_roll": {"signal": "u", "unit": "mm"}},
         "outputs": {"roll": {"signal": "y", "unit": "rad"}},
     }
-    found = load(
+    experiment = load(
         model="roll",
         flights=[{"log": "log.csv", "signals": signals}],
         fit={"free": {"Ixx": {"start": 0.2}}},
     )
-    assert configuration.problem(found).substeps == 10
+    assert configuration.problem(experiment).substeps == 10
 
 
 def test_corrections_switch_on_and_off(load):
@@ -89,19 +91,19 @@ def test_wrong_models_and_corrections(load, content, words):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
 def test_shipped_configurations(path):
-    found = configuration.load(path)
-    wanted = found.config
-    assert wanted.simulate is not None
-    for i, flight in enumerate(wanted.flights):
+    experiment = configuration.load(path)
+    config = experiment.config
+    assert config.simulate is not None
+    for i, flight in enumerate(config.flights):
         where = f"{path}: flights[{i}].signals"
-        configuration.signals(found.model, "inputs", flight.signals.inputs, where)
-        configuration.signals(found.model, "outputs", flight.signals.outputs, where)
-        assert set(wanted.simulate.noise) <= set(flight.signals.outputs)
-    for name, free in wanted.fit.free.items() if wanted.fit else ():
+        configuration.signals(experiment.model, "inputs", flight.signals.inputs, where)
+        configuration.signals(experiment.model, "outputs", flight.signals.outputs, where)
+        assert set(config.simulate.noise) <= set(flight.signals.outputs)
+    for name, free in config.fit.free.items() if config.fit else ():
         low, high = free.lower or 0.0, free.upper or float("inf")
         assert low < free.start < high
         # A fit that begins at the truth could not fail.
-        assert free.start != float(getattr(found.vehicle.params, name))
+        assert free.start != float(getattr(experiment.vehicle.params, name))
 
 
 @pytest.mark.parametrize(
@@ -119,3 +121,17 @@ def test_wrong_runs(load, simulate, words):
         load(simulate={"duration": 2, "rate": 50, **simulate})
     for word in words:
         assert word in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("section", "record"),
+    [
+        (schema.FreeConfig, Free),
+        (schema.PriorConfig, Prior),
+        (schema.NuisanceConfig, Nuisance),
+    ],
+)
+def test_sections_have_the_fields_of_their_records(section, record):
+    defaults = {n: f.default for n, f in section.model_fields.items() if not f.is_required()}
+    assert tuple(section.model_fields) == record._fields
+    assert defaults == record._field_defaults

@@ -157,9 +157,9 @@ def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
     path = folder / "no-units.yaml"
     path.write_text(text)
     assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 0
-    told = capsys.readouterr().err
-    assert "bench.csv: x_roll: no unit stated, taken as m\n" in told
-    assert "bench.csv: roll: no unit stated, taken as rad\n" in told
+    printed = capsys.readouterr().err
+    assert "bench.csv: x_roll: no unit stated, taken as m\n" in printed
+    assert "bench.csv: roll: no unit stated, taken as rad\n" in printed
     saved = heli_jax.load_fit(tmp_path / "fit")
     assert saved.content["data"][0]["notes"] == [
         "x_roll: no unit stated, taken as m",

@@ -52,7 +52,7 @@ IN_C = (
 
 
 class Run(NamedTuple):
-    """What all programs are given."""
+    """What all programs start from."""
 
     start: Any
     """the state in hover"""
@@ -96,7 +96,7 @@ def in_turn(
 def batch(run: Run) -> Callable[[Array], Array]:
     """Sum of roll^2 of vehicles that differ in Ixx, in blocks, nothing else kept."""
 
-    def one(Ixx: Array) -> Array:
+    def vehicle(Ixx: Array) -> Array:
         total, _ = accumulate(
             MODEL,
             replace(VEHICLE, Ixx=Ixx),
@@ -111,7 +111,7 @@ def batch(run: Run) -> Callable[[Array], Array]:
         )
         return total
 
-    return lambda Ixx: jax.lax.map(one, Ixx, batch_size=BLOCK)
+    return lambda Ixx: jax.lax.map(vehicle, Ixx, batch_size=BLOCK)
 
 
 def in_c(run: Run) -> Callable[[], np.ndarray]:
@@ -234,10 +234,10 @@ def check_right_hand_side(run: Run) -> None:
     for _ in range(20):
         x = np.array([float(v) for v in run.start]) + 0.3 * rng.standard_normal(len(run.start))
         u = [float(v[0]) for v in run.inputs]
-        found = MODEL.vector_field(vehicle, MODEL.State(*jnp.asarray(x)), MODEL.Inputs(*u))
+        ours = MODEL.vector_field(vehicle, MODEL.State(*jnp.asarray(x)), MODEL.Inputs(*u))
         for numbers in (NUMPY, PYTHON):
             rates = right_hand_side(first_vehicle(), numbers)(0.0, x, u)
-            np.testing.assert_allclose(rates, np.array(found), rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(rates, np.array(ours), rtol=1e-9, atol=1e-9)
 
 
 def by_samples(run: Run, numbers: Numbers) -> float:
@@ -261,8 +261,8 @@ def by_one_call(run: Run, numbers: Numbers) -> float:
         return rates(t, state, sticks[int(t / DT)])
 
     ends = (0.0, float(times[-1]))
-    found = solve_ivp(looked_up, ends, x, method="RK45", rtol=1e-6, max_step=DT, t_eval=times)
-    return float(np.sum(found.y[3] ** 2))
+    solution = solve_ivp(looked_up, ends, x, method="RK45", rtol=1e-6, max_step=DT, t_eval=times)
+    return float(np.sum(solution.y[3] ** 2))
 
 
 # Derivatives.
@@ -273,11 +273,11 @@ def outputs(run: Run) -> Callable[[Array], Array]:
 
     def of(values: Array) -> Array:
         vehicle = replace(VEHICLE, **dict(zip(FREE, values, strict=True)))
-        found = simulate(
+        trajectory = simulate(
             MODEL, vehicle, run.inputs, dt=jnp.asarray(DT), initial_state=run.start,
             solver="rk4", substeps=SUBSTEPS, adjoint=diffrax.ForwardMode(),
         )  # fmt: skip
-        return jnp.stack(found.outputs)
+        return jnp.stack(trajectory.outputs)
 
     return of
 
@@ -287,9 +287,11 @@ def check_derivative(
 ) -> None:
     """The column of m against a central difference."""
     h = 1e-5 * z * (np.array(FREE) == "m")
-    wanted = (forward(z + h) - forward(z - h)) / (2 * h.sum())
-    found = jacobian(z)[:, :, FREE.index("m")]
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5 * float(jnp.abs(wanted).max()))
+    expected = (forward(z + h) - forward(z - h)) / (2 * h.sum())
+    column = jacobian(z)[:, :, FREE.index("m")]
+    np.testing.assert_allclose(
+        column, expected, rtol=1e-5, atol=1e-5 * float(jnp.abs(expected).max())
+    )
 
 
 def main() -> None:
@@ -305,25 +307,25 @@ def main() -> None:
 
     check_right_hand_side(run)
     for name, alone in (("a sample", by_samples), ("a run", by_one_call)):
-        for kind, numbers, wanted in (("NumPy", NUMPY, "<= 0.002"), ("Python", PYTHON, "")):
+        for kind, numbers, target in (("NumPy", NUMPY, "<= 0.002"), ("Python", PYTHON, "")):
             np.testing.assert_allclose(alone(run, numbers), ours(Ixx)[0], rtol=1e-3)
             a, b, ratio = in_turn(
                 lambda: ours(Ixx), lambda alone=alone, numbers=numbers: alone(run, numbers), 5
             )
             scaled = (a, VEHICLES * b, ratio / VEHICLES)
             title = f"{size} / as many solve_ivp, one call {name}, numbers of {kind}"
-            rows.append((title, scaled, wanted))
+            rows.append((title, scaled, target))
 
     z = jnp.asarray([float(getattr(VEHICLE, n)) for n in FREE])
     zs = z * jnp.linspace(0.98, 1.02, BLOCK)[:, None]
-    one = outputs(run)
+    outputs_of = outputs(run)
 
     def blocks(zs: Array) -> Array:
-        return jax.lax.map(jax.jacfwd(one), zs, batch_size=JACOBIAN_BLOCK)
+        return jax.lax.map(jax.jacfwd(outputs_of), zs, batch_size=JACOBIAN_BLOCK)
 
     for name, f, slope, at in (
-        ("1 vehicle", one, jax.jacfwd(one), z),
-        (f"{BLOCK} vehicles", jax.vmap(one), blocks, zs),
+        ("1 vehicle", outputs_of, jax.jacfwd(outputs_of), z),
+        (f"{BLOCK} vehicles", jax.vmap(outputs_of), blocks, zs),
     ):
         forward, seconds[f"{name}, outputs"] = compile_time(f, at)
         jacobian, seconds[f"{name}, outputs' Jacobian"] = compile_time(slope, at)
@@ -334,13 +336,13 @@ def main() -> None:
 
     evaluations = VEHICLES * (N - 1) * SUBSTEPS * 4
     print(f"{N} samples, {SUBSTEPS} steps each, blocks of {BLOCK}, one core, jax {jax.__version__}")
-    print(f"{'':72s} {'ours [ms]':>10s} {'other [ms]':>11s} {'ratio':>8s}  wanted")
-    for name, (a, b, ratio), wanted in rows:
-        print(f"{name:72s} {1e3 * a:10.2f} {1e3 * b:11.2f} {ratio:8.4f}  {wanted}")
+    print(f"{'':72s} {'ours [ms]':>10s} {'other [ms]':>11s} {'ratio':>8s}  target")
+    for name, (a, b, ratio), target in rows:
+        print(f"{name:72s} {1e3 * a:10.2f} {1e3 * b:11.2f} {ratio:8.4f}  {target}")
     (_, (a, b, _), _), *_ = rows
     each = f"{1e9 * a / evaluations:.0f} ns, in C {1e9 * b / evaluations:.0f} ns"
     print(f"one right-hand side: {each}")
-    print(f"{'compilation':72s} {'[s]':>10s} {'':11s} {'':8s}  wanted")
+    print(f"{'compilation':72s} {'[s]':>10s} {'':11s} {'':8s}  target")
     for name, value in seconds.items():
         print(f"{name:72s} {value:10.1f} {'':11s} {'':8s}  <= 20")
 

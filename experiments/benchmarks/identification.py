@@ -103,9 +103,9 @@ def fit_against_scipy(flight: Flight) -> tuple[tuple[float, ...], tuple[float, .
         return np.append(r, (v["a"] - 5.5) / 0.5)
 
     start = np.log([0.05, 5e-4, 5.0])
-    found = fit(problem)
+    result = fit(problem)
     theirs = scipy.optimize.least_squares(residual, start, x_scale="jac", ftol=1e-10, xtol=1e-10)
-    ours = np.array([e.value for e in found.estimates.values()])
+    ours = np.array([e.value for e in result.estimates.values()])
     assert np.allclose(ours, np.exp(theirs.x), rtol=1e-3), (ours, np.exp(theirs.x))
 
     def scipys() -> Any:
@@ -142,7 +142,7 @@ def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Arr
     u = models.roll_on_stand.Inputs(x_roll=jnp.asarray(flight.inputs["x_roll"]))
     y = jnp.asarray(flight.outputs["roll"])
 
-    def one(i: jax.Array) -> jax.Array:
+    def misfit(i: jax.Array) -> jax.Array:
         total, _ = accumulate(
             models.roll_on_stand,
             replace(VEHICLE, Ixx=i),
@@ -157,7 +157,7 @@ def batched(flight: Flight, Ixx: jax.Array, solver: str) -> Callable[[], jax.Arr
         )
         return total / N
 
-    run = jax.jit(lambda Ixx: jax.lax.map(one, Ixx, batch_size=BLOCK))
+    run = jax.jit(lambda Ixx: jax.lax.map(misfit, Ixx, batch_size=BLOCK))
     return lambda: run(Ixx)
 
 
@@ -185,9 +185,9 @@ def simulation_against_c(flight: Flight, solver: str) -> tuple[float, ...]:
         q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
         k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
         k2 = q * v["R"] ** 4 / (2 * Ixx * v["L1"] * (v["L2"] + v["L3"]))
-        one = np.ones(BATCH)
-        rows = [k1 * one, one / v["L5"], one / v["Omega"], v["Omega"] ** 2 * one, k2 * v["L3"]]
-        rows += [k2 * v["L2"] * v["L4"], v["kappa"] * one, v["zeta"] * one]
+        ones = np.ones(BATCH)
+        rows = [k1 * ones, ones / v["L5"], ones / v["Omega"], v["Omega"] ** 2 * ones, k2 * v["L3"]]
+        rows += [k2 * v["L2"] * v["L4"], v["kappa"] * ones, v["zeta"] * ones]
         par = np.ascontiguousarray(np.array(rows))
 
         def theirs() -> np.ndarray:
@@ -213,9 +213,9 @@ def main() -> None:
         (f"RK4 x{SUBSTEPS}, {BATCH} vehicles / C", simulation_against_c(flight, "rk4"), "<= 2.0"),
     ]
     print(f"{N} samples, one core, jax {jax.__version__}")
-    print(f"{'':47s} {'ours [ms]':>10s} {'other [ms]':>10s} {'ratio':>8s}  wanted")
-    for name, (a, b, ratio), wanted in rows:
-        print(f"{name:47s} {1e3 * a:10.2f} {1e3 * b:10.2f} {ratio:8.4f}  {wanted}")
+    print(f"{'':47s} {'ours [ms]':>10s} {'other [ms]':>10s} {'ratio':>8s}  target")
+    for name, (a, b, ratio), target in rows:
+        print(f"{name:47s} {1e3 * a:10.2f} {1e3 * b:10.2f} {ratio:8.4f}  {target}")
 
 
 if __name__ == "__main__":

@@ -103,10 +103,10 @@ def ours(flight: Flight, n: int, solver: str, **options: Any) -> float:
 
 def in_threads(work: Callable[[int], None], threads: int) -> None:
     running = [threading.Thread(target=work, args=(k,)) for k in range(threads)]
-    for one in running:
-        one.start()
-    for one in running:
-        one.join()
+    for thread in running:
+        thread.start()
+    for thread in running:
+        thread.join()
 
 
 def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -123,17 +123,21 @@ def arrays(n: int) -> tuple[np.ndarray, np.ndarray]:
     q = v["rho"] * v["Omega"] ** 2 * v["a"] * v["c"]
     k1 = q * (v["R2"] ** 4 - v["R1"] ** 4) / (8 * v["If"])
     k2 = q * v["R"] ** 4 / (2 * v["Ixx"] * v["L1"] * (v["L2"] + v["L3"]))
-    one = np.ones(n)
-    rows = [k1, one / v["L5"], one / v["Omega"], v["Omega"] ** 2 * one, k2 * v["L3"]]
-    rows += [k2 * v["L2"] * v["L4"], v["kappa"] * one, v["zeta"] * one]
+    ones = np.ones(n)
+    rows = [k1, ones / v["L5"], ones / v["Omega"], v["Omega"] ** 2 * ones, k2 * v["L3"]]
+    rows += [k2 * v["L2"] * v["L4"], v["kappa"] * ones, v["zeta"] * ones]
     return coefficients, np.array(rows)
 
 
 def in_c(
-    kernel: Any, flight: Flight, solver: str, given: tuple[np.ndarray, np.ndarray], threads: int
+    kernel: Any,
+    flight: Flight,
+    solver: str,
+    coefficients: tuple[np.ndarray, np.ndarray],
+    threads: int,
 ) -> Callable[[], np.ndarray]:
     """The C kernel on all vehicles, on some threads; it returns the mean squares."""
-    matrix = given[0] if solver == "exact" else given[1]
+    matrix = coefficients[0] if solver == "exact" else coefficients[1]
     parts = [np.ascontiguousarray(p) for p in np.array_split(matrix, threads, axis=1)]
     costs = [np.zeros(p.shape[1]) for p in parts]
     u, y, size = flight.inputs["x_roll"], flight.outputs["roll"], ctypes.c_size_t
@@ -163,36 +167,36 @@ def against_c(
 ) -> list[float]:
     """Microseconds a vehicle, ours and then each kernel's, in turn."""
     small, large = sizes
-    given = arrays(large)
-    few = (given[0][:, :small], given[1][:, :small])
-    rivals = [
-        [in_c(kernel, flight, solver, some, len(devices)) for some in (few, given)]
+    coefficients = arrays(large)
+    few = (coefficients[0][:, :small], coefficients[1][:, :small])
+    kernel_runs = [
+        [in_c(kernel, flight, solver, some, len(devices)) for some in (few, coefficients)]
         for kernel in kernels
     ]
-    for run, _ in rivals:
+    for run, _ in kernel_runs:
         check(flight, solver, run())
     ours(flight, small, solver, devices=devices)
     best = np.full((1 + len(kernels), 2), np.inf)
     for _ in range(pairs):
         for k, n in enumerate(sizes):
             best[0, k] = min(best[0, k], ours(flight, n, solver, devices=devices))
-            for i, runs in enumerate(rivals, 1):
+            for i, runs in enumerate(kernel_runs, 1):
                 best[i, k] = min(best[i, k], seconds(runs[k]))
     return [float(v) for v in 1e6 * (best[:, 1] - best[:, 0]) / (large - small)]
 
 
 def check(flight: Flight, solver: str, cost: np.ndarray) -> None:
     """Both give the same numbers."""
-    found = sweep(
+    dataset = sweep(
         models.roll_on_stand, VEHICLE, flight, design(cost.size), REDUCE, solver=solver,
         substeps=SUBSTEPS, chunk=CHUNK[solver],
     )  # fmt: skip
-    np.testing.assert_allclose(found["misfit"].to_numpy() ** 2, cost, rtol=1e-6)
+    np.testing.assert_allclose(dataset["misfit"].to_numpy() ** 2, cost, rtol=1e-6)
 
 
-def in_numpy(flight: Flight, given: np.ndarray, n: int) -> Callable[[], np.ndarray]:
+def in_numpy(flight: Flight, coefficients: np.ndarray, n: int) -> Callable[[], np.ndarray]:
     """The recurrence with NumPy, all vehicles side by side."""
-    A, B = given[:16, :n].reshape(4, 4, n), given[16:, :n]
+    A, B = coefficients[:16, :n].reshape(4, 4, n), coefficients[16:, :n]
     u, y = flight.inputs["x_roll"], flight.outputs["roll"]
 
     def run() -> np.ndarray:
@@ -223,7 +227,9 @@ def in_scipy(flight: Flight, n: int) -> Callable[[], np.ndarray]:
     return run
 
 
-def in_numba(flight: Flight, given: np.ndarray, threads: int) -> Callable[[], np.ndarray] | None:
+def in_numba(
+    flight: Flight, coefficients: np.ndarray, threads: int
+) -> Callable[[], np.ndarray] | None:
     """The C kernel's loops in Numba; None where it is not installed."""
     try:
         import numba
@@ -244,7 +250,7 @@ def in_numba(flight: Flight, given: np.ndarray, threads: int) -> Callable[[], np
                 x0, x1, x2, x3 = n0, n1, n2, n3
             cost[v] = total / u.size
 
-    parts = [np.ascontiguousarray(p) for p in np.array_split(given, threads, axis=1)]
+    parts = [np.ascontiguousarray(p) for p in np.array_split(coefficients, threads, axis=1)]
     costs = [np.zeros(p.shape[1]) for p in parts]
     u, y = np.array(flight.inputs["x_roll"]), np.array(flight.outputs["roll"])
 
@@ -277,8 +283,8 @@ def slopes(
 
 def threads_over_one(kernel: Any, flight: Flight, solver: str, n: int, threads: int) -> float:
     """How much the machine gives the C kernel for its threads, the best of five in turn."""
-    given = arrays(n)
-    ways = [in_c(kernel, flight, solver, given, k) for k in (1, threads)]
+    coefficients = arrays(n)
+    ways = [in_c(kernel, flight, solver, coefficients, k) for k in (1, threads)]
     best = [np.inf, np.inf]
     for _ in range(5):
         best = [min(was, seconds(run)) for was, run in zip(best, ways, strict=True)]
@@ -327,18 +333,18 @@ def memory(n: int) -> None:
 def linearity(n: int, times: int) -> float:
     """Time a vehicle of 4 n over that of n, both beyond one chunk, so that start-up does not count;
     of the best times in turn."""
-    flight, one = record(1000), CHUNK["exact"]
-    best = dict.fromkeys((one, n, 4 * n), np.inf)
+    flight, chunk = record(1000), CHUNK["exact"]
+    best = dict.fromkeys((chunk, n, 4 * n), np.inf)
     ours(flight, n, "exact")
     for _ in range(times):
         best = {k: min(t, ours(flight, k, "exact")) for k, t in best.items()}
-    small, large = ((best[k] - best[one]) / (k - one) for k in (n, 4 * n))
+    small, large = ((best[k] - best[chunk]) / (k - chunk) for k in (n, 4 * n))
     return large / small
 
 
 def table(rows: list[tuple[str, str, str]]) -> None:
-    for what, value, wanted in rows:
-        print(f"{what:62s} {value:>28s}  {wanted}")
+    for what, value, target in rows:
+        print(f"{what:62s} {value:>28s}  {target}")
 
 
 def on_cpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
@@ -346,22 +352,22 @@ def on_cpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
     threads, kernels = len(devices), [compiled("kernel.c"), compiled("kernel.c", WIDE)]
     rows: list[tuple[str, str, str]] = []
     drawn: dict[str, Any] = {"throughput": {}}
-    for solver, wanted in (("exact", "<= 2.0"), ("rk4", "<= 1.8")):
+    for solver, target in (("exact", "<= 2.0"), ("rk4", "<= 1.8")):
         pair = sizes.exact if solver == "exact" else sizes.rk4
         us, plain, wide = against_c(kernels, flight, solver, pair, sizes.pairs, devices)
-        rows.append((f"{solver}, {threads} threads: time / C's", f"{us / plain:.2f}", wanted))
-        rows.append(("    of C told to use 512 bits, as ours is", f"{us / wide:.2f}", ""))
+        rows.append((f"{solver}, {threads} threads: time / C's", f"{us / plain:.2f}", target))
+        rows.append(("    of C that uses 512 bits, as ours is", f"{us / wide:.2f}", ""))
         numbers = f"{us:.2f}, {plain:.2f}, {wide:.2f}"
         rows.append(("    a vehicle: ours, C, C of 512 bits [us]", numbers, ""))
         drawn["throughput"] |= {
             f"{solver}": us, f"{solver} in C": plain, f"{solver} in C, 512 bits": wide,
         }  # fmt: skip
-    given, few = arrays(4096)[0], 256
+    coefficients, few = arrays(4096)[0], 256
     others = {
-        "exact in NumPy, one thread": (in_numpy(flight, given, 4096), 4096, 1),
+        "exact in NumPy, one thread": (in_numpy(flight, coefficients, 4096), 4096, 1),
         "exact in SciPy, one thread": (in_scipy(flight, few), few, 1),
     }
-    numba = in_numba(flight, given, threads)
+    numba = in_numba(flight, coefficients, threads)
     if numba is not None:
         others["exact in Numba"] = (numba, 4096, 3)
     for name, (run, n, times) in others.items():
@@ -405,12 +411,12 @@ def on_gpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
     for precision in ("float64", "float32"):
         for solver in ("exact", "rk4"):
             for n in (1000, 10_000, 100_000, 1_000_000):
-                wanted = job(
+                described = job(
                     models.roll_on_stand, VEHICLE, flight, design(n), REDUCE,
                     RunOptions(solver, SUBSTEPS, precision),
                 )  # fmt: skip
-                program = Program(wanted, 0, jax.local_devices()[:1], n)
-                values = arguments(wanted, wanted.design.values(0, n))
+                program = Program(described, 0, jax.local_devices()[:1], n)
+                values = arguments(described, described.design.values(0, n))
                 jax.block_until_ready(program(values, n))
                 best = min(
                     seconds(lambda p=program, v=values, n=n: jax.block_until_ready(p(v, n)))

@@ -5,7 +5,9 @@ A module has a function `cases()` that returns a list of `Case`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from heli_jax import Fit
 
 
 class Interval(NamedTuple):
@@ -40,12 +42,12 @@ class Case:
     """at full size"""
 
 
-def intervals(found: Any, truth: dict[str, float]) -> Run:
+def intervals(result: Fit, truth: dict[str, float]) -> Run:
     """The intervals of a fit's estimates (or nuisances) beside the truth."""
-    everything = {**found.nuisance, **found.estimates}
+    everything = {**result.nuisance, **result.estimates}
     parameters = {}
     for name, true in truth.items():
         e = everything[name]
         if e.sd is not None and e.lower95 is not None and e.upper95 is not None:
             parameters[name] = Interval(e.value, e.sd, e.lower95, e.upper95, true)
-    return Run(found.status, parameters)
+    return Run(result.status, parameters)

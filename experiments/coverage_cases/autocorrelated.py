@@ -44,7 +44,7 @@ def ar_run(missing: Missing, seed: int) -> Run:
 
 
 def disturbed_run(seed: int) -> Run:
-    """The records of monte_carlo.py: 120 s, and an acceleration with a memory of 1 s."""
+    """The records of monte_carlo.py: 120 s, and an acceleration with a correlation time of 1 s."""
     n = 6000
     vehicle = load_vehicle("configs/vehicles/bench-30.yaml")
     rng = np.random.default_rng(seed)
@@ -56,9 +56,9 @@ def disturbed_run(seed: int) -> Run:
 
 def fitted(vehicle: Any, u: np.ndarray, y: np.ndarray, free: dict[str, Free]) -> Run:
     flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
-    found = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
-    run = intervals(found, {n: float(getattr(vehicle, n)) for n in free})
-    flags = {"taken for white": not found.coloured, "not determined": bool(found.lost)}
+    result = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
+    run = intervals(result, {n: float(getattr(vehicle, n)) for n in free})
+    flags = {"taken for white": not result.coloured, "not determined": bool(result.lost)}
     return dataclasses.replace(run, flags=flags)
 
 

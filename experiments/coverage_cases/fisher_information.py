@@ -28,10 +28,10 @@ def one_run(fixed: tuple[str, ...], seed: int) -> Run:
     flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll_rate": y}, sd={"roll_rate": NOISE})
     free = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
     params = model.Params(**asdict(vehicle), **noise)
-    found = fit(Problem(model, params, [flight], free, method="filter-error", fixed_noise=fixed))
+    result = fit(Problem(model, params, [flight], free, method="filter-error", fixed_noise=fixed))
     truth = {n: float(getattr(vehicle, n)) for n in free}
     truth |= {n: v for n, v in (("sigma_w", SIGMA), ("tau_w", TAU)) if n not in fixed}
-    return intervals(found, truth)
+    return intervals(result, truth)
 
 
 def cases() -> list[Case]:

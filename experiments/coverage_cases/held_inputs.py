@@ -13,8 +13,7 @@ import scipy.integrate
 import scipy.interpolate
 
 from coverage_cases import Case, Run, intervals
-from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
-from heli_jax.identification.result import Fit
+from heli_jax import Fit, Flight, Free, Model, Nuisance, Problem, fit
 
 SPEED = 44.57
 TRUTH = {"Zw": -1.4249, "Zq": -1.4768, "Zde": -6.2632, "Mw": 0.2163, "Mq": -3.7067, "Mde": -12.784}
@@ -86,7 +85,7 @@ def aircraft_record(seed: int, hold: str = "linear", noise: float = 1.0) -> Flig
     t = DT * np.arange(round(DURATION / DT) + 1)
     run = scipy.integrate.solve_ivp(rates, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9)
     w, q = run.y
-    de = np.array([elevator(*one) for one in zip(t, w, strict=True)])
+    de = np.array([elevator(*point) for point in zip(t, w, strict=True)])
     measured = {
         n: x + noise * NOISE[n] * rng.standard_normal(t.size) for n, x in (("w", w), ("q", q))
     }
@@ -144,7 +143,7 @@ def late_record(seed: int, hold: str = "linear") -> Flight:
     t = 0.04 * np.arange(3001)
     run = scipy.integrate.solve_ivp(rates, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9, atol=1e-9)
     p = run.y[0] + 0.05 * rng.standard_normal(t.size)
-    da = np.array([stick(one) for one in t])
+    da = np.array([stick(time) for time in t])
     return Flight(dt=0.04, inputs={"da": da}, outputs={"p": p}, hold={"da": hold})
 
 
@@ -158,9 +157,9 @@ def late_fit(seed: int, hold: str = "linear") -> Fit:
 
 
 def late(seed: int) -> Run:
-    found = late_fit(seed)
-    run = intervals(found, LATE)
-    off = abs(found.nuisance["time_shift"].value - LATE["time_shift"])
+    result = late_fit(seed)
+    run = intervals(result, LATE)
+    off = abs(result.nuisance["time_shift"].value - LATE["time_shift"])
     return Run(run.status, run.parameters, {"delay wrong by more than 2 ms": off > 2e-3})
 
 

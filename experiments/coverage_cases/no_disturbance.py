@@ -11,10 +11,9 @@ import numpy as np
 import scipy.signal
 
 from coverage_cases import Case, Run, intervals
-from heli_jax import Flight, Free, Problem, fit, load_vehicle, models
+from heli_jax import Fit, Flight, Free, Problem, fit, load_vehicle, models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.roll import roll_transfer_function
-from heli_jax.identification.result import Fit
 from heli_jax.naming import asdict
 from heli_jax.simulation.inputs import random_steps
 
@@ -34,17 +33,17 @@ def one_run(seed: int, poles: int = 1) -> Run:
     free = {"Ixx": Free(0.05), "If": Free(5e-4)}
     start = {"sigma_w": jnp.asarray(0.0), "tau_w": jnp.asarray(1.0)}
     params = MODELS[poles].Params(**{**asdict(vehicle), **start})
-    found = fit(Problem(MODELS[poles], params, [flight], free, method="filter-error"))
-    run = intervals(found, {n: float(getattr(vehicle, n)) for n in free})
-    run.flags.update(flags(found))
+    result = fit(Problem(MODELS[poles], params, [flight], free, method="filter-error"))
+    run = intervals(result, {n: float(getattr(vehicle, n)) for n in free})
+    run.flags.update(flags(result))
     return run
 
 
-def flags(found: Fit) -> dict[str, bool]:
+def flags(result: Fit) -> dict[str, bool]:
     """What must not be said of a disturbance that is not there."""
-    sigma, tau = found.nuisance["sigma_w"], found.nuisance["tau_w"]
+    sigma, tau = result.nuisance["sigma_w"], result.nuisance["tau_w"]
     absent = sigma.value == 0.0 and sigma.sd is None and tau.sd is None
-    noted = any("No disturbance shows" in note for note in found.notes)
+    noted = any("No disturbance shows" in note for note in result.notes)
     relative = [e.sd / e.value for e in (sigma, tau) if e.sd is not None and e.value > 0]
     return {
         "absurd sigma_w": not absent and not 1e-6 < sigma.value < 1e6,
@@ -52,7 +51,7 @@ def flags(found: Fit) -> dict[str, bool]:
         "absurdly sure": any(r < 1e-4 for r in relative),
         "absent but not said": absent != noted,
         "a disturbance is seen (5 % by the test's own level)": not absent,
-        "not converged": found.status != "converged",
+        "not converged": result.status != "converged",
     }
 
 

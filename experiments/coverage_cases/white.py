@@ -26,8 +26,8 @@ def one_run(seed: int) -> Run:
     y = scipy.signal.lfilter(np.ravel(b), a, u) + NOISE * rng.standard_normal(N)
     flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
     free = {"Ixx": Free(0.05), "If": Free(5e-4)}
-    found = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
-    return intervals(found, {n: float(getattr(vehicle, n)) for n in free})
+    result = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
+    return intervals(result, {n: float(getattr(vehicle, n)) for n in free})
 
 
 def cases() -> list[Case]:

@@ -2,7 +2,7 @@
 
 from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import read_flights, signals
-from heli_jax.config.problems import disturbed, problem, rivals
+from heli_jax.config.problems import candidate_models, disturbed, problem
 from heli_jax.config.schema import Config, SimulateConfig, StickConfig
 
 __all__ = [
@@ -10,12 +10,12 @@ __all__ = [
     "Experiment",
     "SimulateConfig",
     "StickConfig",
+    "candidate_models",
     "disturbed",
     "in_wind",
     "load",
     "problem",
     "read_flights",
     "resolved",
-    "rivals",
     "signals",
 ]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import pydantic
 from pydantic import BaseModel
+from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
 from heli_jax.config.schema import Config
@@ -38,6 +39,8 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
     """
     path = Path(path)
     content = read_mapping(path)
+    # Before the validation, so that an override is checked as what the file says is, and may set a
+    # key that the file leaves out.
     if isinstance(overrides, Mapping):
         for key, value in overrides.items():
             _set(content, str(key), value, f"override {key!r:.80}")
@@ -53,6 +56,7 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
 def _model(config: Config, path: Path) -> Model:
     folder = path.absolute().parent
     model = models.by_name(config.model, f"{path}: model", folder)
+    # Looked up without corrections first: a name that no model has is an error of `model`.
     if config.corrections is not None:
         where = f"{path}: corrections"
         model = models.by_name(config.model, where, folder, corrections=config.corrections)
@@ -79,6 +83,7 @@ def in_wind(experiment: Experiment) -> Experiment:
         InputError: the model takes no wind.
     """
     config, path = experiment.config, experiment.path
+    # Anew by name: the wind's inputs are part of the model, and the initial state goes with it.
     model = models.by_name(
         config.model,
         f"{path}: simulate.wind",
@@ -97,6 +102,7 @@ def _override(content: dict[str, Any], text: str) -> None:
     _set(content, key.strip(), parse_value(value, where), where)
 
 
+# What YAML holds is Any below: a mapping, a list or a value, at any depth.
 def _set(content: dict[str, Any], key: str, value: Any, where: str) -> None:
     """Put a value at `key.path`, in sections that are made where they are missing."""
     *above, last = key.split(".")
@@ -108,18 +114,21 @@ def _set(content: dict[str, Any], key: str, value: Any, where: str) -> None:
     elif isinstance(at, dict):
         at[last] = value
     else:
-        raise InputError(f"{where}: {'.'.join(above)} holds no keys to set")
+        raise InputError(
+            f"{where}: {'.'.join(above)} must be a section or a list to set a key in it"
+        )
 
 
 def _child(at: Any, name: str, where: str) -> Any:
     if isinstance(at, list):
         return at[_index(at, name, where)]
     if isinstance(at, dict):
-        return at.setdefault(name, {})
-    raise InputError(f"{where}: there is nothing below the key before {name!r}")
+        return at.setdefault(name, {})  # a misspelt section is refused as an unknown key later
+    raise InputError(f"{where}: the key before {name!r} must be a section or a list")
 
 
 def _index(at: list[Any], name: str, where: str) -> int:
+    # No index from the end and none beyond it: a list is changed, never lengthened.
     if not name.isdigit() or int(name) >= len(at):
         raise InputError(f"{where}: got {name!r}, expected a number from 0 to {len(at) - 1}")
     return int(name)
@@ -129,43 +138,51 @@ def _validated(content: dict[str, Any], where: str) -> Config:
     try:
         return Config.model_validate(content)
     except pydantic.ValidationError as e:
-        # An unknown key is the likeliest cause of the others, so it is told first.
-        errors = sorted(e.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        # An unknown key is the likeliest cause of the others (what it was meant for is missing), so
+        # it comes first. One error at a time: a list of twenty is not read.
+        errors = sorted(e.errors(), key=lambda error: error["type"] != "extra_forbidden")
         raise InputError(f"{where}: {_sentence(errors[0])}") from None
 
 
-def _sentence(error: Any) -> str:
+def _sentence(error: ErrorDetails) -> str:
     place = _place(error["loc"])
-    found = error.get("input")
+    value = error.get("input")
     if error["type"] == "extra_forbidden":
         known = _known_keys(error["loc"])
         return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
     if error["type"] == "missing":
         return f"{place}: missing"
+    # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
-    if isinstance(found, dict | list) or error["type"] == "value_error":
+    # A section says where it is; quoted, it would fill the line. Our own validators say what they
+    # got in their message.
+    if isinstance(value, dict | list) or error["type"] == "value_error":
         return f"{place}: {message}"
-    return f"{place}: got {found!r:.60}, {message.replace('input should be', 'expected')}"
+    return f"{place}: got {value!r:.60}, {message.replace('input should be', 'expected')}"
 
 
-def _place(loc: tuple[Any, ...]) -> str:
+def _place(loc: tuple[int | str, ...]) -> str:
     text = ""
     for part in loc:
         if isinstance(part, int):
             text += f"[{part}]"
+        # The members of a union (`vehicle: str | dict`) stand in pydantic's places as if they were
+        # keys.
         elif part not in ("str", "dict[str,any]"):
             text += f".{part}" if text else str(part)
     return text or "the configuration"
 
 
-def _known_keys(loc: tuple[Any, ...]) -> list[str]:
+def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
     """The keys of the section that an unknown key stands in."""
     section: Any = Config
     for part in loc[:-1]:
         if isinstance(part, int):
             continue
         fields = getattr(section, "model_fields", None)
+        # The user's own names, such as that of a parameter below `free`, are in no section: the
+        # section is still the one that the mapping's values are of.
         if fields is None or part not in fields:
             continue
         section = _section(fields[part].annotation) or section
@@ -177,13 +194,14 @@ def _section(annotation: Any) -> Any:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):
-        found = _section(inner)
-        if found is not None:
-            return found
+        section = _section(inner)
+        if section is not None:
+            return section
     return None
 
 
 def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
+    # The model's Params say which constants there can be, and in which units.
     if isinstance(config.vehicle, str):
         return read_vehicle(path.parent / config.vehicle, model.Params)
     return vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
@@ -195,12 +213,15 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     Paths of logs become absolute; the vehicle stands in it with units and sources.
     """
     config, path = experiment.config, experiment.path
+    # Without what is None: an absent key means the same, and stays right where a default changes.
     content = config.model_dump(mode="json", exclude_none=True)
     for flight in content.get("flights", []):
+        # With links resolved too: the run's config.yaml is read from its own directory.
         flight["log"] = str((path.parent / flight["log"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())
+    # As read, not as converted: a reader of the copy sees the number and the unit of the source.
     content["vehicle"] = {
         name: {"value": c.value, "unit": c.unit, "source": c.source}
         for name, c in experiment.vehicle.constants.items()

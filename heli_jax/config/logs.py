@@ -2,11 +2,11 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FlightConfig, SignalsConfig
+from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
@@ -38,6 +38,7 @@ def _read_flight(
     experiment: Experiment, i: int, f: FlightConfig, gain: bool, moving: bool
 ) -> Flight:
     model = experiment.model
+    # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
     for name in f.known:
         if name not in naming.names(model.Params):
@@ -59,8 +60,8 @@ def _read_flight(
             moving_inputs=moving,
         )
     except InputError:
-        raise
-    except ValueError as e:
+        raise  # it names the log and the line already
+    except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
     return _with_notes(flight, _unstated_units(model, f.signals))
 
@@ -73,6 +74,7 @@ def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
     notes = []
     for record, signals in ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs)):
         for name, signal in signals.items():
+            # Plain numbers have no unit to mistake.
             si = naming.unit(record, name)
             if signal.unit is None and si is not None and not units.is_plain(si):
                 notes.append(f"{name}: no unit stated, taken as {si}")
@@ -89,7 +91,7 @@ def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
 def signals(
     model: Model,
     role: Literal["inputs", "outputs"],
-    stated: Mapping[str, Any],
+    stated: Mapping[str, InputConfig] | Mapping[str, OutputConfig],
     where: str,
     gain: bool = False,
 ) -> dict[str, Signal]:
@@ -98,7 +100,7 @@ def signals(
     Args:
         model: what the names are of.
         role: whether they are its inputs or its outputs.
-        stated: a configuration's signals by the model's name (InputConfig or OutputConfig).
+        stated: a configuration's signals by the model's name.
         where: what a sentence about a wrong one begins with.
         gain: whether a plain number is allowed for an input with a unit.
 
@@ -115,6 +117,7 @@ def signals(
                 f"{nearest(name, known)}"
             )
     missing = [n for n in known if n not in stated]
+    # Every input acts on the machine, so none can be left out; of the outputs one is enough.
     if role == "inputs" and missing:
         raise InputError(f"{where}.inputs: {missing[0]} missing, model {model.name} needs it")
     if not stated:
@@ -124,6 +127,7 @@ def signals(
         place = f"{where}.{role}.{name}.unit"
         si = naming.unit(record, name)
         unit = config.unit if config.unit is not None else (si or "1")
+        # Inputs have a hold and no sd, outputs the reverse.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
         out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold)
     return out
@@ -131,13 +135,16 @@ def signals(
 
 def _si(unit: str, si: str | None, place: str, gain: bool) -> str:
     try:
+        # A model of one's own may state no units: the log's unit is converted to SI all the same.
         if si is None:
             return units.si_of(unit)
+        # A stick in plain numbers: the estimated gain is then in the model's unit per 1.
         if gain and units.is_plain(unit):
             return "1"
         units.factor(unit, si)
     except ValueError as e:
         hint = ""
+        # The remedy only where it is one: for sticks logged in percent or counts.
         if si is not None and unit.strip() in ("", "1", "-", "%", "stick", "dimensionless"):
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
         raise InputError(f"{place}: {e}{hint}") from e

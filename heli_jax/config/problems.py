@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
-from heli_jax.config.schema import FitConfig
+from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -32,21 +32,11 @@ def problem(experiment: Experiment) -> Problem:
     if not config.fit.free:
         raise InputError(f"{path}: fit.free: nothing is free, expected a parameter to estimate")
     _check_intervals(config.fit, path)
-    asked = config.fit.nuisance.model_dump()
-    if isinstance(asked["input_offset"], list):
-        asked["input_offset"] = tuple(asked["input_offset"])
-    nuisance = Nuisance(**asked)
+    nuisance = _nuisance(config.fit)
     flights = read_flights(experiment, gain=nuisance.input_gain)
-    free = {
-        name: Free(
-            f.start,
-            f.lower,
-            f.upper,
-            Prior(f.prior.mean, f.prior.sd) if f.prior else None,
-            f.sign,
-        )
-        for name, f in config.fit.free.items()
-    }
+    free = {name: _free(f) for name, f in config.fit.free.items()}
+    # Output error gets the bare model, whatever `disturbance` says: that section is then for
+    # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if config.fit.method == "filter-error":
         if config.disturbance is None:
@@ -63,6 +53,7 @@ def problem(experiment: Experiment) -> Problem:
             flights,
             free,
             nuisance,
+            # One number for all flights, since they share one compiled program: the slowest log's.
             substeps=max(substeps_for(f.dt) for f in flights),
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
@@ -71,9 +62,22 @@ def problem(experiment: Experiment) -> Problem:
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
         )
     except ValueError as e:
-        raise InputError(
-            f"{path}: fit: {e}" if "vehicle" not in str(e)[:8] else f"{path}: {e}"
-        ) from e
+        # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
+        place = path if str(e).startswith("vehicle") else f"{path}: fit"
+        raise InputError(f"{place}: {e}") from e
+
+
+def _nuisance(config: FitConfig) -> Nuisance:
+    stated = config.nuisance.model_dump()
+    if isinstance(stated["input_offset"], list):  # YAML has no tuples
+        stated["input_offset"] = tuple(stated["input_offset"])
+    return Nuisance(**stated)
+
+
+def _free(config: FreeConfig) -> Free:
+    # By name: a field that Free has and the configuration lacks, or the reverse, is an error here.
+    prior = None if config.prior is None else Prior(**dict(config.prior))
+    return Free(**{**dict(config), "prior": prior})
 
 
 def _check_intervals(config: FitConfig, path: Path) -> None:
@@ -83,6 +87,7 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             raise InputError(
                 f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, config.free)}"
             )
+    # Asked of the installation, not by an import, which takes seconds.
     if config.intervals.nuts and importlib.util.find_spec("blackjax") is None:
         raise InputError(
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
@@ -95,15 +100,14 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
         )
 
 
-def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
+def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
     """The models that a configuration's `compare` puts beside the fitted one.
 
     Raises:
         InputError: no axis of the model can be disturbed.
     """
-    from heli_jax.identification.model_selection import (
-        alternatives,  # not before it is needed: slow
-    )
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.model_selection import alternatives
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
@@ -118,30 +122,30 @@ def rivals(experiment: Experiment, fitted: Problem) -> "Alternatives":
     return alternatives(fitted, model, axis, without_stand=bare)
 
 
+# Params are classes of each model, hence Any.
 def disturbed(experiment: Experiment) -> tuple[Model, Any]:
     """The model with the configuration's disturbance, and its parameters.
 
     Raises:
         InputError: the model has no such axis.
     """
-    model, params, disturbance = (
-        experiment.model,
-        experiment.vehicle.params,
-        experiment.config.disturbance,
-    )
+    model, params = experiment.model, experiment.vehicle.params
+    disturbance = experiment.config.disturbance
     if disturbance is None:
         return model, params
     try:
         model = with_disturbance(model, disturbance.axis, disturbance.poles)
     except ValueError as e:
         raise InputError(f"{experiment.path}: disturbance: {e}") from e
-    given = {"sigma_w": disturbance.sigma_w, "tau_w": disturbance.tau_w}
-    extra = {n: jnp.asarray(v) for n, v in given.items() if v is not None}
+    stated = {"sigma_w": disturbance.sigma_w, "tau_w": disturbance.tau_w}
+    # Left out, sigma_w stays 0 and tau_w 1 s: filter error then makes an initial guess of its own.
+    extra = {n: jnp.asarray(v) for n, v in stated.items() if v is not None}
     return model, model.Params(**{**naming.asdict(params), **extra})
 
 
 def _gain_units(experiment: Experiment) -> dict[str, str]:
     """The unit that each input's gain carries: 1 where the log's unit is of the right kind."""
+    # Of the first flight, since a gain is shared by all.
     out = {}
     for name, signal in experiment.config.flights[0].signals.inputs.items():
         si = naming.unit(experiment.model.Inputs, name)

@@ -7,11 +7,17 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
+# YAML reads .inf and .nan as numbers; a NaN would pass every comparison with a bound.
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
+# The records that a script fills (`Free`, `Prior`, `Nuisance`) have sections of their own, with
+# the same fields (a test holds that). Two, not one: pydantic would read a NamedTuple from a list as
+# well, call a misspelt key an unexpected argument, and write a list into the run's config.yaml; and
+# made of pydantic's classes they would bring it into the identification.
 class _Strict(BaseModel):
+    # An unknown key is an error: a misspelt `lower` would leave the parameter without a bound.
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -44,6 +50,7 @@ class FlightConfig(_Strict):
     signals: SignalsConfig
     name: str | None = None
     rate: Positive | None = None
+    # Increasing is checked where logs are read, for configurations and scripts alike.
     window: tuple[Finite, Finite] | None = None
     hold_out: bool = False
     known: dict[str, Finite] = {}
@@ -64,7 +71,8 @@ class FreeConfig(_Strict):
     helicopter's parameters keep theirs and those of a model of one's own may have any"""
 
 
-def _offset_choice(value: Any) -> Any:
+def _offset_choice(value: object) -> object:
+    # By hand: of a union pydantic would report every member, and take "yes" and 1 for true.
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, list) and all(isinstance(v, str) for v in value):
@@ -79,6 +87,7 @@ class NuisanceConfig(_Strict):
     bias: bool = True
     time_shift: bool = False
     input_gain: bool = False
+    # Any, since the validator before it has said what it may be.
     input_offset: Annotated[Any, BeforeValidator(_offset_choice)] = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
     the sticks of a machine in free flight"""
@@ -88,9 +97,9 @@ class IntervalsConfig(_Strict):
     """Intervals beside the Gaussian one."""
 
     profile: list[str] = []
-    """free parameters whose profile likelihood is wanted"""
+    """free parameters of which to compute the profile likelihood"""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
-    """made records to refit; 0 for none"""
+    """simulated records to refit; 0 for none"""
     nuts: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """draws of each of four chains (extra `bayes`); 0 for none"""
 
@@ -101,10 +110,12 @@ class ShootingConfig(_Strict):
     window: Positive
     """length [s]"""
     continuity: Positive | None = None
-    """sd of the jump of each state between windows, as a part of what it does; null: free"""
+    """sd of each state's defect between windows (matching condition), as a part of the state's
+    range; null: free"""
 
 
 class FitConfig(_Strict):
+    # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     free: dict[str, FreeConfig]
     nuisance: NuisanceConfig = NuisanceConfig()
@@ -113,7 +124,7 @@ class FitConfig(_Strict):
     seed: Annotated[int, Field(ge=0)] = 0
     max_steps: Annotated[int, Field(ge=1)] = 200
     compare: bool = False
-    """whether to fit the alternatives too: no disturbance, one pole, two poles; without stand"""
+    """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand"""
     intervals: IntervalsConfig = IntervalsConfig()
 
 
@@ -128,9 +139,9 @@ class DisturbanceConfig(_Strict):
     axis: Literal["roll", "pitch", "yaw"]
     poles: Literal[1, 2] = 1
     sigma_w: Positive | None = None
-    """standard deviation [rad/s^2]: needed to simulate, a start for filter error"""
+    """standard deviation [rad/s^2]: needed to simulate, an initial guess for filter error"""
     tau_w: Positive | None = None
-    """correlation time [s]: needed to simulate, a start for filter error"""
+    """correlation time [s]: needed to simulate, an initial guess for filter error"""
     fixed: list[Literal["sigma_w", "tau_w", "sigma_y"]] = []
     """what filter error takes as it stands here; sigma_y: the noise that the outputs state (sd)"""
 
@@ -138,13 +149,14 @@ class DisturbanceConfig(_Strict):
     def _fixed_given(self) -> "DisturbanceConfig":
         for name in ("sigma_w", "tau_w"):
             if name in self.fixed and getattr(self, name) is None:
-                raise ValueError(f"{name} is fixed but not given, expected its value")
+                raise ValueError(f"{name}: missing, expected its value, since it is fixed")
         return self
 
 
 class StickConfig(_Strict):
     """How one input moves in a simulation."""
 
+    # "sweep" is the older name of "chirp".
     kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
     amplitude: Positive
     unit: str | None = None
@@ -155,7 +167,7 @@ class StickConfig(_Strict):
     pause: Positive = 2.0
     """neutral between two 3-2-1-1 [s]"""
     band: tuple[Positive, Positive] = (0.05, 5.0)
-    """first and last frequency of a sweep [Hz]"""
+    """first and last frequency of a chirp [Hz]"""
 
 
 class NoiseConfig(_Strict):
@@ -200,6 +212,7 @@ class SimulateConfig(_Strict):
 
     @model_validator(mode="after")
     def _bounded(self) -> "SimulateConfig":
+        # 8: no reader takes fewer. 1e8 samples of ten signals fill 8 GB.
         if not 8 <= self.duration * self.rate <= 1e8:
             raise ValueError(
                 f"duration times rate is {self.duration * self.rate:g} samples, expected 8 to 1e8"
@@ -223,12 +236,13 @@ class AxisConfig(_Strict):
 
 
 class DesignConfig(_Strict):
-    """Which values the axes take, element by element."""
+    """A design of experiments: which values the axes take, one design point after the other."""
 
     design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
     n: int | None = None
-    """elements, for lhs and sobol"""
+    """design points, for lhs and sobol"""
     axes: dict[str, AxisConfig] = {}
+    # A section within itself: designs nest to any depth.
     of: list["DesignConfig"] = []
     """the designs of a product or a zip"""
     file: str | None = None
@@ -240,6 +254,7 @@ class DesignConfig(_Strict):
 class ReduceConfig(_Strict):
     """A result of each run."""
 
+    # Checked against the reducers where the sweep is put together: a path may lead to any function.
     how: str
     """a name, or package.module:function of one's own"""
     signal: str | None = None
@@ -263,21 +278,22 @@ class SweepConfig(DesignConfig):
     inputs: Literal["flights", "simulate"] | None = None
     """where the inputs come from; the flights unless there are none"""
     start: StartConfig | None = None
-    """the steady flight in which each element of a whole helicopter begins, the flights' sticks as
+    """the steady flight in which each run of a whole helicopter begins, the flights' sticks as
     they are; what `simulate` makes begins as it says there"""
     solver: str | None = None
     substeps: int | None = None
     precision: Literal["float64", "float32"] = "float64"
     chunk: int | None = None
-    """elements written at a time"""
+    """design points written at a time"""
     lanes: int | None = None
-    """elements computed side by side on a device"""
+    """batch size: design points computed side by side on a device"""
 
 
 class Config(_Strict):
     """One experiment."""
 
     model: str
+    # A file, or constants as in one: checked by the readers of vehicle files, with their messages.
     vehicle: str | dict[str, Any]
     corrections: dict[str, StrictBool] | None = None
     """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
@@ -285,8 +301,10 @@ class Config(_Strict):
     initial_state: dict[str, Finite] = {}
     """values of states at the first sample in SI, in place of the model's own: for models that
     cannot begin at zero"""
+    # May be missing: a simulation needs none.
     flights: list[FlightConfig] = []
     fit: FitConfig | None = None
+    # On unless switched off by `rls: null`: the baseline of the paper costs little.
     rls: RLSConfig | None = RLSConfig()
     disturbance: DisturbanceConfig | None = None
     simulate: SimulateConfig | None = None

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax import naming, units
+from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
@@ -36,6 +37,7 @@ def simulates(experiment: Experiment) -> bool:
     config, path = experiment.config, experiment.path
     if config.sweep is None:
         raise InputError(f"{path}: sweep: missing, expected a design with axes and results")
+    # Logs come first: a configuration with both was written for a fit, and `simulate` made its log.
     source = config.sweep.inputs or ("flights" if config.flights else "simulate")
     if source == "flights" and not config.flights:
         raise InputError(f"{path}: sweep.inputs: there are no flights, expected at least one log")
@@ -50,11 +52,15 @@ def sweep_job(
     experiment: Experiment,
     made: Flight | None = None,
     trimmed: Trimmed | None = None,
-    pilot: Any = None,
+    pilot: Pilot | None = None,
 ) -> Job:
     """The sweep of a configuration, checked; its logs and tables are read.
 
-    `made` is the flight that `simulate` makes, with the beginning and the pilot that belong to it.
+    Args:
+        experiment: the configuration, with its model and vehicle.
+        made: the flight that `simulate` makes; the logs are read unless given.
+        trimmed: the steady flight in which each run of `made` begins.
+        pilot: who holds the attitude in it.
 
     Raises:
         InputError: something of it cannot be; the sentence says what and where.
@@ -65,11 +71,14 @@ def sweep_job(
     model, params = _model(experiment, sweep)
     reduce = {n: _reduce(r, f"{where}.reduce.{n}", path) for n, r in sweep.reduce.items()}
     kept = sweep.trajectories
+    # Inputs that never move say nothing of parameters, but a sweep may want just that run.
     flights = (made,) if made is not None else read_flights(experiment, moving_inputs=False)
     if sweep.start is not None:
+        # Two beginnings would contradict each other.
         if made is not None:
             raise InputError(f"{where}.start: expected simulate.start, which makes the inputs")
         trimmed = Trimmed(Condition(**sweep.start.model_dump()), sticks=False, of=experiment.model)
+    # An initial state would be overwritten by the trim without a word.
     if trimmed is not None and experiment.config.initial_state:
         raise InputError(
             f"{path}: initial_state: each element of this sweep begins in a trim of its own, "
@@ -94,81 +103,91 @@ def sweep_job(
     except InputError:
         raise
     except ValueError as e:
-        outside = str(e).startswith("vehicle:")
+        outside = str(e).startswith("vehicle:")  # not in the section `sweep`
         raise InputError(f"{path if outside else where}: {e}") from e
 
 
 def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
     """The model, with the disturbance where an axis is one of its."""
     plain = naming.names(experiment.model.Params)
+    # A model of one's own may have a parameter called sigma_w, which is then no disturbance's.
     drawn = [n for n in _axes(sweep) if n in _DRAWN and n not in plain]
     if not drawn or experiment.config.disturbance is None:
         return experiment.model, experiment.vehicle.params
-    where, given = f"{experiment.path}: disturbance", experiment.config.disturbance
+    where, disturbance = f"{experiment.path}: disturbance", experiment.config.disturbance
     for name in ("sigma_w", "tau_w"):
-        if getattr(given, name) is None and name not in drawn:
+        if getattr(disturbance, name) is None and name not in drawn:
             raise InputError(f"{where}.{name}: missing, expected a number to draw it with")
     if "seed" not in drawn:
         raise InputError(
-            f"{experiment.path}: sweep.axes.{drawn[0]}: nothing is drawn without an axis seed, "
-            "expected seed: {values: [0]} too"
+            f"{experiment.path}: sweep.axes.{drawn[0]}: expected an axis seed too, as "
+            "seed: {values: [0]}, without which nothing is drawn"
         )
     return disturbed(experiment)
 
 
-def _axes(one: DesignConfig) -> list[str]:
-    return [*one.axes, *(n for part in one.of for n in _axes(part))]
+def _axes(section: DesignConfig) -> list[str]:
+    return [*section.axes, *(n for part in section.of for n in _axes(part))]
 
 
-def _design(one: DesignConfig, model: Model, path: Path, seed: int) -> Design:
-    """The design that a section describes; ValueError where it cannot be."""
-    seed = seed if one.seed is None else one.seed
-    if one.design in ("product", "zip"):
-        _refuse(one, ("axes", "n", "file"), f"a {one.design} has designs in 'of'")
-        parts = []
-        for i, part in enumerate(one.of):
-            try:
-                parts.append(_design(part, model, path, _another(seed, i)))
-            except InputError:
-                raise
-            except ValueError as e:
-                raise ValueError(f"of[{i}].{e}") from e
-        made: Callable[..., Design] = {"product": designs.product, "zip": designs.zipped}[
-            one.design
-        ]
-        return made(*parts)
-    _refuse(one, ("of",), f"only product and zip have it, not {one.design}")
-    if one.design == "table":
-        _refuse(one, ("n",), "a table has its rows")
-        return _table(one, model, path)
-    _refuse(one, ("file",), f"only a table has it, not {one.design}")
-    if one.design in ("lhs", "sobol"):
-        if one.n is None:
-            raise ValueError(f"n: missing, expected how many elements {one.design} makes")
-        between = {n: _between(n, a, model, path) for n, a in one.axes.items()}
-        return {"lhs": designs.lhs, "sobol": designs.sobol}[one.design](between, one.n, seed)
-    _refuse(one, ("n",), f"a {one.design} has its axes' points: expected n in an axis")
-    axes = {n: _points(n, a, model, path) for n, a in one.axes.items()}
-    return {"grid": designs.grid, "list": designs.paired}[one.design](axes)
+def _design(section: DesignConfig, model: Model, path: Path, seed: int) -> Design:
+    """The design of experiments that a section describes; ValueError where it cannot be."""
+    kind = section.design
+    seed = seed if section.seed is None else section.seed
+    if kind in ("product", "zip"):
+        return _of_designs(section, model, path, seed)
+    _refuse(section, ("of",), f"only product and zip have it, not {kind}")
+    if kind == "table":
+        _refuse(section, ("n",), "a table has its rows")
+        return _table(section, model, path)
+    _refuse(section, ("file",), f"only a table has it, not {kind}")
+    if kind in ("lhs", "sobol"):
+        if section.n is None:
+            raise ValueError(f"n: missing, expected the number of design points of {kind}")
+        ranges = {n: _range(n, a, model, path) for n, a in section.axes.items()}
+        return {"lhs": designs.lhs, "sobol": designs.sobol}[kind](ranges, section.n, seed)
+    _refuse(section, ("n",), f"a {kind} has its axes' points: expected n in an axis")
+    axes = {n: _points(n, a, model, path) for n, a in section.axes.items()}
+    return {"grid": designs.grid, "list": designs.paired}[kind](axes)
 
 
-def _another(seed: int, i: int) -> int:
+def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> Design:
+    """A product or a zip of the designs below `of`."""
+    _refuse(section, ("axes", "n", "file"), f"a {section.design} has designs in 'of'")
+    parts = []
+    for i, part in enumerate(section.of):
+        try:
+            parts.append(_design(part, model, path, _seed_of_part(seed, i)))
+        except InputError:
+            raise
+        except ValueError as e:  # the place grows from the inside out: of[0].of[1].axes.a
+            raise ValueError(f"of[{i}].{e}") from e
+    combine: Callable[..., Design] = {"product": designs.product, "zip": designs.zipped}[
+        section.design
+    ]
+    return combine(*parts)
+
+
+def _seed_of_part(seed: int, i: int) -> int:
     """A seed for the i-th part of a design: no two parts, however deep, draw the same."""
+    # Not seed + i: the second part of one seed would then be the first part of the next.
     return int(np.random.SeedSequence(seed, spawn_key=(i,)).generate_state(1)[0])
 
 
-def _refuse(one: DesignConfig, keys: tuple[str, ...], why: str) -> None:
+# Said, not ignored: who gives a key that is not used believes that it acts.
+def _refuse(section: DesignConfig, keys: tuple[str, ...], why: str) -> None:
     for key in keys:
-        if getattr(one, key):
+        if getattr(section, key):
             raise ValueError(f"{key}: {why}")
 
 
-def _between(name: str, axis: AxisConfig, model: Model, path: Path) -> Range:
+def _range(name: str, axis: AxisConfig, model: Model, path: Path) -> Range:
     for key in ("values", "column", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}.{key}: expected lower and upper here")
     if axis.lower is None or axis.upper is None:
         raise ValueError(f"axes.{name}: expected lower and upper")
+    # A logarithmic axis stays one in SI, since units of parameters have no offset.
     scale = _scale(name, axis, model, path)
     return Range(axis.lower * scale, axis.upper * scale, axis.scale)
 
@@ -177,8 +196,9 @@ def _points(name: str, axis: AxisConfig, model: Model, path: Path) -> Any:
     if axis.column is not None:
         raise ValueError(f"axes.{name}.column: only a table has columns")
     if axis.values is None:
+        # n is the grid's own: a range with it is refused where a design draws its points.
         points = axis.model_copy(update={"n": None})
-        return _between(name, points, model, path)._replace(n=axis.n)
+        return _range(name, points, model, path)._replace(n=axis.n)
     for key in ("lower", "upper", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}: expected values, or lower and upper, not both")
@@ -190,21 +210,22 @@ def _as_column(name: str, values: np.ndarray) -> np.ndarray:
     return whole_seeds(values) if name == "seed" else values
 
 
-def _table(one: DesignConfig, model: Model, path: Path) -> Design:
-    if one.file is None:
+def _table(section: DesignConfig, model: Model, path: Path) -> Design:
+    if section.file is None:
         raise ValueError("file: missing, expected a table in CSV or Parquet")
-    if not one.axes:
-        raise ValueError("axes: none given, expected at least one, as Ixx: {} for a column Ixx")
-    source = open_table(path.parent / one.file)
-    for name, axis in one.axes.items():
+    if not section.axes:
+        raise ValueError("axes: expected at least one, as Ixx: {} for a column Ixx, got none")
+    source = open_table(path.parent / section.file)
+    for name, axis in section.axes.items():
         for key in ("lower", "upper", "values", "n"):
             if getattr(axis, key) is not None:
                 raise ValueError(f"axes.{name}.{key}: the table has the values")
-    columns = {name: axis.column or name for name, axis in one.axes.items()}
-    found = source.numbers(list(dict.fromkeys(columns.values())))
+    columns = {name: axis.column or name for name, axis in section.axes.items()}
+    # Each column once, though two axes may share one.
+    numbers = source.numbers(list(dict.fromkeys(columns.values())))
     scaled: Mapping[str, np.ndarray] = {
-        name: _as_column(name, found[columns[name]] * _scale(name, axis, model, path))
-        for name, axis in one.axes.items()
+        name: _as_column(name, numbers[columns[name]] * _scale(name, axis, model, path))
+        for name, axis in section.axes.items()
     }
     return designs.table(scaled)
 
@@ -219,13 +240,13 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
         raise ValueError(f"axes.{name}.unit: {e}") from e
 
 
-def _reduce(one: ReduceConfig, where: str, path: Path) -> Reduce:
-    how: Any = one.how
-    if how not in REDUCERS and how not in LINEAR and is_path(how):
-        how = by_path(how, f"{where}.how", path.absolute().parent)
-        if not callable(how) and not isinstance(how, Streaming):
-            found = "nothing" if how is None else f"a {type(how).__name__}"
+def _reduce(section: ReduceConfig, where: str, path: Path) -> Reduce:
+    reducer: Any = section.how  # a name, or what a path leads to: anything at all
+    if reducer not in REDUCERS and reducer not in LINEAR and is_path(reducer):
+        reducer = by_path(reducer, f"{where}.how", path.absolute().parent)
+        if not callable(reducer) and not isinstance(reducer, Streaming):
+            kind = "nothing" if reducer is None else f"a {type(reducer).__name__}"
             raise InputError(
-                f"{where}.how: {one.how!r} is {found}, expected a function of a Trajectory"
+                f"{where}.how: expected a function of a Trajectory at {section.how!r}, got {kind}"
             )
-    return Reduce(how, one.signal, one.input, one.gain)
+    return Reduce(reducer, section.signal, section.input, section.gain)

@@ -3,12 +3,14 @@
 from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.read import read_flight, require_moving_inputs
+from heli_jax.flights.request import ReadOptions
 
 __all__ = [
     "ColumnInfo",
     "Flight",
     "Gap",
     "LogInfo",
+    "ReadOptions",
     "Signal",
     "Source",
     "TimeInfo",

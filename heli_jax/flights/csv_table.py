@@ -1,25 +1,24 @@
 """Logs in delimited text: fast through pyarrow, and line by line where something is wrong.
 
 pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes. So a clean file
-takes the fast way, and `_records` walks the text again to say where an error is.
+takes the fast way, and `Body.records` walks the text again to say where an error is.
 """
 
-import csv
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
+    Body,
     decode,
     find_delimiter,
     find_header,
     header_names,
-    lines_of,
     require_short_lines,
 )
 from heli_jax.flights.table import (
@@ -32,6 +31,12 @@ from heli_jax.flights.table import (
 )
 from heli_jax.regular_file import read_regular
 
+# Imported again within the functions that need it: it takes a quarter of a second, which
+# flights made in Python need not wait for.
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+# What counts as a number. float() would also take 1_000, and digits of any script.
 _NUMBER = re.compile(
     r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
     r"|[+-]?(?:nan|inf|infinity)",
@@ -39,7 +44,7 @@ _NUMBER = re.compile(
 )
 _LARGEST = 10**9
 """bytes: a log in text is read as a whole, and takes about ten times its size meanwhile"""
-_ROWS_AT_ONCE = 1 << 16
+_CELLS_AT_ONCE = 1 << 16
 
 
 def open_csv(path: Path) -> "CsvTable":
@@ -54,6 +59,7 @@ def open_csv(path: Path) -> "CsvTable":
     start, line = find_header(text)
     if start is None:
         raise wrong(str(path), "holds no header, expected names of columns and rows of numbers")
+    # Found, not split: a list of all lines takes many times the text's memory.
     end = text.find("\n", start)
     end = len(text) if end < 0 else end
     body = text[end + 1 :]
@@ -64,16 +70,14 @@ def open_csv(path: Path) -> "CsvTable":
         raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
     require_short_lines(str(path), body, line + 1)
     delimiter = find_delimiter(header, body.lstrip("\n").split("\n", 1)[0])
+    # Counted before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(str(path), header.count(delimiter) + 1, f"line {line}")
     names = header_names(str(path), header, delimiter, line)
     return CsvTable(
-        path=str(path),
         size=len(data),
         sha256=hashlib.sha256(data).hexdigest(),
         names=names,
-        delimiter=delimiter,
-        body=body,
-        first_line=line + 1,
+        body=Body(str(path), body, delimiter, line + 1),
     )
 
 
@@ -82,20 +86,9 @@ class CsvTable:
 
     format = "csv"
 
-    def __init__(
-        self,
-        *,
-        path: str,
-        size: int,
-        sha256: str,
-        names: tuple[str, ...],
-        delimiter: str,
-        body: str,
-        first_line: int,
-    ) -> None:
-        self.path, self.size, self.sha256 = path, size, sha256
-        self.names, self.delimiter = names, delimiter
-        self._body, self._first_line = body, first_line
+    def __init__(self, *, size: int, sha256: str, names: tuple[str, ...], body: Body) -> None:
+        self.path, self.size, self.sha256, self.names = body.path, size, sha256, names
+        self._body = body
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -107,15 +100,15 @@ class CsvTable:
         self._require(names)
         indices = [self.names.index(name) for name in names]
         try:
-            texts = _decimal_points(self._texts(indices), self.delimiter)
+            texts = _decimal_points(self._texts(indices), self._body.delimiter)
         except _TwoDecimalSigns as e:
             raise wrong(self.path, str(e)) from e
         result = {}
         for name, text in zip(names, texts, strict=True):
             values = _floats(text)
             if isinstance(values, int):
-                found = f"got {self.found(name, values)}, expected a number"
-                raise wrong(self.path, found, self.place(values), column(name))
+                problem = f"got {self.cell_text(name, values)}, expected a number"
+                raise wrong(self.path, problem, self.place(values), column(name))
             result[name] = values
         return result
 
@@ -124,7 +117,8 @@ class CsvTable:
         result = []
         for name, text in zip(self.names, self._texts(range(len(self.names))), strict=True):
             try:
-                values = _floats(_decimal_points([text], self.delimiter)[0])
+                values = _floats(_decimal_points([text], self._body.delimiter)[0])
+            # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
             except _TwoDecimalSigns:
                 values = 0
             filled = len(text) - _filled(text).null_count
@@ -135,7 +129,7 @@ class CsvTable:
         """`line 12`, counted from the top of the file, comments and blank lines included."""
         return f"line {self._record(row)[0]}"
 
-    def found(self, name: str, row: int) -> str:
+    def cell_text(self, name: str, row: int) -> str:
         """What stands in a cell, in words."""
         cell = self._record(row)[1][self.names.index(name)].strip()
         return shown(cell) if cell else "nothing"
@@ -146,92 +140,84 @@ class CsvTable:
 
     def _require(self, names: Sequence[str]) -> None:
         missing = [name for name in names if name not in self.names]
+        # The likeliest causes have a sentence of their own: "no column 't'; known are 0.0, 1.3"
+        # leaves a reader puzzled where the file has no header at all.
         if missing and all(_NUMBER.fullmatch(name) for name in self.names):
             raise wrong(
                 self.path,
                 f"got numbers, expected the names of the columns, {shown(missing[0])} among them",
-                f"line {self._first_line - 1}",
+                f"line {self._body.first_line - 1}",
             )
         if missing and len(self.names) == 1:
             raise wrong(
                 self.path,
                 f"got no comma, semicolon or tab between names, expected columns,"
                 f" {shown(missing[0])} among them",
-                f"line {self._first_line - 1}",
+                f"line {self._body.first_line - 1}",
             )
         require_columns(self.path, self.names, names)
 
     def _record(self, row: int) -> tuple[int, list[str]]:
-        for i, record in enumerate(self._records()):
+        # From the top each time: only a message asks for one, and an index of all rows would be as
+        # large as the log.
+        for i, record in enumerate(self._body.records()):
             if i == row:
                 return record
         raise IndexError(row)
 
-    def _records(self) -> Iterator[tuple[int, list[str]]]:
-        """Each row's line and cells. Blank lines are passed over, as in pyarrow's reader."""
-        if '"' not in self._body:
-            for number, line in enumerate(lines_of(self._body), self._first_line):
-                if not _is_blank(line, self.delimiter):
-                    yield number, line.split(self.delimiter)
-            return
-        lines = (f"{line}\n" for line in lines_of(self._body))
-        reader = csv.reader(lines, delimiter=self.delimiter, skipinitialspace=True, strict=True)
-        start = self._first_line
-        try:
-            for cells in reader:
-                if cells and not (len(cells) == 1 and _is_blank(cells[0], self.delimiter)):
-                    yield start, cells
-                start = self._first_line + reader.line_num
-        except csv.Error as e:
-            problem = "a quotation mark that closes nothing or is never closed, expected numbers"
-            raise wrong(self.path, problem, f"line {start}") from e
-
-    def _texts(self, indices: Sequence[int]) -> list[Any]:
+    def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """The cells of some columns as pyarrow string arrays (N,)."""
-        texts = None if '"' in self._body else self._texts_by_pyarrow(indices)
+        # pyarrow takes a line break within quotes for one within a cell or for the end of a row, by
+        # an option; either way the lines that it counts are not those of the file.
+        texts = None if '"' in self._body.text else self._texts_by_pyarrow(indices)
         if texts is None:
             texts = self._texts_row_by_row(indices)
         if texts and not len(texts[0]):
             raise wrong(self.path, "holds a header alone, expected rows of numbers")
         return texts
 
-    def _texts_by_pyarrow(self, indices: Sequence[int]) -> list[Any] | None:
+    def _texts_by_pyarrow(self, indices: Sequence[int]) -> list["pa.ChunkedArray"] | None:
         """As `_texts`; None where pyarrow finds anything wrong."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
+        # By number, since two columns may have one name. As text, since pyarrow's own guess
+        # knows no decimal comma, and gives up a column of numbers for one bad cell.
         names = [str(i) for i in range(len(self.names))]
-        wanted = [names[i] for i in indices]
+        columns = [names[i] for i in indices]
         ragged: list[Any] = []
 
+        # Called for each row with other than the header's number of cells: so for blank lines too,
+        # which are no error. That there is any other is enough: `Body.records` finds its line.
         def skip(row: Any) -> str:
-            if not _is_blank(row.text, self.delimiter):
+            if not self._body.is_blank(row.text):
                 ragged.append(row)
             return "skip"
 
         try:
             table = arrow_csv.read_csv(
-                pa.BufferReader(self._body.encode()),
+                pa.BufferReader(self._body.text.encode()),
                 read_options=arrow_csv.ReadOptions(column_names=names),
                 parse_options=arrow_csv.ParseOptions(
-                    delimiter=self.delimiter,
+                    delimiter=self._body.delimiter,
                     quote_char=False,
                     double_quote=False,
                     invalid_row_handler=skip,
                 ),
                 convert_options=arrow_csv.ConvertOptions(
-                    column_types=dict.fromkeys(wanted, pa.string()), include_columns=wanted
+                    column_types=dict.fromkeys(columns, pa.string()), include_columns=columns
                 ),
             )
         except pa.ArrowException:  # such as a line longer than a block
             return None
-        return None if ragged else [table.column(name) for name in wanted]
+        return None if ragged else [table.column(name) for name in columns]
 
-    def _texts_row_by_row(self, indices: Sequence[int]) -> list[Any]:
+    def _texts_row_by_row(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """As `_texts`; cells are packed as they come: as objects of Python they take many times
         the file's size."""
         import pyarrow as pa
 
+        # large_string: an array of string() holds 2 GB of text at most.
         width, kind = len(self.names), pa.large_string()
         pieces: list[list[Any]] = [[] for _ in indices]
         cells_of: list[list[str]] = [[] for _ in indices]
@@ -241,12 +227,12 @@ class CsvTable:
                 piece.append(pa.array(cells, kind))
                 cells.clear()
 
-        for row, (line, cells) in enumerate(self._records()):
+        for row, (line, cells) in enumerate(self._body.records()):
             if len(cells) != width:
                 problem = f"{_count(len(cells))}, expected {width} as in the header"
                 raise wrong(self.path, problem, f"line {line}")
-            for one, i in zip(cells_of, indices, strict=True):
-                one.append(cells[i])
+            for column_cells, i in zip(cells_of, indices, strict=True):
+                column_cells.append(cells[i])
             if row % self._rows_at_once == self._rows_at_once - 1:
                 pack()
         pack()
@@ -254,15 +240,11 @@ class CsvTable:
 
     @property
     def _rows_at_once(self) -> int:
-        return max(1, _ROWS_AT_ONCE // len(self.names))
+        return max(1, _CELLS_AT_ONCE // len(self.names))
 
 
 def _count(n: int) -> str:
     return "1 cell" if n == 1 else f"{n} cells"
-
-
-def _is_blank(line: str, delimiter: str) -> bool:
-    return not line.strip() and delimiter not in line
 
 
 def _compute() -> Any:
@@ -276,13 +258,15 @@ class _TwoDecimalSigns(Exception):
     """A file holds both decimal commas and decimal points."""
 
 
-def _decimal_points(texts: list[Any], delimiter: str) -> list[Any]:
+def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.ChunkedArray"]:
     """The cells with decimal points for commas, where the comma is not the delimiter.
 
     Raises:
         _TwoDecimalSigns: so that no thousands separator passes for a decimal sign.
     """
     pc = _compute()
+    # Over all columns that are read, not one by one: a file has one decimal sign, and a column of
+    # 1.500 beside one of 1,5 holds thousands.
     signs = {}
     for sign in (",", ".") if delimiter != "," else ():
         for text in texts:
@@ -298,27 +282,28 @@ def _decimal_points(texts: list[Any], delimiter: str) -> list[Any]:
     return [pc.replace_substring(text, ",", ".") for text in texts]
 
 
-def _filled(text: Any) -> Any:
+def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     """Cells without the blanks around them, null where nothing is left."""
     pc = _compute()
     trimmed = pc.utf8_trim_whitespace(text)
     return pc.if_else(pc.equal(trimmed, ""), None, trimmed)
 
 
-def _floats(text: Any) -> np.ndarray | int:
+def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
     """Cells as float64 (N,), NaN where empty; or the first row that holds no number."""
     import pyarrow as pa
 
     filled = _filled(text)
     try:
         return np.asarray(filled.cast(pa.float64()).to_numpy(zero_copy_only=False))
-    except pa.ArrowInvalid:
+    except pa.ArrowInvalid:  # it does not say which row
         return _floats_one_by_one(filled)
 
 
-def _floats_one_by_one(filled: Any) -> np.ndarray | int:
+def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:
+    # In pieces: as objects of Python all cells at once take many times the file's size.
     values = np.full(len(filled), np.nan)
-    pieces = (filled.slice(at, _ROWS_AT_ONCE) for at in range(0, len(filled), _ROWS_AT_ONCE))
+    pieces = (filled.slice(at, _CELLS_AT_ONCE) for at in range(0, len(filled), _CELLS_AT_ONCE))
     for row, cell in enumerate(cell for piece in pieces for cell in piece.to_pylist()):
         if cell is None:
             continue

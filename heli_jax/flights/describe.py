@@ -18,6 +18,7 @@ _UNIT_AT_END = re.compile(
     r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))(s|sec|ms|us|µs|ns|min)(?(open)[\])])$"
 )
 _GAP_STEPS = 1.5
+"""usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
 
 
 @dataclass(frozen=True)
@@ -89,43 +90,42 @@ def describe_log(path: str | Path, time: str | Signal | None = None) -> LogInfo:
         InputError: the log cannot be read, or has no such column.
     """
     table = open_table(path)
-    survey = table.survey()
-    signal = _guess_time(table, survey) if time is None else _asked_time(table, survey, time)
+    surveys = table.survey()
+    signal = _guess_time(table, surveys) if time is None else _asked_time(table, surveys, time)
     return LogInfo(
         path=table.path,
         format=table.format,
         size=table.size,
         sha256=table.sha256,
-        n_rows=_n_rows(table, survey),
-        columns=tuple(_describe_column(found) for found in survey),
-        time=None if signal is None else _describe_time(table, survey, signal),
+        n_rows=_n_rows(surveys),
+        columns=tuple(_describe_column(each) for each in surveys),
+        time=None if signal is None else _describe_time(table, surveys, signal),
     )
 
 
-def _n_rows(table: Table, survey: list[Survey]) -> int:
-    return max(
-        (found.n_filled if found.values is None else found.values.size for found in survey),
-        default=0,
-    )
+def _n_rows(surveys: list[Survey]) -> int:
+    # Of a column of text only the filled cells are known, so the longest column is asked.
+    sizes = (each.n_filled if each.values is None else each.values.size for each in surveys)
+    return max(sizes, default=0)
 
 
-def _describe_column(found: Survey) -> ColumnInfo:
+def _describe_column(survey: Survey) -> ColumnInfo:
     nan = float("nan")
-    if found.values is None:
-        return ColumnInfo(found.name, "text", found.n_filled, 0, nan, nan, nan, nan)
-    n_nan = int(np.count_nonzero(np.isnan(found.values)))
-    x = found.values[np.isfinite(found.values)]
+    if survey.values is None:
+        return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan)
+    n_nan = int(np.count_nonzero(np.isnan(survey.values)))
+    x = survey.values[np.isfinite(survey.values)]
     numbers = (nan, nan, nan, nan)
     if x.size:
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):  # a sum of huge numbers may overflow
             numbers = (float(x.min()), float(x.max()), float(x.mean()), float(x.std()))
-    return ColumnInfo(found.name, "number", found.n_filled, n_nan, *numbers)
+    return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers)
 
 
-def _asked_time(table: Table, survey: list[Survey], time: str | Signal) -> Signal:
+def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Signal:
     signal = Signal(time, "s", "s") if isinstance(time, str) else time
     require_columns(table.path, table.names, [signal.name])
-    if _values(survey, signal.name) is None:
+    if _values(surveys, signal.name) is None:
         raise wrong(table.path, "holds text, expected times", column(signal.name))
     try:
         units.factor(signal.unit, "s")
@@ -134,14 +134,15 @@ def _asked_time(table: Table, survey: list[Survey], time: str | Signal) -> Signa
     return signal
 
 
-def _guess_time(table: Table, survey: list[Survey]) -> Signal | None:
-    numeric = [found.name for found in survey if found.values is not None]
+def _guess_time(table: Table, surveys: list[Survey]) -> Signal | None:
+    numeric = [survey.name for survey in surveys if survey.values is not None]
+    # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
         stem, unit = _split_unit(name)
         if stem.casefold() in _TIME_NAMES or table.time_unit(name):
             return Signal(name, unit, "s")
     for name in numeric:
-        values = _values(survey, name)
+        values = _values(surveys, name)
         if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
             return Signal(name, _split_unit(name)[1], "s")
     return None
@@ -152,14 +153,14 @@ def _split_unit(name: str) -> tuple[str, str]:
     return (match[1], match[3]) if match else (name, "s")
 
 
-def _values(survey: list[Survey], name: str) -> np.ndarray | None:
-    return next(found.values for found in survey if found.name == name)
+def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
+    return next(survey.values for survey in surveys if survey.name == name)
 
 
-def _describe_time(table: Table, survey: list[Survey], signal: Signal) -> TimeInfo:
+def _describe_time(table: Table, surveys: list[Survey], signal: Signal) -> TimeInfo:
     unit = table.time_unit(signal.name) or signal.unit
-    stamps = _values(survey, signal.name)
-    assert stamps is not None
+    stamps = _values(surveys, signal.name)
+    assert stamps is not None  # only a column of numbers is guessed or taken for a clock
     with np.errstate(all="ignore"):
         seconds = stamps * units.factor(unit, "s")
         steps = np.diff(seconds)
@@ -167,9 +168,10 @@ def _describe_time(table: Table, survey: list[Survey], signal: Signal) -> TimeIn
     nan = float("nan")
     if problem:
         return TimeInfo(signal.name, unit, nan, nan, False, nan, (), problem)
-    usual = float(np.median(steps))
+    usual = float(np.median(steps))  # the mean would count the gaps
     grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * units.factor(unit, "s"))
     uneven = isinstance(grid, Uneven)
+    # Stamps that are a grid but for their rounding have no gaps, however coarse it is.
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
     return TimeInfo(
         column=signal.name,
@@ -192,8 +194,8 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
         return "the stamps are too large for times"
     if not np.all(steps > 0):
         row = int(np.flatnonzero(steps <= 0)[0])
-        what = "stands still" if steps[row] == 0 else "runs backwards"
-        return f"the time {what} after {seconds[row] - seconds[0]:.6g} s"
+        fault = "stands still" if steps[row] == 0 else "runs backwards"
+        return f"the time {fault} after {seconds[row] - seconds[0]:.6g} s"
     if np.median(steps) < SHORTEST_STEP:
         return "the steps are shorter than 1 ns"
     return ""

@@ -16,7 +16,7 @@ class Signal:
     Attributes:
         name: the column's name in the log.
         unit: the unit in the log, such as `deg`.
-        si: the SI unit that the model wants, such as `rad`.
+        si: the SI unit of the model, such as `rad`.
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
         hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
             log shows of it.
@@ -79,6 +79,7 @@ class Flight:
             raise ValueError(f"dt is {self.dt}, expected a positive number of seconds")
         if not math.isfinite(self.t0):
             raise ValueError(f"t0 is {self.t0}, expected a finite number of seconds")
+        # By object.__setattr__, since the class is frozen: what was fitted must not change later.
         for kind in ("inputs", "outputs"):
             gaps = kind == "outputs"
             signals = {name: _samples(name, x, gaps) for name, x in getattr(self, kind).items()}
@@ -129,6 +130,7 @@ class Flight:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)
 
+    # Imported within: `summaries` is for notebooks, and a flight is made without it.
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_flight
 
@@ -141,9 +143,11 @@ class Flight:
 
 
 def _samples(name: str, values: np.ndarray, gaps: bool) -> np.ndarray:
+    # A copy, made read-only: the caller's array may change after the flight has been checked.
     samples = np.array(values, dtype=np.float64)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"{name!r} has shape {samples.shape}, expected (N,) with N >= 1")
+    # NaN in an output is a sample that was not taken; an input acts all the time.
     bad = np.flatnonzero(np.isinf(samples) if gaps else ~np.isfinite(samples))
     if bad.size:
         raise ValueError(f"{name!r} is {samples[bad[0]]} at sample {bad[0]}, expected numbers")

@@ -51,12 +51,14 @@ def decide(values: np.ndarray) -> Decision:
     share = float(moved.mean())
     if span <= (_FEW + 0.5) * quantum:
         return _of_few_values(moves, moved, span, quantum, share)
-    told = np.where(size > 1.5 * quantum, size, 0.0)
-    if not told.any():
+    # 1.5: one count against two, whatever the rounding of either.
+    evident = np.where(size > 1.5 * quantum, size, 0.0)
+    if not evident.any():
         return Decision("linear", f"moves by one count of the log at a time, {_percent(share)}")
+    # The larger of a move's two neighbours; before the first and after the last there is none.
     beside = np.maximum(np.r_[0.0, size[:-1]], np.r_[size[1:], 0.0])
-    jumps = (told > 0) & (beside <= _QUIET * told)
-    weight = told**_POWER
+    jumps = (evident > 0) & (beside <= _QUIET * evident)
+    weight = evident**_POWER
     if weight[jumps].sum() >= 0.5 * weight.sum():
         return Decision("zero-order", _steps(jumps))
     return Decision("linear", f"moves at {_percent(share)}")
@@ -67,10 +69,12 @@ def _of_few_values(
 ) -> Decision:
     """Of an input with a handful of values, such as -1, 0 and 1, or noise of a few counts: steps,
     unless it passes through the values between on its way."""
-    went = np.flatnonzero(moved)
+    at = np.flatnonzero(moved)
     # Two moves of the same sign at neighbouring samples are one motion, seen on its way.
-    onward = (np.diff(went) == 1) & (np.sign(moves[went[1:]]) == np.sign(moves[went[:-1]]))
-    if went.size > 1 and onward.mean() > 0.4:
+    # Of white noise of a few counts less than a third of neighbouring moves agree in sign, since a
+    # value above the mean tends to come back: hence 0.4.
+    onward = (np.diff(at) == 1) & (np.sign(moves[at[1:]]) == np.sign(moves[at[:-1]]))
+    if at.size > 1 and onward.mean() > 0.4:
         return Decision("linear", f"passes through the values between, moves at {_percent(share)}")
     return Decision("zero-order", _steps(moved))
 
@@ -80,7 +84,7 @@ def _steps(jumps: np.ndarray) -> str:
     if at.size < 2:
         return "jumps once and stays"
     stay = round(float(np.median(np.diff(at))))
-    if stay < 2:
+    if stay < 2:  # a random binary signal at the log's own rate
         return "jumps from sample to sample among few values"
     return f"stays for {stay} samples at a time and jumps"
 

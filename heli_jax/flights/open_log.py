@@ -17,8 +17,11 @@ def open_table(path: str | Path) -> Table:
             format may be, it cannot be read, or it is of no readable format.
     """
     path = Path(path)
+    # By the ending, not by the content, so that a damaged Parquet file is called so and not read as
+    # text. A new format adds one entry.
     readers = {".parquet": open_parquet} | dict.fromkeys((".csv", ".txt", ".tsv"), open_csv)
     try:
+        # Any size here: each reader has a limit of its own.
         if not require_regular(path, "a log in CSV or Parquet", sys.maxsize):
             raise wrong(str(path), "is empty, expected a log in CSV or Parquet")
         reader = readers.get(path.suffix.lower())

@@ -4,12 +4,17 @@ import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from heli_jax.flights.table import Survey, column, require_columns, require_few_columns, wrong
 from heli_jax.regular_file import open_regular, size_words
+
+# Imported again within the functions that need it, as in `csv_table`.
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 _LARGEST = 16 * 10**9
 """bytes: the whole file goes through sha256, the columns asked for into memory"""
@@ -32,12 +37,13 @@ def open_parquet(path: Path) -> "ParquetTable":
 
     with open_regular(path, "a log in Parquet", _LARGEST) as opened:
         size = os.fstat(opened.fileno()).st_size
-        # Before anything goes through the whole file.
+        # Before anything goes through the whole file: what ends otherwise is none of Parquet.
         _check_end(str(path), opened, size)
         try:
             file = pq.ParquetFile(path)
             schema, metadata = file.schema_arrow, file.metadata
             n_rows = metadata.num_rows
+        # pyarrow raises UnicodeDecodeError where the name of a column is no text.
         except (pa.ArrowException, OSError, UnicodeDecodeError) as e:
             raise wrong(str(path), "is no whole Parquet file") from e
         if not len(schema) or not n_rows:
@@ -54,14 +60,16 @@ def open_parquet(path: Path) -> "ParquetTable":
 
 
 def _sha256(file: BinaryIO) -> str:
-    found = hashlib.sha256()
-    while piece := file.read(1 << 20):
-        found.update(piece)
-    return found.hexdigest()
+    digest = hashlib.sha256()
+    while piece := file.read(1 << 20):  # never the whole file: it may be larger than the memory
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:
     """Refuse a file whose end is not that of a Parquet file, or says that it is mostly header."""
+    # A Parquet file ends with its metadata, their length (4 bytes, little-endian) and its mark:
+    # PAR1, or PARE where the metadata are encrypted. 12 bytes are both marks and the length.
     file.seek(max(size - 8, 0))
     end = file.read(8)
     file.seek(0)
@@ -78,7 +86,7 @@ class ParquetTable:
 
     format = "parquet"
 
-    def __init__(self, path: str, size: int, sha256: str, file: Any) -> None:
+    def __init__(self, path: str, size: int, sha256: str, file: "pq.ParquetFile") -> None:
         self.path, self.size, self.sha256 = path, size, sha256
         self._file = file
         self._schema = file.schema_arrow
@@ -112,7 +120,7 @@ class ParquetTable:
         """`row 1` is the first."""
         return f"row {row + 1}"
 
-    def found(self, name: str, row: int) -> str:
+    def cell_text(self, name: str, row: int) -> str:
         """What stands in a cell, in words."""
         value = self._read([name]).column(name)[row].as_py()
         return "nothing" if value is None else repr(value)[:40]
@@ -132,14 +140,15 @@ class ParquetTable:
         for i in range(metadata.num_row_groups):
             group = metadata.row_group(i)
             for j in range(group.num_columns):
-                one = group.column(j)
-                if names is None or one.path_in_schema in names:
-                    cells += max(one.num_values, group.num_rows)
+                chunk = group.column(j)
+                # num_values counts what lists within cells hold; a column of nulls may claim none.
+                if names is None or chunk.path_in_schema in names:
+                    cells += max(chunk.num_values, group.num_rows)
         if cells > _MOST_CELLS:
             problem = f"expected at most {_MOST_CELLS} values in the columns read, got {cells}"
             raise wrong(self.path, f"{problem}; read fewer columns, or resample the log")
 
-    def _read(self, names: Sequence[str] | None) -> Any:
+    def _read(self, names: Sequence[str] | None) -> "pa.Table":
         import pyarrow as pa
 
         self._require_few(names)
@@ -151,16 +160,17 @@ class ParquetTable:
             raise wrong(self.path, "is no whole Parquet file") from e
 
 
-def _is_text(kind: Any) -> bool:
+def _is_text(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
     types = pa.types
     return types.is_string(kind) or types.is_binary(kind)
 
 
-def _is_number(kind: Any) -> bool:
+def _is_number(kind: "pa.DataType") -> bool:
     import pyarrow as pa
 
+    # A clock's ticks count as numbers, so that a column of time stamps can be the time.
     types = pa.types
     return (
         types.is_integer(kind)
@@ -173,15 +183,18 @@ def _is_number(kind: Any) -> bool:
     )
 
 
-def _floats(values: Any) -> np.ndarray:
+def _floats(values: "pa.ChunkedArray") -> np.ndarray:
     """Numbers, or ticks of a clock, as float64 (N,), NaN where null."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     kind = values.type
+    # Ticks as whole numbers first: no cast goes from stamps to floating point.
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time64(kind):
         values = values.cast(pa.int64())
     elif pa.types.is_time32(kind):
         values = values.cast(pa.int32())
+    # Unsafe, since a safe cast refuses integers above 2^53, which stamps in ns all are. A
+    # calendar's stamps round to 256 ns.
     values = pc.cast(values, pa.float64(), safe=False)
     return np.asarray(values.to_numpy(), dtype=np.float64)

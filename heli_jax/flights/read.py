@@ -1,23 +1,29 @@
 """From a log to a `Flight`: columns, units, window, clock."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from heli_jax import units
+from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.open_log import open_table
-from heli_jax.flights.request import Request
+from heli_jax.flights.request import ReadOptions, Request
 from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
 from heli_jax.flights.table import Table, column, shown, wrong
 
 _FEWEST = 8
+"""samples in a run"""
 _MOST_UPSAMPLING = 100
+"""times the log's rate: more is a slip, and fills the memory with straight lines"""
+_DEFAULT = ReadOptions()
 
 
 def read_flight(
@@ -26,12 +32,8 @@ def read_flight(
     time: str | Signal,
     inputs: Mapping[str, Signal],
     outputs: Mapping[str, Signal],
-    rate: float | None = None,
-    window: tuple[float, float] | None = None,
-    known: Mapping[str, float] | None = None,
-    hold_out: bool = False,
-    name: str = "",
-    moving_inputs: bool = True,
+    options: ReadOptions = _DEFAULT,
+    **keywords: Any,
 ) -> Flight:
     """Read one run from a log in CSV or Parquet.
 
@@ -41,43 +43,43 @@ def read_flight(
         inputs: the log's signals by the model's names; two inputs may share a column. What one
             does between samples is its `hold`; "auto" decides by how it moves in the log.
         outputs: the same for what was measured.
-        rate: resample to this rate [Hz]. Without it the stamps must be a uniform grid.
-        window: first and last time to use [s], counted from the log's first sample.
-        known: parameters that differ in this run, SI.
-        hold_out: whether the run serves for validation alone.
-        name: what to call the run.
-        moving_inputs: whether a run in which no input ever moves is refused.
+        options: which part of the log, at which rate; all of it unless given.
+        **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
+            [s], `known` [SI], `hold_out`, `name`, `moving_inputs`.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.
+        TypeError: a keyword that is no field of ReadOptions.
     """
-    request = Request(str(path), time, inputs, outputs, rate, window, known or {})
+    options = dataclasses.replace(options, **keywords)
+    request = Request(str(path), time, inputs, outputs, options)
     table = open_table(path)
     numbers = table.numbers(request.columns)
     clock = _clock(table, request.time, numbers[request.time.name])
-    seconds = clock.elapsed
-    rows, notes = _rows(table.path, seconds, window)
+    rows, notes = _rows(table.path, clock.elapsed, options.window)
     signals = _to_si(table, request, numbers, rows)
-    _check_step(table, request.time.name, seconds[rows], rows.start)
-    grid = uniform_grid(seconds[rows], rounding_of(clock.stamps[rows]) * clock.scale)
-    if isinstance(grid, Uneven) and rate is None:
-        raise _uneven(table, request.time.name, seconds[rows], rows.start, grid)
+    stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
+    _check_step(stamps)
+    grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
+    if isinstance(grid, Uneven) and options.rate is None:
+        raise _uneven(stamps, grid)
+    # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = _holds(request, signals)
-    dt, samples, more = _on_grid(table, request, seconds, rows, signals, grid, holds)
+    dt, samples, more = _on_grid(stamps, options.rate, signals, grid, holds)
     flight = Flight(
         dt=dt,
         inputs={key: samples[key, "input"] for key in inputs},
         outputs={key: samples[key, "output"] for key in outputs},
         t0=float(clock.stamps[rows.start] * clock.scale),
         sd=request.noise(),
-        known=dict(request.known),
-        hold_out=hold_out,
-        name=name,
+        known=request.known,
+        hold_out=options.hold_out,
+        name=options.name,
         source=Source(table.path, table.sha256, (*notes, *_missing(request, signals), *more)),
-        hold={key: one.hold for key, one in holds.items()},
-        hold_reason={key: one.reason for key, one in holds.items() if one.reason},
+        hold={key: decision.hold for key, decision in holds.items()},
+        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
     )
-    if moving_inputs:
+    if options.moving_inputs:
         require_moving_inputs(flight)
     return flight
 
@@ -114,22 +116,40 @@ class _Clock:
         return (self.stamps - self.stamps[0]) * self.scale
 
 
+@dataclass(frozen=True, eq=False)
+class _Stamps:
+    """The stamps (N,) that are used, in seconds from the log's first, and where they stand."""
+
+    table: Table
+    name: str
+    """of their column"""
+    seconds: np.ndarray
+    first_row: int
+
+    def wrong(self, problem: str, i: int) -> InputError:
+        """The error for the i-th of these stamps, placed in the file's own rows."""
+        place = self.table.place(self.first_row + i)
+        return wrong(self.table.path, problem, place, column(self.name))
+
+
 def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
     """The stamps, finite and increasing."""
     place = column(time.name)
+    # A column of time stamps says by its type what its ticks are, whatever the user thinks.
     scale = units.factor(table.time_unit(time.name) or time.unit, "s")
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
         row = int(bad[0])
-        found = f"got {table.found(time.name, row)}, expected a time"
-        raise wrong(table.path, found, table.place(row), place)
+        problem = f"got {table.cell_text(time.name, row)}, expected a time"
+        raise wrong(table.path, problem, table.place(row), place)
+    # In the log's own unit: a product with the scale can round two stamps to one.
     back = np.flatnonzero(np.diff(stamps) <= 0)
     if back.size:
         row = int(back[0]) + 1
-        what = "stands still" if stamps[row] == stamps[row - 1] else "runs backwards"
-        after, now = table.found(time.name, row - 1), table.found(time.name, row)
-        problem = f"the time {what}, got {now} after {after}, expected increasing times"
+        fault = "stands still" if stamps[row] == stamps[row - 1] else "runs backwards"
+        after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
+        problem = f"the time {fault}, got {now} after {after}, expected increasing times"
         raise wrong(table.path, problem, table.place(row), place)
     return _Clock(stamps, scale)
 
@@ -141,7 +161,7 @@ def _rows(
     first, last, notes = 0, elapsed.size, ()
     where = "the log"
     if window is not None and elapsed.size > 1:
-        step = float(np.median(np.diff(elapsed)))
+        step = float(np.median(np.diff(elapsed)))  # the mean would count the gaps
         start, end = window
         where = f"the window from {start:g} s to {end:g} s"
         if end < 0 or start > elapsed[-1]:
@@ -169,109 +189,108 @@ def _to_si(
     """The signals (N,) inside the window in SI, by name and kind."""
     samples = {}
     for (key, kind), signal in request.signals.items():
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore"):  # what overflows is refused below, with its line
             values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
         # An output may be missing here and there; a stick is somewhere all the time.
         bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:
             row = rows.start + int(bad[0])
-            found = f"got {table.found(signal.name, row)}, expected a finite number"
-            raise wrong(table.path, found, table.place(row), column(signal.name))
+            problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"
+            raise wrong(table.path, problem, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples
 
 
 def _holds(request: Request, signals: _Samples) -> dict[str, Decision]:
     """What each input does between samples: as stated, or by what the log itself shows."""
-    found = {}
+    holds = {}
     for (key, kind), signal in request.signals.items():
         if kind == "input":
-            given = Decision(signal.hold, "")
-            found[key] = decide(signals[key, kind]) if signal.hold == "auto" else given
-    return found
+            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
+            holds[key] = decide(signals[key, kind]) if signal.hold == "auto" else stated
+    return holds
 
 
 def _missing(request: Request, signals: _Samples) -> list[str]:
     """A note for every output with missing samples."""
-    found = []
+    notes = []
     for (key, kind), values in signals.items():
         count = int(np.isnan(values).sum())
         if count:
             name = request.signals[key, kind].name
-            found.append(f"{count} of {values.size} samples of {shown(name)} are missing")
-    return found
+            notes.append(f"{count} of {values.size} samples of {shown(name)} are missing")
+    return notes
 
 
-def _check_step(table: Table, name: str, seconds: np.ndarray, start: int) -> None:
+def _check_step(stamps: _Stamps) -> None:
     """Refuse steps that no clock resolves: the time's unit is wrong."""
-    usual = float(np.median(np.diff(seconds)))
+    usual = float(np.median(np.diff(stamps.seconds)))
     if usual < SHORTEST_STEP:
-        problem = (
-            f"the usual step is {usual:.3g} s, expected at least 1 ns; look at the time's unit"
-        )
-        raise wrong(table.path, problem, table.place(start), column(name))
+        problem = f"the usual step is {usual:.3g} s, expected at least 1 ns"
+        raise stamps.wrong(f"{problem}; look at the time's unit", 0)
 
 
-def _uneven(table: Table, name: str, seconds: np.ndarray, start: int, uneven: Uneven) -> ValueError:
+def _uneven(stamps: _Stamps, uneven: Uneven) -> InputError:
     """The error for stamps that are no uniform grid, with the remedy."""
-    place = table.place(start + uneven.row)
     if uneven.drift is not None:
         problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
     else:
         problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
     remedy = f"give `rate: {1 / uneven.usual:.4g}` to resample, or a window"
-    if np.diff(seconds).max() > longest_gap(seconds):
+    # Where a gap is too long to be bridged, a rate would only lead to the next error.
+    if np.diff(stamps.seconds).max() > longest_gap(stamps.seconds):
         remedy = "give a window"
-    wanted = f"expected a uniform grid; {remedy} without such steps"
-    return wrong(table.path, f"{problem}, {wanted}", place, column(name))
+    expected = f"expected a uniform grid; {remedy} without such steps"
+    return stamps.wrong(f"{problem}, {expected}", uneven.row)
 
 
 def _on_grid(
-    table: Table,
-    request: Request,
-    seconds: np.ndarray,
-    rows: slice,
+    stamps: _Stamps,
+    rate: float | None,
     signals: _Samples,
     grid: Grid | Uneven,
     holds: Mapping[str, Decision],
 ) -> tuple[float, _Samples, tuple[str, ...]]:
     """The time step, the signals on the uniform grid, and notes on how they came there."""
-    stamps, rate = seconds[rows], request.rate
+    seconds = stamps.seconds
     notes: tuple[str, ...] = ()
     if isinstance(grid, Grid):
         if rate is None:
             return grid.dt, signals, grid.notes
-        if abs(rate * grid.dt - 1.0) * stamps.size < 0.5:
+        # A rate that leaves the log's own grid by less than half a sample at its end is that grid:
+        # the samples stay as they are, unblurred by interpolation.
+        if abs(rate * grid.dt - 1.0) * seconds.size < 0.5:
             return 1.0 / rate, signals, grid.notes
         # The grid is better than its rounded stamps: held inputs would slip by a sample.
-        stamps, notes = stamps[0] + grid.dt * np.arange(stamps.size), grid.notes
-    assert rate is not None
-    _check_rate(table, request.time.name, stamps, rows.start, rate)
-    clock = new_clock(stamps, rate)
+        seconds, notes = seconds[0] + grid.dt * np.arange(seconds.size), grid.notes
+        stamps = dataclasses.replace(stamps, seconds=seconds)
+    assert rate is not None  # `read_flight` refuses uneven stamps without one
+    _check_rate(stamps, rate)
+    clock = new_clock(seconds, rate)
     samples = {}
     for (key, kind), x in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
-        samples[key, kind] = (hold if stays else interpolate)(stamps, x, clock.times)
+        samples[key, kind] = (hold if stays else interpolate)(seconds, x, clock.times)
     return clock.dt, samples, notes + clock.notes
 
 
-def _check_rate(table: Table, name: str, seconds: np.ndarray, start: int, rate: float) -> None:
+def _check_rate(stamps: _Stamps, rate: float) -> None:
     """Refuse gaps that nothing should bridge, and rates that make no sense for the log."""
+    seconds, path = stamps.seconds, stamps.table.path
     steps = np.diff(seconds)
     row, most = int(np.argmax(steps)), longest_gap(seconds)
-    if steps[row] > most * (1 + 1e-9):
-        raise wrong(
-            table.path,
-            f"found a gap of {steps[row]:.6g} s, {seconds[row]:.6g} s after the first sample,"
+    if steps[row] > most * (1 + 1e-9):  # a step of exactly the limit, but for its rounding, passes
+        raise stamps.wrong(
+            f"a gap of {steps[row]:.6g} s, {seconds[row]:.6g} s after the first sample,"
             f" expected none longer than {most:.3g} s; give a window without it",
-            table.place(start + row + 1),
-            column(name),
+            row + 1,
         )
     usual = float(np.median(steps))
     count = (seconds[-1] - seconds[0]) * rate
     if not count >= _FEWEST - 1 - 1e-6:
         problem = f"a rate of {rate:g} Hz leaves fewer than {_FEWEST} samples, expected more"
-        raise wrong(table.path, problem)
+        raise wrong(path, problem)
+    # The product can overflow where the rate alone is finite.
     if not (rate * usual <= _MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
-        raise wrong(table.path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")
+        raise wrong(path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")

@@ -1,11 +1,34 @@
-"""What is asked of a log, checked before the log is read."""
+"""What is asked of a log, checked before the log is read.
+
+Checked before, because a log can take minutes to read, and a wrong unit or a reversed window need
+not wait for it.
+"""
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.table import column, wrong
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What `read_flight` takes of a log and what it makes of it; each field is also its keyword."""
+
+    rate: float | None = None
+    """resample to this rate [Hz]; without it the stamps must be a uniform grid"""
+    window: tuple[float, float] | None = None
+    """first and last time to use [s], counted from the log's first sample"""
+    known: Mapping[str, float] | None = None
+    """parameters that differ in this run, SI"""
+    hold_out: bool = False
+    """whether the run serves for validation alone"""
+    name: str = ""
+    """what to call the run"""
+    moving_inputs: bool = True
+    """whether a run in which no input ever moves is refused"""
 
 
 class Request:
@@ -21,12 +44,12 @@ class Request:
         time: str | Signal,
         inputs: Mapping[str, Signal],
         outputs: Mapping[str, Signal],
-        rate: float | None,
-        window: tuple[float, float] | None,
-        known: Mapping[str, float],
+        options: ReadOptions,
     ) -> None:
-        self.path, self.rate, self.known = path, rate, known
+        self.path, self.options = path, options
+        self.known = dict(options.known or {})
         self.time = Signal(time, "s", "s") if isinstance(time, str) else time
+        # By name and kind: a model may call an input and an output the same.
         self.signals = {(key, "input"): signal for key, signal in inputs.items()}
         self.signals |= {(key, "output"): signal for key, signal in outputs.items()}
         if not self.signals:
@@ -35,7 +58,7 @@ class Request:
         self._check_units()
         self._check_noise()
         self._check_holds()
-        self._check_numbers(window)
+        self._check_numbers()
 
     @property
     def columns(self) -> list[str]:
@@ -44,6 +67,7 @@ class Request:
 
     def noise(self) -> dict[str, float]:
         """The stated noise of the outputs, in SI."""
+        # abs: a unit may flip the sign of a signal, but a standard deviation has none.
         return {
             key: signal.sd * abs(units.factor(signal.unit, signal.si))
             for (key, kind), signal in self.signals.items()
@@ -51,6 +75,8 @@ class Request:
         }
 
     def _check_columns(self) -> None:
+        # Two inputs may share a column. Any other double use is a slip: a column that is input and
+        # output at once would be fitted perfectly, and say nothing.
         uses = {self.time.name: ("time", "the time")}
         for (key, kind), signal in self.signals.items():
             use = (kind, f"{kind} {key!r}")
@@ -77,6 +103,7 @@ class Request:
             if kind == "input":
                 problem = f"an sd is stated for {use}, expected one for outputs alone"
                 raise wrong(self.path, problem, column(signal.name))
+            # In SI too: 1e-320 deg is positive, and zero in rad, by which residuals are divided.
             scale = abs(units.factor(signal.unit, signal.si))
             if not (sd > 0 and 0 < sd * scale < math.inf):
                 problem = f"the sd of {use} is {sd:g}, expected a positive number"
@@ -86,22 +113,23 @@ class Request:
         for (key, kind), signal in self.signals.items():
             use = f"{kind} {key!r}"
             if kind == "output" and signal.hold != "auto":
-                problem = f"a hold is stated for {use}, expected is one for inputs alone"
+                problem = f"a hold is stated for {use}, expected one for inputs alone"
                 raise wrong(self.path, problem, column(signal.name))
             if signal.hold not in ("auto", *HOLDS):
                 known = ", ".join(("auto", *HOLDS))
                 problem = f"the hold of {use}: expected one of {known}, got {signal.hold!r:.60}"
                 raise wrong(self.path, problem, column(signal.name))
 
-    def _check_numbers(self, window: tuple[float, float] | None) -> None:
-        if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
-            raise wrong(self.path, f"rate is {self.rate:g}, expected a positive number in Hz")
+    def _check_numbers(self) -> None:
+        rate, window = self.options.rate, self.options.window
+        if rate is not None and not (rate > 0 and math.isfinite(rate)):
+            raise wrong(self.path, f"rate is {rate:g}, expected a positive number in Hz")
         if window is not None:
-            wanted = "expected two increasing numbers of seconds"
+            expected = "expected two increasing numbers of seconds"
             if len(window) != 2 or not all(math.isfinite(w) for w in window):
-                raise wrong(self.path, f"window is {list(window)}, {wanted}")
+                raise wrong(self.path, f"window is {list(window)}, {expected}")
             if not window[0] < window[1]:
-                raise wrong(self.path, f"window is empty or reversed, {list(window)}, {wanted}")
+                raise wrong(self.path, f"window is empty or reversed, {list(window)}, {expected}")
         for name, value in self.known.items():
             if not math.isfinite(value):
                 problem = f"known {name!r} is {value:g}, expected a finite number"

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
+# still near a straight line. What lies in a longer gap nobody knows.
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 
@@ -27,6 +29,7 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     usual = float(np.median(np.diff(seconds)))
     # The last sample is not lost to the rounding of its stamp.
     count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
+    # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
     if rate * usual < 0.5:
         notes.append("nothing was filtered: what the log holds above half the new rate is aliased")
@@ -53,7 +56,16 @@ def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarr
 
 
 def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The straight line between neighbouring samples, arguments and result as in `hold`."""
+    """The straight line between neighbouring samples.
+
+    Args:
+        seconds: stamps (N,) [s], increasing.
+        values: samples (N,), NaN where one is missing.
+        times: (M,) [s]; beyond the last stamp its value holds.
+
+    Returns:
+        (M,), in the samples' unit; NaN beside a missing sample.
+    """
     i = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, seconds.size - 2)
     part = np.clip((times - seconds[i]) / (seconds[i + 1] - seconds[i]), 0.0, 1.0)
     # A weighted mean: the difference of two huge values would overflow.

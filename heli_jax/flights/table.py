@@ -12,7 +12,7 @@ from heli_jax.errors import InputError, nearest
 
 @dataclass(frozen=True)
 class Survey:
-    """One column as it is found: `values` (N,), NaN where empty, or None where it is text."""
+    """One column of a file: `values` (N,), NaN where empty, or None where it is text."""
 
     name: str
     values: np.ndarray | None
@@ -21,6 +21,9 @@ class Survey:
 
 class Table(Protocol):
     """What a reader of one format offers. Rows count from 0, places are for people."""
+
+    # A protocol and no base class: a reader is chosen by the file's ending in `open_log` alone, and
+    # the next format is one more module there.
 
     path: str
     format: str
@@ -40,7 +43,7 @@ class Table(Protocol):
         """Where a row stands: `line 12` of a text file, `row 3` (from 1) of another."""
         ...
 
-    def found(self, name: str, row: int) -> str:
+    def cell_text(self, name: str, row: int) -> str:
         """What stands in a cell, in words."""
         ...
 
@@ -51,6 +54,7 @@ class Table(Protocol):
 
 def wrong(path: str, problem: str, *place: str) -> InputError:
     """The error for a file: `file, place, place: problem`, in one line whatever the names hold."""
+    # A name from a file may hold line breaks or escape sequences, which a terminal would obey.
     text = f"{', '.join((path, *place))}: {problem}"
     return InputError(re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", text))
 
@@ -79,16 +83,23 @@ def require_few_columns(path: str, count: int, *place: str) -> None:
         raise wrong(path, f"expected at most {MOST_COLUMNS} columns, got {count}", *place)
 
 
-def require_columns(path: str, have: Sequence[str], wanted: Sequence[str]) -> None:
+def require_columns(path: str, have: Sequence[str], needed: Sequence[str]) -> None:
     """Refuse a column that is missing or stands in the file twice.
+
+    Args:
+        path: for the message.
+        have: the names in the file, in its order.
+        needed: those to be read.
 
     Raises:
         InputError: with the nearest name there is.
     """
-    for name in wanted:
-        times = have.count(name)
-        if times > 1:
-            raise wrong(path, f"{times} columns have this name, expected one", column(name))
-        if times == 0:
+    for name in needed:
+        count = have.count(name)
+        # Which of the two is meant cannot be known, and pyarrow would return either.
+        if count > 1:
+            raise wrong(path, f"{count} columns have this name, expected one", column(name))
+        if count == 0:
+            # Cut, because the search for the nearest is quadratic in the length of a name.
             known = {n[:40] for n in have if n}
             raise wrong(path, f"no column {shown(name)}{nearest(name[:40], known)}")

@@ -15,7 +15,7 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     Raises:
         OSError: the place cannot be written to.
     """
-    import pyarrow as pa
+    import pyarrow as pa  # here, so that a fit without files does not wait for it
 
     table = pa.table({name: pa.array(values) for name, values in columns.items()})
     if isinstance(target, Path) and target.suffix.lower() == ".parquet":
@@ -25,18 +25,23 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
         return
     import pyarrow.csv
 
+    # pyarrow writes numbers with as many digits as give the same float64 back.
     pyarrow.csv.write_csv(
         table, target if isinstance(target, Path) else pa.PythonFile(target, mode="w")
     )
 
 
 def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:
-    """Tables one below the other; a column that a part lacks is empty there."""
+    """Tables one below the other; a column that a part lacks is empty there.
+
+    `names` are the columns of the result, in order.
+    """
     out: dict[str, Any] = {}
     for name in names:
         if all(name in part for part in parts):
             out[name] = np.concatenate([np.asarray(part[name]) for part in parts])
             continue
+        # A list, because no array of numbers holds an empty cell: NaN would be written as a value.
         cells: list[Any] = []
         for part in parts:
             n = len(next(iter(part.values())))

@@ -20,32 +20,32 @@ def heave():
     return runpy.run_path(str(path))
 
 
-def errors(heave, found):
+def errors(heave, result):
     truth = heave["vehicle"]()
     return {
         n: (e.value - float(getattr(truth, n))) / e.sd
-        for n, e in found.estimates.items()
+        for n, e in result.estimates.items()
         if e.sd is not None
     }
 
 
 def test_nine_parameters_are_recovered_with_throttle(heave):
-    found = heave["identify"](heave["records"](0.03, count=4))
-    assert found.status == "converged"
-    assert set(found.estimates) == set(heave["FREE"])
-    off = errors(heave, found)
+    result = heave["identify"](heave["records"](0.03, count=4))
+    assert result.status == "converged"
+    assert set(result.estimates) == set(heave["FREE"])
+    off = errors(heave, result)
     assert len(off) == 9
     assert max(abs(e) for e in off.values()) < 4
-    a = found.estimates["a"]
+    a = result.estimates["a"]
     assert a.value == pytest.approx(6.0, rel=0.03)
     assert a.sd < 0.02 * 6.0
 
 
 def test_without_throttle_the_pair_is_named(heave):
-    found = heave["identify"](heave["records"](0.002, count=4))
-    assert max(abs(e) for e in errors(heave, found).values()) < 4
-    pairs = {frozenset((p.first, p.second)) for p in found.verdict.pairs}
-    assert "Ir * K_throttle is determined far better" in found.verdict.text or (
+    result = heave["identify"](heave["records"](0.002, count=4))
+    assert max(abs(e) for e in errors(heave, result).values()) < 4
+    pairs = {frozenset((p.first, p.second)) for p in result.verdict.pairs}
+    assert "Ir * K_throttle is determined far better" in result.verdict.text or (
         frozenset(("Ir", "K_throttle")) in pairs
     )
 
@@ -66,8 +66,8 @@ def test_the_extended_filter_knows_the_machine_in_gusts(heave):
             initial_state=start, substeps=1,
         )  # fmt: skip
 
-    def log_likelihood(found):
-        e, s = (np.stack([np.asarray(v[n]) for n in measured]) for v in found)
+    def log_likelihood(predictions):
+        e, s = (np.stack([np.asarray(v[n]) for n in measured]) for v in predictions)
         return -0.5 * np.sum(e**2 / s + np.log(s))
 
     truth = filtered(params.a)

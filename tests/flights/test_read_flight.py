@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights import ReadOptions, Signal, describe_log, read_flight
 
 ASKED = {
     "time": "t",
@@ -128,6 +128,17 @@ def test_units_sd_and_known(tmp_path):
     assert flight.outputs["roll"] == pytest.approx(np.deg2rad(PHI))
     assert flight.sd == {"roll": pytest.approx(np.deg2rad(0.5))}
     assert (flight.known, flight.hold_out, flight.name) == ({"Ixx_added": 0.012}, True, "second")
+
+
+def test_options_as_a_record_and_as_keywords(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines()))
+    options = ReadOptions(window=(0.02, 0.2), hold_out=True, name="first")
+    flight = read_flight(path, **ASKED, options=options, name="second")
+    assert (flight.name, flight.hold_out, flight.n_samples) == ("second", True, 10)
+    assert read_flight(path, **ASKED, known=None).known == {}
+    with pytest.raises(TypeError, match="rat"):
+        read_flight(path, **ASKED, rat=50.0)
 
 
 def test_window_is_inclusive(tmp_path):

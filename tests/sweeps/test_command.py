@@ -156,7 +156,7 @@ WRONG = {
         lambda c: c["sweep"]["reduce"]["rms"].update(how="mrs"), ["reduce.rms.how", "'rms'"],
     ),
     "no such function": (
-        lambda c: c["sweep"]["reduce"]["rms"].update(how="json:nothing"), ["is nothing"],
+        lambda c: c["sweep"]["reduce"]["rms"].update(how="json:nothing"), ["got nothing"],
     ),
     "no such module": (
         lambda c: c["sweep"]["reduce"]["rms"].update(how="nowhere_at_all:f"), ["cannot import"],
