@@ -7,8 +7,8 @@ from collections.abc import Iterable
 class InputError(ValueError):
     """A file or a configuration is wrong.
 
-    Its text is one whole sentence that names the file, the place, what was found and what is
-    wanted. The command line prints it and ends with exit code 2.
+    Its text is one whole sentence that names the file, the place, what was expected and what was
+    got. The command line prints it and ends with exit code 2.
     """
 
 

@@ -114,7 +114,7 @@ def drive(experiment: Experiment) -> Made:
     where = f"{experiment.path}: simulate"
     _check_whole(experiment, wanted, where)
     if wanted.ground is not None:
-        raise InputError(f"{where}.ground: a sweep has none, wanted is a configuration without it")
+        raise InputError(f"{where}.ground: a sweep has none, expected a configuration without it")
     n, rng = round(wanted.duration * wanted.rate), np.random.default_rng(wanted.seed)
     plain = in_wind(experiment) if wanted.wind is not None else experiment
     inputs = _inputs(plain, wanted, n, rng, where)
@@ -197,8 +197,8 @@ def _check_whole(experiment: Experiment, wanted: SimulateConfig, where: str) -> 
     }
     for name in (n for n, there in given.items() if there):
         raise InputError(
-            f"{where}.{name}: model {experiment.model.name} is not a whole helicopter, wanted is "
-            "model: helicopter or helicopter-paper"
+            f"{where}.{name}: model {experiment.model.name} is not the full nonlinear model, "
+            "expected model: helicopter or helicopter-paper"
         )
 
 
@@ -231,7 +231,7 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
         wrong = cannot_start(experiment.model, experiment.vehicle.params, first)
         return wrong or "the run is not finite: the model is unstable with this vehicle"
     return (
-        f"the run is not finite from {_lost(run):g} s on, wanted is a shorter duration, gentler "
+        f"the run is not finite from {_lost(run):g} s on, expected a shorter duration, gentler "
         "inputs or hold_attitude: true"
     )
 

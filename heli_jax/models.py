@@ -55,7 +55,7 @@ def by_name(
     if corrections is not None or wind:
         what = "wind" if wind else "corrections"
         raise InputError(
-            f"{where}: {name!r} takes no {what}, wanted is one of {', '.join(_HELICOPTERS)}"
+            f"{where}: {name!r} takes no {what}, expected one of {', '.join(_HELICOPTERS)}"
         )
     return model
 
@@ -66,8 +66,8 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):
-        found = "nothing" if model is None else f"a {type(model).__name__}"
-        raise InputError(f"{where}: {name!r} is {found}, wanted is a heli_jax.Model")
+        kind = "nothing" if model is None else f"a {type(model).__name__}"
+        raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
     try:
         check_model(model)
     except ValueError as e:

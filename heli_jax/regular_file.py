@@ -118,7 +118,7 @@ def _checked(found: os.stat_result, path: str | Path, what: str, at_most: int) -
 
 def _too_large(path: str | Path, what: str, at_most: int, size: int | None = None) -> InputError:
     got = "more" if size is None else size_words(size)
-    return InputError(f"{path}: larger than {size_words(at_most)}, expected {what}, got {got}")
+    return InputError(f"{path}: expected {what} of at most {size_words(at_most)}, got {got}")
 
 
 def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError:
@@ -131,4 +131,4 @@ def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError
         waits = e.errno in (errno.EAGAIN, errno.EWOULDBLOCK)
         why = "it gives nothing" if waits else e.strerror or type(e).__name__
         return InputError(f"{path}: cannot be read ({why}), expected {what}")
-    return InputError(f"{path!r:.80}: is no name of a file")  # one with a null character
+    return InputError(f"expected the name of a file, got {path!r:.80}")  # one with a null character

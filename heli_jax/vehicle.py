@@ -117,16 +117,16 @@ def impossible(params: Mapping[str, float]) -> str | None:
     """
     for name, value in params.items():
         if _too_small(name, value):
-            wanted = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
-            return f"{name} is {value:g}, wanted is {wanted}"
+            bound = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
+            return f"{name} must be {bound}, got {value:g}"
     r1, r2 = params.get("R1"), params.get("R2")
     if r1 is not None and r2 is not None and r1 >= r2:
         return (
-            f"R1 is {r1:g} and R2 is {r2:g}, wanted is R1 < R2: R1 is the inner and R2 the outer "
+            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the outer "
             "end of the flybar paddle (the paper's nomenclature exchanges them)"
         )
     if (b := params.get("B")) is not None and b > 1:
-        return f"B is {b:g}, wanted is a tip loss factor of at most 1"
+        return f"B must be a tip loss factor of at most 1, got {b:g}"
     return None
 
 
@@ -197,7 +197,7 @@ def vehicle_from_mapping(
         constants[name] = _constant(entry, name, naming.unit(params, name), where)
     missing = [n for n in known if n not in constants and n not in naming.defaults(params)]
     if missing:
-        raise InputError(f"{where}: {', '.join(missing)} missing, wanted is a number for each")
+        raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
     if params is Helicopter:
         wrong = impossible({n: c.value for n, c in constants.items()})
         if wrong:
@@ -213,19 +213,19 @@ def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
         unknown = [k for k in entry if k not in ("value", "unit", "source")]
         if unknown:
             raise InputError(
-                f"{place}: unknown key {unknown[0]!r}, known are value, unit and source"
+                f"{place}: expected the keys value, unit and source, got {unknown[0]!r}"
             )
         if "value" not in entry:
-            raise InputError(f"{place}: no value, wanted is a number")
+            raise InputError(f"{place}: expected a number under value, got none")
         unit, source = str(entry.get("unit", unit)), str(entry.get("source", ""))
         entry = entry["value"]
     if isinstance(entry, bool) or not isinstance(entry, int | float):
-        raise InputError(f"{place}: found {entry!r:.40}, wanted is a number")
+        raise InputError(f"{place}: expected a number, got {entry!r:.40}")
     try:
         scale = units.factor(unit, si) if si is not None else 1.0
     except ValueError as e:
         raise InputError(f"{place}: {e}") from e
     value = float(entry) * scale if abs(entry) < 1e300 else math.inf
     if not math.isfinite(value):
-        raise InputError(f"{place}: found {entry!r:.40}, wanted is a finite number")
+        raise InputError(f"{place}: expected a finite number, got {entry!r:.40}")
     return Constant(value, si or unit, source)

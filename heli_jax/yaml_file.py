@@ -64,8 +64,8 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
     value = _load(text, where)
     if not isinstance(value, dict):
-        found = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{where}: holds {found}, expected keys with values")
+        kind = "nothing" if value is None else f"a {type(value).__name__}"
+        raise InputError(f"{where}: expected keys with values, got {kind}")
     return value
 
 
@@ -83,7 +83,9 @@ def _load(text: str, where: str) -> Any:
     loader = None
     try:
         if _deepest(text) > _LIMIT_DEPTH:
-            raise InputError(f"{where}: nested more than {_LIMIT_DEPTH} deep")
+            raise InputError(
+                f"{where}: expected at most {_LIMIT_DEPTH} levels, got data nested deeper"
+            )
         loader = _Loader(text)
         node = loader.get_single_node()
         if node is None:
@@ -132,21 +134,28 @@ def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int
     count[0] += 1
     if count[0] > _LIMIT_NODES or depth > _LIMIT_DEPTH or id(node) in above:
         line = node.start_mark.line + 1
-        raise InputError(f"{where}, line {line}: larger or deeper than any configuration")
+        raise InputError(
+            f"{where}, line {line}: expected at most {_LIMIT_NODES} values in {_LIMIT_DEPTH} "
+            "levels and no alias within itself, got more"
+        )
     above = above | {id(node)}
     if isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
-                raise InputError(f"{where}, line {line}: a key must be a name")
+                raise InputError(
+                    f"{where}, line {line}: expected a name as key, got a list or a mapping"
+                )
             if len(key.value) > _LONGEST_KEY:
                 raise InputError(
                     f"{where}, line {line}: expected a key of at most {_LONGEST_KEY} characters, "
                     f"got {len(key.value)}"
                 )
             if key.value in seen and key.value != "<<":
-                raise InputError(f"{where}, line {line}: key {key.value!r} stands here twice")
+                raise InputError(
+                    f"{where}, line {line}: expected each key once, got {key.value!r} twice"
+                )
             seen.add(key.value)
             _inspect(value, where, depth + 1, above, count)
     elif isinstance(node, yaml.SequenceNode):

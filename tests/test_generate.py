@@ -108,7 +108,9 @@ def test_what_cannot_be_flown(made, simulate, words):
     ids=lambda key: next(iter(key)),
 )
 def test_keys_of_the_whole_helicopter_alone(made, key):
-    with pytest.raises(InputError, match=rf"simulate.{next(iter(key))}: model roll is not a whole"):
+    with pytest.raises(
+        InputError, match=rf"simulate.{next(iter(key))}: model roll is not the full"
+    ):
         made(model="roll", **key)
 
 

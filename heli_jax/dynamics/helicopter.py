@@ -55,11 +55,11 @@ def helicopter(
         ValueError: no such variant or switch.
     """
     if variant not in _VARIANTS:
-        raise ValueError(f"variant is {variant!r}, wanted is one of {', '.join(_VARIANTS)}")
+        raise ValueError(f"variant: expected one of {', '.join(_VARIANTS)}, got {variant!r}")
     unknown = [n for n in switches if n not in Corrections._fields]
     if unknown:
         raise ValueError(
-            f"no correction {unknown[0]!r}, wanted is one of {', '.join(Corrections._fields)}"
+            f"corrections: expected some of {', '.join(Corrections._fields)}, got {unknown[0]!r}"
         )
     how = _VARIANTS[variant]._replace(**switches)
     State = _state_class(how)

@@ -59,11 +59,11 @@ def cannot_start(model: Model, params: Any, inputs: Mapping[str, float] | None =
     what = f"model {model.name}: {' and '.join(bad)} {verb} not finite at the initial state"
     if not cause:
         where = ", ".join(f"{n} = {x[n]:g}" for n in names)
-        return f"{what} ({where}); wanted is another Model.start, other parameters or inputs"
+        return f"{what} ({where}); expected another Model.start, other parameters or inputs"
     where = ", ".join(f"{n} = 0" for n in cause)
     given = ", ".join(f"{n}: 1.0" for n in cause)
     return (
-        f"{what}, where {where}; wanted is a Model.start that begins elsewhere, or in a "
+        f"{what}, where {where}; expected a Model.start that begins elsewhere, or in a "
         f"configuration initial_state: {{{given}}} with the value of the record"
     )
 

@@ -51,10 +51,12 @@ def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:
     else:
         inputs = jax.tree.map(jnp.asarray, flight)
     if dt is None:
-        raise ValueError("inputs given as arrays need dt, the sample time in seconds")
+        raise ValueError(
+            "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
+        )
     shapes = {u.shape for u in jax.tree.leaves(inputs)}
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
-        raise ValueError(f"inputs have shapes {sorted(shapes)}, expected (N,) for all, N >= 2")
+        raise ValueError(f"inputs: expected the shape (N,) for all, N >= 2, got {sorted(shapes)}")
     return inputs, dt
 
 
@@ -126,14 +128,14 @@ def _method_with_extras(
     method, args, term = per_sample(model, params, inputs, options, linear)
     if isinstance(method, Adaptive) and options.key is not None:
         # A step of the controller's choice would have noise of another covariance.
-        raise ValueError("noise is drawn with fixed steps only")
+        raise ValueError("key: expected fixed steps to draw noise with, got a step-size controller")
     if options.feedback is not None:
         if options.delay is not None:
-            raise ValueError("feedback is for runs without a delay only")
+            raise ValueError("feedback: expected a run without a delay, got one with delay")
         if linear:
             raise ValueError(
-                "feedback acts once a sample and is held until the next, expected are inputs with "
-                "hold='zero-order'"
+                "feedback acts once a sample and is held until the next: expected inputs with "
+                "hold='zero-order', got hold='linear'"
             )
         method = StateFeedback(method, options.feedback)
     if options.key is not None:
@@ -200,13 +202,15 @@ def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.Abstra
         solver = "exact" if model.linear else "rk4"
     if solver == "exact":
         if not model.linear:
-            raise ValueError(f"model {model.name!r} is not linear: use solver='rk4' or another")
+            raise ValueError(
+                f"model {model.name!r} is not linear: expected solver='rk4' or another, got 'exact'"
+            )
         return Exact()
     if solver == "rk4":
         return RK4(rolled=len(naming.names(model.State)) > _LARGE)
     if isinstance(solver, dfx.AbstractSolver):
         return solver
-    raise ValueError(f"unknown solver {solver!r}: use 'exact', 'rk4' or a diffrax solver")
+    raise ValueError(f"solver: expected 'exact', 'rk4' or a diffrax solver, got {solver!r}")
 
 
 def split_delay(delay: Any, dt: Any) -> tuple[Any, Any]:
@@ -235,7 +239,10 @@ def per_sample(
     controller, solver = options.controller, options.solver
     method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
     if controller is not None and isinstance(method, Exact | RK4):
-        raise ValueError("adaptive steps need a diffrax solver with an error estimate: Dopri8()")
+        raise ValueError(
+            "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
+            f"{options.solver!r}"
+        )
     parts = None if options.delay is None else split_delay(options.delay, options.dt)
 
     term = field_term(model, model.vector_field)
@@ -285,7 +292,9 @@ def _require_blocks(method: Any, block: int, events: Any) -> None:
     if block < 1:
         raise ValueError(f"block must be at least 1, got {block}")
     if not isinstance(method, Exact) or events:
-        raise ValueError("block is for solver='exact' without feedback and events only")
+        raise ValueError(
+            f"block: expected solver='exact' without feedback and events, or 1, got {block}"
+        )
 
 
 def _with_noise(
@@ -293,9 +302,14 @@ def _with_noise(
 ) -> tuple[Any, ZeroOrderHoldArgs]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise."""
     if model.noise_intensity is None:
-        raise ValueError(f"model {model.name!r} has no noise to draw: see with_disturbance")
+        raise ValueError(
+            f"key: expected a model with process noise, as with_disturbance makes one, got "
+            f"{model.name!r}"
+        )
     if args.delay is not None:
-        raise ValueError("noise is drawn without a delay only")
+        raise ValueError(
+            "key: expected a run without a delay to draw noise for, got one with delay"
+        )
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
     if not isinstance(method, Exact) or args.discrete is None:
