@@ -122,8 +122,8 @@ def impossible(params: Mapping[str, float]) -> str | None:
     r1, r2 = params.get("R1"), params.get("R2")
     if r1 is not None and r2 is not None and r1 >= r2:
         return (
-            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the outer "
-            "end of the flybar paddle (the paper's nomenclature exchanges them)"
+            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the "
+            "outer end of the flybar paddle (the paper's nomenclature exchanges them)"
         )
     if (b := params.get("B")) is not None and b > 1:
         return f"B must be a tip loss factor of at most 1, got {b:g}"

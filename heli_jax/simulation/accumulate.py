@@ -20,7 +20,8 @@ from heli_jax.simulation.discretize import Discrete, scalars
 from heli_jax.simulation.hold import linear_inputs
 from heli_jax.simulation.options import DEFAULT
 from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
-from heli_jax.simulation.solvers import Accumulating, ZeroOrderHoldArgs, advance, at, dot
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, at, dot
+from heli_jax.simulation.wrappers import Accumulating
 
 
 class Accumulated(NamedTuple):

@@ -26,13 +26,11 @@ from heli_jax.simulation.solvers import (
     Exact,
     PerSample,
     RampArgs,
-    StateFeedback,
-    Stopping,
-    WithProcessNoise,
     ZeroOrderHoldArgs,
     at,
 )
 from heli_jax.simulation.trajectory import Trajectory
+from heli_jax.simulation.wrappers import StateFeedback, Stopping, WithProcessNoise
 
 
 def held_inputs(model: Model, flight: Any, dt: Any) -> tuple[Any, Any]:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from heli_jax.errors import nearest
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import at, at_end, segments
+from heli_jax.simulation.hold import at, segments
 
 
 class ZeroOrderHoldArgs(NamedTuple):
@@ -60,7 +60,7 @@ class RampArgs(NamedTuple):
         return self._replace(inputs=inputs)
 
 
-def _sample(t: Any) -> Any:
+def sample_index(t: Any) -> Any:
     return jnp.floor(t + 1e-3).astype(int)
 
 
@@ -76,8 +76,8 @@ class _Stateless(dfx.AbstractSolver):
         return None
 
 
-class _Wrapper(_Stateless):
-    """A solver of whole samples around another."""
+class SolverWrapper(_Stateless):
+    """A solver of whole samples around another (see also `heli_jax.simulation.wrappers`)."""
 
     solver: dfx.AbstractSolver
 
@@ -95,7 +95,7 @@ class Exact(_Stateless):
         return None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0))))
+        return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
     def step(
         self,
@@ -108,7 +108,7 @@ class Exact(_Stateless):
         made_jump: Any,
     ) -> Any:
         assert args.discrete is not None
-        k = _sample(t0)
+        k = sample_index(t0)
         if args.delay is not None:
             k = k - args.delay[0]
         before = None if args.delay is None else jax.tree.leaves(at(args.inputs, k - 1))
@@ -191,7 +191,7 @@ class RK4(_Stateless):
         return y1
 
 
-class PerSample(_Wrapper):
+class PerSample(SolverWrapper):
     """Any solver inside one sample: `substeps` equal steps.
 
     With a delayed input the interval has two parts, before and after the change of the input,
@@ -204,7 +204,7 @@ class PerSample(_Wrapper):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return self.solver.func(
-            terms, t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0)))
+            terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
 
     def step(
@@ -218,7 +218,7 @@ class PerSample(_Wrapper):
         made_jump: Any,
     ) -> Any:
         y, result = y0, dfx.RESULTS.successful
-        for length, now in self._parts(args, _sample(t0)):
+        for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
         return y, None, {"y0": y0, "y1": y}, None, result
@@ -282,106 +282,6 @@ class Adaptive(PerSample):
         reached = jax.tree.map(lambda a, b: jnp.where(h > 0, a[-1], b), sol.ys, y0)
         fine = dfx.RESULTS.where(h > 0, sol.result, dfx.RESULTS.successful)
         return reached, fine
-
-
-class StateFeedback(_Wrapper):
-    """A per-sample solver whose inputs are a function of the state at the sample.
-
-    feedback(state, given inputs of that sample) gives the inputs that are held.
-    """
-
-    feedback: Callable[..., Any]
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        u = self.feedback(y0, at(args.inputs, _sample(t0)))
-        held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
-        return self.solver.step(terms, t0, t1, y0, held, solver_state, made_jump)
-
-
-class Stopping(_Wrapper):
-    """A per-sample solver that stays where it is after the first sample at which `over` holds.
-
-    y = (state, going), where going is 1 until then and 0 from there on.
-    """
-
-    over: Callable[..., Any]
-    linear: tuple[bool, ...] = eqx.field(static=True, default=())
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        state, going = y0
-        new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
-        new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
-        result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
-        # The inputs at the end of the interval: those held since its begin, or the next ones.
-        ended = self.over(new, at_end(args.inputs, _sample(t0), self.linear))
-        y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
-        return y1, None, {"y0": y0, "y1": y1}, None, result
-
-
-class WithProcessNoise(_Wrapper):
-    """A per-sample solver whose state gets its process noise after every sample.
-
-    The inputs are (the model's, standard normal numbers); add_noise(state, held inputs, numbers
-    of that sample) gives the new state.
-    """
-
-    add_noise: Callable[..., Any]
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        inputs, draws = args.inputs
-        held = args._replace(inputs=inputs)
-        y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
-        k = _sample(t0)
-        y1 = self.add_noise(y, at(inputs, k), at(draws, k))
-        return y1, None, {"y0": y0, "y1": y1}, None, result
-
-
-class Accumulating(_Wrapper):
-    """A per-sample solver that carries a running value beside the state.
-
-    y = (state, value); at each sample, before the step, value = update(value, state, held inputs
-    at that sample, k). Nothing else of the trajectory is kept.
-    """
-
-    update: Callable[..., Any] = eqx.field(static=True)
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> Any:
-        held, data = args
-        state, value = y0
-        k = _sample(t0)
-        value = self.update(value, state, at(held.inputs, k), at(data, k))
-        state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
-        y1 = (state, value)
-        return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
 NAMED = ("Euler", "Midpoint", "Heun", "Ralston", "Bosh3", "Tsit5", "Dopri5", "Dopri8")
