@@ -18,6 +18,11 @@ from jaxtyping import Array, Float
 type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
 
+# Models are anyone's own, and so are the classes of their parameters, states, inputs and outputs:
+# no base class or protocol holds them all, since their field names are what the model says.
+type Record = Any
+"""An instance of a record class: a model's Params, State, Inputs or Outputs."""
+
 
 @functools.cache
 def names(record: type) -> tuple[str, ...]:
