@@ -164,6 +164,8 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
 def _bar(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion
 ) -> dict[str, Scalar]:
+    """The flybar's rates, eq. 12 or the first-order bar."""
+    # One bar for roll and one for pitch, each with the body's rate about its own axis.
     if corrections.first_order_bar:
         return {
             "beta_roll": flybar.flybar_rate(p, s.Omega, u.x_roll, s.beta_roll, m.p),

@@ -246,9 +246,9 @@ def moments(
     else:
         yaw = aero.tail_moment(p, s.Omega, p.K_theta0T * u.x_yaw)
     yaw = yaw + motor_torque(corrections, p, u)
-    # The fuselage feels the motor's torque T_m alone. Eq. 7 has -Ir dOmega beside it, the motor once
-    # more: by eq. 10 that takes T_m off again and leaves the rotor's drag torque, which follows a
-    # throttle step only as the rotor speeds up. Trim, where dOmega = 0, is the same in both.
+    # The fuselage feels the motor's torque T_m alone. Eq. 7 has -Ir dOmega beside it, the motor a
+    # second time: by eq. 10 that takes T_m off again and leaves the rotor's drag torque, which
+    # follows a throttle step only as the rotor speeds up. Trim, where dOmega = 0, stays the same.
     if not corrections.reaction:
         yaw = yaw - p.Ir * dOmega
     # Eq. 6's -T lr: the rotor axis stands behind the centre of gravity, and lifts the tail.
