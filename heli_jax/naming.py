@@ -13,14 +13,18 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Real
 
 type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
 
+type Number = Real[ArrayLike, ""]
+"""As Scalar, or whatever else JAX takes for one number: an int, a NumPy scalar."""
+
 # Models are anyone's own, and so are the classes of their parameters, states, inputs and outputs:
 # no base class or protocol holds them all, since their field names are what the model says.
-type Record = Any
+# A plain name, not a `type` statement: beartype cannot check `Record | None` of an alias to Any.
+Record = Any
 """An instance of a record class: a model's Params, State, Inputs or Outputs."""
 
 

@@ -5,15 +5,17 @@ error of first order. Here the input of an interval is picked once and held whil
 one that is linear between samples is followed along its line by every stage.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
 
 from heli_jax.errors import nearest
+from heli_jax.naming import Number, Record, Scalar
 from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.hold import at, segments
 
@@ -26,10 +28,10 @@ class ZeroOrderHoldArgs(NamedTuple):
     sample time.
     """
 
-    params: Any
-    inputs: Any
-    dt: Any
-    delay: Any
+    params: Record
+    inputs: Record
+    dt: Number
+    delay: tuple[Array, Array] | None
     discrete: Discrete | None
 
     def in_scalars(self) -> "ZeroOrderHoldArgs":
@@ -42,26 +44,33 @@ class ZeroOrderHoldArgs(NamedTuple):
 class IntervalArgs(NamedTuple):
     """The arguments of a vector field within one interval: parameters and the held inputs."""
 
-    params: Any
-    inputs: Any
+    params: Record
+    inputs: Record
 
 
 class RampArgs(NamedTuple):
     """As `IntervalArgs`, for inputs that move: those at the begin of a step, and their slope per
     second."""
 
-    params: Any
-    inputs: Any
-    slope: Any
+    params: Record
+    inputs: Record
+    slope: Record
 
-    def after(self, t: Any) -> "RampArgs":
+    def after(self, t: Number) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
 
-def sample_index(t: Any) -> Any:
+def sample_index(t: Number) -> Int[Array, ""]:
+    """The sample that an interval begins with, from its time in samples."""
+    # Time is counted in samples: a rounding error short of a whole number is that number.
     return jnp.floor(t + 1e-3).astype(int)
+
+
+# The arguments of `init`, `func` and `step` are those of diffrax.AbstractSolver: terms, times, the
+# state y0 and `args`. Time is counted in samples in the solvers of a whole sample, in seconds from
+# the begin of a step within it.
 
 
 class _Stateless(dfx.AbstractSolver):
@@ -72,7 +81,9 @@ class _Stateless(dfx.AbstractSolver):
         dfx.LocalLinearInterpolation
     )
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(
+        self, terms: dfx.AbstractTerm, t0: Number, t1: Number, y0: PyTree, args: PyTree
+    ) -> None:
         return None
 
 
@@ -81,33 +92,35 @@ class SolverWrapper(_Stateless):
 
     solver: dfx.AbstractSolver
 
-    def order(self, terms: Any) -> int | None:
+    def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return y0
 
 
 class Exact(_Stateless):
     """Exact for linear models, held inputs or linear ones: a recurrence of scalar coefficients."""
 
-    def order(self, terms: Any) -> None:
+    def order(self, terms: dfx.AbstractTerm) -> None:
+        # No error to have an order: diffrax takes None where nobody asks for one.
         return None
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
         assert args.discrete is not None
+        # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
         k = sample_index(t0)
         if args.delay is not None:
             k = k - args.delay[0]
@@ -119,8 +132,24 @@ class Exact(_Stateless):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
-def advance(discrete: Discrete, x: Any, u: Any, before: Any = None, after: Any = None) -> list[Any]:
-    """x[k+1] from lists of scalars; `before` and `after` are the inputs of the samples beside."""
+def advance(
+    discrete: Discrete,
+    x: Sequence[Scalar],
+    u: Sequence[Scalar],
+    before: Sequence[Scalar] | None = None,
+    after: Sequence[Scalar] | None = None,
+) -> list[Scalar]:
+    """x[k+1] from x[k] and the inputs.
+
+    Args:
+        discrete: the recurrence, in scalars.
+        x: the n states at sample k.
+        u: the m inputs at sample k.
+        before: those of the sample before, where the recurrence has a Bp.
+        after: those of the next sample, where it has a Bn.
+    """
+    # Sums of scalars and not a matrix product: under vmap each is a vector over the batch, which
+    # XLA fuses into one loop. A product of many 4x4 matrices calls a routine for each of them.
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
         new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
@@ -129,8 +158,9 @@ def advance(discrete: Discrete, x: Any, u: Any, before: Any = None, after: Any =
     return new
 
 
-def dot(coefficients: Any, values: Any) -> Any:
+def dot(coefficients: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
     """The sum of products of two lists of scalars, term by term from the first."""
+    # Not sum(): that begins with a 0, and an addition more at each step.
     total = coefficients[0] * values[0]
     for c, v in zip(coefficients[1:], values[1:], strict=True):
         total = total + c * v
@@ -145,23 +175,32 @@ class RK4(_Stateless):
 
     rolled: bool = eqx.field(static=True, default=False)
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: dfx.AbstractTerm) -> int:
         return 4
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
         h = t1 - t0
 
-        def f(t: Any, y: Any) -> Any:
+        # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
+        # which XLA does not fuse into one loop over a batch of vehicles.
+        def f(t: Number, y: PyTree) -> Any:
             # Behind a barrier each slope is computed once: without it XLA computes all of them
             # again for every state variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
-        def along(y: Any, slope: Any, step: Any) -> Any:
+        def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
         if self.rolled:
@@ -177,8 +216,12 @@ class RK4(_Stateless):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
     @staticmethod
-    def _rolled(f: Any, along: Any, t0: Any, h: Any, y0: Any) -> Any:
-        def stage(carry: Any, node: Any) -> Any:
+    def _rolled(
+        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Number, y0: PyTree
+    ) -> PyTree:
+        # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
+        # reach of zero, and any slope will do.
+        def stage(carry: PyTree, node: tuple[Array, Array]) -> tuple[PyTree, None]:
             total, slope = carry
             reach, weight = node
             slope = f(t0 + reach * h, along(y0, slope, reach * h))
@@ -189,6 +232,9 @@ class RK4(_Stateless):
         nothing = jax.tree.map(jnp.zeros_like, y0)
         (y1, _), _ = jax.lax.scan(stage, (y0, nothing), (reach, weight))
         return y1
+
+
+type _Part = tuple[Number, IntervalArgs | RampArgs]
 
 
 class PerSample(SolverWrapper):
@@ -202,48 +248,53 @@ class PerSample(SolverWrapper):
     linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
     """of each input whether it is linear between samples; () holds all"""
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(
             terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
         return y, None, {"y0": y0, "y1": y}, None, result
 
-    def _parts(self, args: ZeroOrderHoldArgs, k: Any) -> list[tuple[Any, IntervalArgs | RampArgs]]:
+    def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""
         if self.linear:
             parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
             return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
         if args.delay is None:
             return [(args.dt, IntervalArgs(args.params, at(args.inputs, k)))]
+        # Each part has its own steps and ends where the input jumps: a step across the jump would
+        # be of first order, whatever the method's.
         whole, rest = args.delay
         return [
             (rest * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole - 1))),
             ((1.0 - rest) * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole))),
         ]
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
+    def _steps(
+        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+    ) -> Any:
         """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
         moves it is counted from the step's begin, so each begins at 0: a step length that is the
         same number in all steps makes the code faster.
         """
         begin = jnp.zeros_like(h)
 
-        def body(carry: Any, j: Any) -> Any:
+        def body(carry: PyTree, j: Array | None) -> tuple[PyTree, None]:
             y, result = carry
             here = now.after(j * h) if isinstance(now, RampArgs) else now
             state = self.solver.init(terms, begin, h, y, here)
@@ -263,13 +314,15 @@ class Adaptive(PerSample):
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
+    def _steps(
+        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+    ) -> Any:
         sol = dfx.diffeqsolve(
             terms,
             self.solver,
             t0=jnp.zeros_like(h),
             t1=self.substeps * h,
-            dt0=None,
+            dt0=None,  # the controller chooses a first step anew in each interval: inputs jump
             y0=y0,
             args=now,
             saveat=dfx.SaveAt(t1=True),
@@ -284,6 +337,7 @@ class Adaptive(PerSample):
         return reached, fine
 
 
+# An implicit one needs a root finder with tolerances, which a name cannot give.
 NAMED = ("Euler", "Midpoint", "Heun", "Ralston", "Bosh3", "Tsit5", "Dopri5", "Dopri8")
 """Solvers of diffrax that have a name here: explicit ones, of fixed steps."""
 

@@ -11,9 +11,14 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
 
+from heli_jax.naming import Number
 from heli_jax.simulation.hold import at, at_end
 from heli_jax.simulation.solvers import SolverWrapper, ZeroOrderHoldArgs, sample_index
+
+# The arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, the state at its
+# begin, and what is known beside it; none of the solvers here keeps a state between steps.
 
 
 class StateFeedback(SolverWrapper):
@@ -26,14 +31,15 @@ class StateFeedback(SolverWrapper):
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        # One sample, index 0, stands for all: `at` takes the last where the index is past the end.
         u = self.feedback(y0, at(args.inputs, sample_index(t0)))
         held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
         return self.solver.step(terms, t0, t1, y0, held, solver_state, made_jump)
@@ -50,14 +56,15 @@ class Stopping(SolverWrapper):
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        # A batch cannot stop for one of its runs, so the step is made and its result not taken.
         state, going = y0
         new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
         new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
@@ -79,14 +86,15 @@ class WithProcessNoise(SolverWrapper):
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
         inputs, draws = args.inputs
         held = args._replace(inputs=inputs)
         y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
@@ -105,10 +113,19 @@ class Accumulating(SolverWrapper):
     update: Callable[..., Any] = eqx.field(static=True)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
         held, data = args
         state, value = y0
+        # Before the step: the outputs of a sample belong to the state at its beginning. Whoever
+        # runs this has to add the last sample, which no step begins with.
         k = sample_index(t0)
         value = self.update(value, state, at(held.inputs, k), at(data, k))
         state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
