@@ -14,12 +14,16 @@ class InputError(ValueError):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
+    # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is
+    # half.
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if not close:
+        # Case counts above: only if nothing is near is 'HELICOPTER' compared without it.
         lower = {k.lower(): k for k in known}
         close = [lower[c] for c in difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)]
     if close:
         return f"; did you mean {close[0]!r}?"
+    # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""

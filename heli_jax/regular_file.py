@@ -60,11 +60,17 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
 
 @contextlib.contextmanager
 def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO]:
-    """A regular file opened for reading; the arguments are those of `require_regular`.
+    """A regular file opened for reading.
+
+    Args:
+        path: the file, or a link to it.
+        what: what it should be, with its article.
+        at_most: the largest size that is read [bytes].
 
     Raises:
         InputError: as `require_regular`, or it cannot be opened or read.
     """
+    # Before it is opened: to open some devices has an effect (a tape rewinds, a watchdog starts).
     require_regular(path, what, at_most)
     try:
         descriptor = os.open(path, _FLAGS)
@@ -76,13 +82,17 @@ def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO
 
 
 def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
-    """All of a regular file; the arguments are those of `require_regular`.
+    """All of a regular file.
 
-    A file of /proc says that it is empty and gives without end: what is read is counted too.
+    Args:
+        path: the file, or a link to it.
+        what: what it should be, with its article.
+        at_most: the largest size that is read [bytes].
 
     Raises:
         InputError: as `open_regular`.
     """
+    # A file of /proc says that it is empty and gives without end: what is read is counted too.
     pieces, size = [], 0
     with open_regular(path, what, at_most) as file:
         while piece := file.read(_PIECE):
@@ -108,12 +118,12 @@ def kind_of(mode: int) -> str:
     return next((words for is_it, words in _KINDS if is_it(mode)), "no regular file")
 
 
-def _checked(found: os.stat_result, path: str | Path, what: str, at_most: int) -> int:
-    if not stat.S_ISREG(found.st_mode):
-        raise InputError(f"{path}: expected {what}, got {kind_of(found.st_mode)}")
-    if found.st_size > at_most:
-        raise _too_large(path, what, at_most, found.st_size)
-    return found.st_size
+def _checked(status: os.stat_result, path: str | Path, what: str, at_most: int) -> int:
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: expected {what}, got {kind_of(status.st_mode)}")
+    if status.st_size > at_most:
+        raise _too_large(path, what, at_most, status.st_size)
+    return status.st_size
 
 
 def _too_large(path: str | Path, what: str, at_most: int, size: int | None = None) -> InputError:
@@ -122,6 +132,7 @@ def _too_large(path: str | Path, what: str, at_most: int, size: int | None = Non
 
 
 def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError:
+    # An InputError is a ValueError: one that was raised on purpose keeps its words.
     if isinstance(e, InputError):
         return e
     if isinstance(e, FileNotFoundError):
