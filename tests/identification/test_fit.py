@@ -256,7 +256,7 @@ def test_known_must_not_be_free_and_must_exist(bench_run):
     for known, words in (
         ({"Ixx": 0.02}, "is free as well"),
         ({"Ixx_aded": 0.02}, "did you mean 'Ixx_added'"),
-        ({"Ixx_added": -1.0}, "Ixx_added is -1"),
+        ({"Ixx_added": -1.0}, "Ixx_added must be zero or more, got -1"),
     ):
         flight = dataclasses.replace(bench_run, known=known)
         with pytest.raises(ValueError, match=words):
