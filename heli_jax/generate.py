@@ -128,6 +128,8 @@ def drive(experiment: Experiment) -> Made:
     flight = Flight(dt=1.0 / settings.rate, inputs=inputs, outputs={}, name="simulate")
     if not is_full_nonlinear(flown.model):
         return Made(flown, flight, None, None)
+    # Each element trims itself, so only the condition goes along; the pilot's gains are those for
+    # the vehicle of the file, as a pilot's would be.
     begin = Condition(**settings.start.model_dump()) if settings.start else Condition()
     trimmed = Trimmed(begin, settings.wind or (0.0, 0.0, 0.0), of=flown.model)
     pilot = None
@@ -154,6 +156,7 @@ def _run(
     where: str,
 ) -> Trajectory:
     """The run as NumPy arrays, without measurement noise."""
+    # Said by name: what is missing is NaN, and the run would only be called not finite.
     missing = needed_but_missing(experiment.model, experiment.vehicle.params)
     if missing:
         raise InputError(
@@ -249,6 +252,7 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
 
 def _lost(run: Trajectory) -> float:
     """When a run ceases to be finite [s]."""
+    # argmin of booleans: the first sample at which any state is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
     return float(run.times[np.argmin(good)])
 

@@ -275,6 +275,7 @@ def print_sweep(out: Path) -> None:
         rows.append(
             (name, *numbers, result.get("unit", ""), "" if error is None else f"{error:.1g}")
         )
+    # The last column only where the sweep compared single with double precision.
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
     width = len(head) if "float32_error" in totals else len(head) - 1
     _table(head[:width], [row[:width] for row in rows])

@@ -35,6 +35,7 @@ _PIECE = 1 << 20
 
 def size_words(size: int) -> str:
     """A size in bytes in words: `1 MB`, `16 GB`."""
+    # Powers of ten, as disks are sold; the limits are stated in them too.
     for unit, scale in (("TB", 10**12), ("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if size >= scale:
             return f"{size / scale:.3g} {unit}"
@@ -52,6 +53,7 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
     Raises:
         InputError: there is none, it is no regular file, or it is larger.
     """
+    # A ValueError is a path with a null character, which os refuses before the system sees it.
     try:
         return _checked(os.stat(path), path, what, at_most)
     except (OSError, ValueError) as e:

@@ -151,6 +151,7 @@ def _by_samples(
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
         args = args._replace(params=values)
+    # No limits: an empty record is carried, and costs nothing.
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
     if reducer.limits is not None:
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
@@ -165,7 +166,9 @@ def _by_samples(
         dt0=jnp.ones((), dtype),
         y0=(x0, (start, outside)),
         args=(args, data),
-        saveat=dfx.SaveAt(t1=True),
+        saveat=dfx.SaveAt(
+            t1=True
+        ),  # the end alone: what a large batch has no memory for is the rest
         max_steps=n - 1,
         adjoint=adjoint,
         throw=False,
@@ -233,6 +236,7 @@ def _in_blocks(
     structure, inputs = jax.tree.structure(x0), jax.tree.structure(args.inputs)
     U = jax.tree.leaves(args.inputs)
     n = U[0].shape[0]
+    # At least one sample is left over: the last one has outputs but no step after it.
     steps = (n - 1) // m
     outputs = functools.partial(_outputs_in_block, reducer, block, structure, inputs)
 
@@ -286,6 +290,7 @@ def _outputs_in_block(
         now = jax.tree.unflatten(inputs, u[0])
         state = _plus(jax.tree.unflatten(structure, x), block.of_next, now)
         return model.output(reducer.params, state, now)
+    # y[j] = C A^j x + the inputs of this sample and of those before it in the block.
     outputs = {}
     for i, name in enumerate(naming.names(model.Outputs)):
         total = dot(block.free[j - 1][i], x)

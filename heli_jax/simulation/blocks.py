@@ -38,6 +38,8 @@ def blockwise(args: ZeroOrderHoldArgs, m: int, x0: Record) -> Record:
     n, size = U.shape[0], A.shape[0]
     count = -(-n // m)
     U = jnp.pad(U, ((0, count * m - n), (0, 0))).reshape(count, m, -1)
+    # From block to block one step after another, then all samples of all blocks at once: N/m short
+    # steps in place of N, and the rest in matrix products.
     powers, Am = _powers(A, m)
     response = powers @ B
     w = jnp.einsum("kjr,jnr->kn", U, response[::-1])
@@ -64,6 +66,8 @@ def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
     """B (n, r) and what it multiplies (N, r): the inputs now, those before, and the next ones."""
     assert args.discrete is not None
     _, B, before, after = args.discrete
+    # A late or a moving input makes a sample's state depend on two or three samples of it: columns
+    # beside B, for inputs that are shifted by one.
     if before is None and after is None:
         return B, jnp.stack(jax.tree.leaves(args.inputs), axis=1)
     n = jax.tree.leaves(args.inputs)[0].shape[0]

@@ -133,6 +133,7 @@ def _first_order_hold(
     One exponential of [[A, B, 0], [0, 0, I/dt], [0, 0, 0]] h (Franklin, Powell and Workman, 1998,
     section 6.3.2); the last is zero for inputs that are not linear.
     """
+    # A chain of two integrators per moving input: the ramp drives the input, the input the state.
     n, m = B.shape
     moving = np.flatnonzero(linear)
     q = n + m + moving.size
@@ -143,6 +144,7 @@ def _first_order_hold(
     return E[:n, :n], E[:n, n : n + m], ramps
 
 
+# Nested tuples are pytrees of scalars: under vmap each coefficient is a vector over the batch.
 def scalars(M: Float[Array, "n m"]) -> tuple[tuple[Any, ...], ...]:
     """A matrix row by row as nested tuples of scalars."""
     return tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))

@@ -27,6 +27,7 @@ def ground(height: Scalar = 0.0) -> Event:
 
 def rotor_speed(lowest: Scalar, highest: Scalar) -> Event:
     """The rotor's speed leaves the range [rad/s]."""
+    # One number for both ends: it falls to zero where the nearer of the two is reached.
     return lambda params, state, inputs: jnp.minimum(state.Omega - lowest, highest - state.Omega)
 
 
@@ -97,6 +98,7 @@ def stopped(
     # A run that begins beyond an event ends where it begins.
     s = jnp.where(over[0], 0.0, s)
     which = jnp.argmin(values(end.state(s), end.inputs(s)))
+    # argmax of no event is 0, so k and s are numbers of no meaning there: `came` chooses.
     came = jnp.any(over)
     moment = jnp.where(over[0], times[0], times[k] + s * h)
     rest = jnp.where(came, jnp.arange(n) >= last, False)

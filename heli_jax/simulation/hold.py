@@ -70,6 +70,8 @@ def check_hold(value: PyTree, where: str = "hold") -> None:
 
 def at(inputs: PyTree, k: Int[Array, "..."] | int) -> PyTree:
     """The inputs of sample k; before the first the first, after the last the last."""
+    # Clipped on purpose and in sight: JAX would clip an index past the end, and wrap one below
+    # zero.
     return jax.tree.map(lambda u: u[jnp.clip(k, 0, u.shape[0] - 1)], inputs)
 
 

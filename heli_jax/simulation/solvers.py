@@ -203,6 +203,7 @@ class RK4(_Stateless):
         def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
+        # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
         if self.rolled:
             y1 = self._rolled(f, along, t0, h, y0)
             return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
@@ -272,6 +273,7 @@ class PerSample(SolverWrapper):
 
     def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""
+        # A line across a sample is one part; late by a fraction, it bends within the interval.
         if self.linear:
             parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
             return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
