@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from heli_jax.report.card import card, summary
 from heli_jax.workflow import FitRun
 
 if TYPE_CHECKING:
+    from heli_jax.flights.describe import LogInfo, TimeInfo
     from heli_jax.generate import Simulated
     from heli_jax.sweeps.run import Progress
 
@@ -304,7 +305,7 @@ def print_sweep(out: Path) -> None:
     print(f"store: {out / 'sweep.zarr'}")
 
 
-def print_info(info: Any) -> None:
+def print_info(info: "LogInfo") -> None:
     """What a log holds, on standard output."""
     print(f"{info.path}: {info.format}, {info.size} bytes, {info.n_rows} rows")
     print(f"sha256 {info.sha256}")
@@ -323,7 +324,7 @@ def print_info(info: Any) -> None:
     _table(("signal", "kind", "count", "min", "max", "mean", "sd", "NaN"), rows)
 
 
-def _print_clock(clock: Any) -> None:
+def _print_clock(clock: "TimeInfo") -> None:
     uniform = (
         f"uniform (jitter {100 * clock.jitter:.2g} % of a step)" if clock.uniform else "not uniform"
     )

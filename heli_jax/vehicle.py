@@ -16,7 +16,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.errors import InputError, nearest
-from heli_jax.naming import Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.yaml_file import read_mapping
 
 
@@ -157,7 +157,7 @@ def possible(params: Mapping[str, Any]) -> np.ndarray:
     return np.asarray(fine)
 
 
-def _too_small(name: str, value: Any) -> Any:
+def _too_small(name: str, value: float | int | np.ndarray) -> Any:
     """Whether values [SI] of a constant are below what it can be."""
     if name not in naming.names(Helicopter) or name in _MAY_BE_NEGATIVE:
         return np.zeros(np.shape(value), bool)
@@ -176,7 +176,7 @@ class Constant(NamedTuple):
 class Vehicle(NamedTuple):
     """A vehicle file: the parameters, and where each number comes from."""
 
-    params: Any
+    params: Record
     constants: dict[str, Constant]
     path: str
 

@@ -4,8 +4,6 @@ Everything here is divided by the air's mass flow scale, so that nothing is divi
 speed: a rotor at rest is an ordinary point.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
@@ -63,7 +61,9 @@ def induced_velocity(V2: Scalar, W: Scalar, T0: Scalar, b: Scalar) -> Scalar:
 
 
 @induced_velocity.defjvp
-def _induced_velocity_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _induced_velocity_jvp(
+    primals: tuple[Scalar, ...], tangents: tuple[Scalar, ...]
+) -> tuple[Scalar, Scalar]:
     # Of the implicit function: as exact as the root itself, at a fifth of what a gradient through
     # the steps costs. One Newton step with a stopped gradient would do for first derivatives, and
     # give a wrong Hessian.

@@ -7,10 +7,13 @@ README on where the paper and physics part.
 
 import dataclasses
 import functools
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import core
+from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
@@ -228,7 +231,9 @@ class Ratios(NamedTuple):
     """the coefficient of s^2 that the other coefficients and Omega ask for"""
 
 
-def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Ratios:
+def ratios_from_denominator(
+    p: Helicopter, den: Sequence[Scalar] | np.ndarray | Array, angle: str = "roll"
+) -> Ratios:
     r"""a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
 
     With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. Where
