@@ -37,10 +37,8 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     check_model(model)
     rates = {known.name: known.rate for known in axes_of(model)}
     if axis not in rates:
-        raise ValueError(
-            f"model {model.name} has no axis {axis!r} to disturb, expected one of "
-            f"{', '.join(rates) or 'a model that turns about roll, pitch or yaw'}"
-        )
+        expected = f"one of {', '.join(rates)}" if rates else "a model that turns about an axis"
+        raise ValueError(f"model {model.name} has no axis {axis!r} to disturb, expected {expected}")
     if poles not in (1, 2):
         raise ValueError(f"poles must be 1 or 2, got {poles}")
     lags = tuple(f"w{i + 1}_{axis}" for i in range(poles))
