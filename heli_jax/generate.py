@@ -277,16 +277,22 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
                 f"the run leaves the model's range at {run.times[np.argmax(left)]:g} s: {name} "
                 f"({100 * share:.2g} % of the samples)"
             )
+    return (*notes, *_stick_notes(experiment, run, flown))
+
+
+def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[str]:
+    """Where sticks are past their ends, in the samples that are `flown`."""
+    # Other models' inputs are lengths or anyone's own, without known ends.
+    if not is_full_nonlinear(experiment.model):
+        return []
+    notes = []
     for name, (low, high) in STICKS.items():
-        # Other models' inputs are lengths or anyone's own, without known ends.
-        if not is_full_nonlinear(experiment.model):
-            break
         stick = np.asarray(getattr(run.inputs, name))[flown]
         beyond = (stick < low) | (stick > high)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
             notes.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
-    return tuple(notes)
+    return notes
 
 
 def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[str]:

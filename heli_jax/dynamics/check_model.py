@@ -233,6 +233,7 @@ class _Function:
         jax.eval_shape(call, [[number] * len(naming.names(record)) for record in classes])
 
 
+# Arguments in another order are the most common mistake, and show as a missing attribute.
 def _words(e: Exception) -> str:
     """What went wrong in a function, with the remedy where it is known."""
     if isinstance(e, jax.errors.TracerBoolConversionError):
@@ -250,7 +251,6 @@ def _words(e: Exception) -> str:
             "makes a Python number of a value that is traced (float, int, the functions of math, "
             "an index); expected the value itself, and jax.numpy, as jnp.sin in place of math.sin"
         )
-    # Arguments in another order are the most common mistake, and show as a missing attribute.
     said = " ".join(str(e).split())[:200]
     order = ""
     if isinstance(e, AttributeError | TypeError):

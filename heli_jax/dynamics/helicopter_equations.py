@@ -47,15 +47,21 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
         lateral_speed * at.cphi + below * at.sphi,
         below * at.cphi - lateral_speed * at.sphi,
     )
+    p, q, r = _body_rates(corrections, s, at)
+    return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
+
+
+def _body_rates(corrections: Corrections, s: Record, at: Attitude) -> tuple[Scalar, ...]:
+    """p, q and r [rad/s]."""
     # Eqs 5-7 integrate M/I straight into the angles, so the paper's rates are the angles'
     # derivatives. That is right in level flight alone: a body that turns steadily with dpsi at a
     # bank phi has a pitch rate.
-    p, q, r = s.dphi, s.dtheta, s.dpsi
-    if corrections.rigid_body:
-        p = s.dphi - s.dpsi * at.sth
-        q = s.dtheta * at.cphi + s.dpsi * at.cth * at.sphi
-        r = s.dpsi * at.cth * at.cphi - s.dtheta * at.sphi
-    return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
+    if not corrections.rigid_body:
+        return s.dphi, s.dtheta, s.dpsi
+    p = s.dphi - s.dpsi * at.sth
+    q = s.dtheta * at.cphi + s.dpsi * at.cth * at.sphi
+    r = s.dpsi * at.cth * at.cphi - s.dtheta * at.sphi
+    return p, q, r
 
 
 def _to_earth(at: Attitude, forward: Scalar, right: Scalar, down: Scalar) -> tuple[Scalar, ...]:
@@ -240,6 +246,15 @@ def moments(
     else:
         roll = aero.cyclic_moment(p, s.Omega, tilt.roll)
         pitch = aero.cyclic_moment(p, s.Omega, tilt.pitch)
+    yaw = _yaw_moment(corrections, p, s, u, m, dOmega)
+    # Eq. 6's -T lr: the rotor axis stands behind the centre of gravity, and lifts the tail.
+    return once(Moments(roll, pitch - T * p.lr, yaw))
+
+
+def _yaw_moment(
+    corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, dOmega: Scalar
+) -> Scalar:
+    """M_psi and what the motor does, eqs 7, 16 and 19 [N m]."""
     # Trim needs M_psi = -T_m: x_yaw K_theta0T is negative in hover.
     if corrections.tail:
         yaw = p.L_T * tail_rotor(p, s, u, m).T
@@ -251,8 +266,7 @@ def moments(
     # follows a throttle step only as the rotor speeds up. Trim, where dOmega = 0, stays the same.
     if not corrections.reaction:
         yaw = yaw - p.Ir * dOmega
-    # Eq. 6's -T lr: the rotor axis stands behind the centre of gravity, and lifts the tail.
-    return once(Moments(roll, pitch - T * p.lr, yaw))
+    return yaw
 
 
 def accelerations(
@@ -284,12 +298,17 @@ def accelerations(
     ddz = pull * at.cphi * at.cth - p.g
     if not corrections.drag:
         return ddx, ddy, ddz
+    slowed = _drag(p, m)
+    return ddx - slowed[0], ddy - slowed[1], ddz - slowed[2]
+
+
+def _drag(p: Helicopter, m: Motion) -> tuple[Scalar, ...]:
+    """What drag takes off the accelerations along x, y and z [m/s^2]."""
     square = m.u**2 + m.v**2 + m.w**2
     # The root of a speed of zero has no derivative; this one has, and gives zero drag there.
     speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
     factor = once((0.5 * p.rho / p.m) * speed)
-    slowed = _to_earth(at, factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w)
-    return ddx - slowed[0], ddy - slowed[1], ddz - slowed[2]
+    return _to_earth(m.at, factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w)
 
 
 def angular_accelerations(

@@ -101,21 +101,25 @@ def _method_with_extras(
     if isinstance(method, Adaptive) and options.key is not None:
         # A step of the controller's choice would have noise of another covariance.
         raise ValueError("key: expected fixed steps to draw noise with, got a step-size controller")
-    # Feedback is a function of the state at the sample and is held from there: a late input, or one
-    # on its way to the next sample's, would need a state that is not there yet.
     if options.feedback is not None:
-        if options.delay is not None:
-            raise ValueError("feedback: expected a run without a delay, got one with delay")
-        if linear:
-            raise ValueError(
-                "feedback acts once a sample and is held until the next: expected inputs with "
-                "hold='zero-order', got hold='linear'"
-            )
+        _check_feedback(options, linear)
         method = StateFeedback(method, options.feedback)
     # Around the feedback, not within: the noise comes after the step that the feedback drove.
     if options.key is not None:
         method, args = with_process_noise(model, args, method, options.dt, options.key)
     return method, args, term
+
+
+def _check_feedback(options: SimulationOptions, linear: tuple[bool, ...]) -> None:
+    # Feedback is a function of the state at the sample and is held from there: a late input, or one
+    # on its way to the next sample's, would need a state that is not there yet.
+    if options.delay is not None:
+        raise ValueError("feedback: expected a run without a delay, got one with delay")
+    if linear:
+        raise ValueError(
+            "feedback acts once a sample and is held until the next: expected inputs with "
+            "hold='zero-order', got hold='linear'"
+        )
 
 
 def _states(
@@ -175,6 +179,8 @@ def _require_blocks(
         )
 
 
+# Steps of 1 from 0 to n - 1: the same program for every sample time, and no rounding of times
+# decides on the number of steps.
 def _stepwise(
     method: dfx.AbstractSolver,
     args: ZeroOrderHoldArgs,
@@ -183,8 +189,6 @@ def _stepwise(
     adjoint: dfx.AbstractAdjoint,
 ) -> tuple[Any, dfx.RESULTS]:
     """The states from x0 on, one step a sample: time is counted in samples."""
-    # Steps of 1 from 0 to n - 1: the same program for every sample time, and no rounding of times
-    # decides on the number of steps.
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype = jax.tree.leaves(x0)[0].dtype
     sol = dfx.diffeqsolve(

@@ -161,6 +161,8 @@ def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> df
     return dfx.ODETerm(_Field(model.State, vector_field))
 
 
+# Where a Kalman filter goes through the record, inputs enter as a known drive: multiplied by B
+# for all samples at once they cost one matrix product.
 def held_columns(
     model: Model,
     params: Record,
@@ -179,8 +181,6 @@ def held_columns(
         delay: as in `SimulationOptions`.
         linear: of each input whether it is linear between samples; () holds all.
     """
-    # Where a Kalman filter goes through the record, inputs enter as a known drive: multiplied by B
-    # for all samples at once they cost one matrix product.
     options = SimulationOptions(dt=dt, solver="exact", delay=delay)
     _, args, _ = per_sample(model, params, inputs, options, linear)
     assert args.discrete is not None
