@@ -245,12 +245,12 @@ def _diverged(experiment: Experiment, run: Trajectory) -> str:
         reason = cannot_start(experiment.model, experiment.vehicle.params, first)
         return reason or "the run is not finite: the model is unstable with this vehicle"
     return (
-        f"the run is not finite from {_lost(run):g} s on, expected a shorter duration, gentler "
-        "inputs or hold_attitude: true"
+        f"the run is not finite from {_diverged_at(run):g} s on, expected a shorter duration, "
+        "gentler inputs or hold_attitude: true"
     )
 
 
-def _lost(run: Trajectory) -> float:
+def _diverged_at(run: Trajectory) -> float:
     """When a run ceases to be finite [s]."""
     # argmin of booleans: the first sample at which any state is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
@@ -338,9 +338,8 @@ def follow(experiment: Experiment) -> Simulated:
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             params = naming.replace(experiment.vehicle.params, **known)
             reason = "" if is_full_nonlinear(model) else cannot_start(model, params, first)
-            notes.append(
-                f"{flight.name}: {reason or f'the run is not finite from {_lost(run):g} s on'}"
-            )
+            reason = reason or f"the run is not finite from {_diverged_at(run):g} s on"
+            notes.append(f"{flight.name}: {reason}")
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     return Simulated(columns, model, runs, tuple(notes))
 

@@ -125,7 +125,7 @@ def of_helicopter(record: type) -> bool:
 def impossible(params: Mapping[str, float]) -> str | None:
     """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
 
-    `params` are numbers by name; a name that is missing is not judged.
+    `params` are numbers by name; a name that is missing is not checked.
     """
     for name, value in params.items():
         if _too_small(name, value):
@@ -145,7 +145,7 @@ def impossible(params: Mapping[str, float]) -> str | None:
 
 def possible(params: Mapping[str, Any]) -> np.ndarray:
     """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name, as `impossible`
-    judges one; a value that is not a number is not judged."""
+    checks one; a value that is not a number is not checked."""
     # The same rules for a batch of a sweep: what cannot be is a status there, not an error.
     fine = np.asarray(True)
     for name, value in params.items():

@@ -30,7 +30,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     Args:
         model: what should be a Model.
         traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
-            Without it only the return values are judged: parameters that stay plain numbers may
+            Without it only the return values are checked: parameters that stay plain numbers may
             be branched on.
 
     Raises:

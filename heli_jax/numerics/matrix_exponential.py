@@ -43,7 +43,7 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.custom_batching.custom_vmap
 def _side_by_side(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The exponential where no derivative is wanted, as in sweeps."""
+    """The exponential without derivatives, as in sweeps."""
     return _many(M[:, :, None])[:, :, 0]
 
 
