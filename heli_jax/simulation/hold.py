@@ -90,7 +90,7 @@ def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...])
 class Segment(NamedTuple):
     """A part of a sample interval in which every input stays or follows one straight line."""
 
-    length: Number
+    length: Array
     """[s]"""
     inputs: Record
     """at its begin"""

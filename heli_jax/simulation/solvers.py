@@ -30,7 +30,7 @@ class ZeroOrderHoldArgs(NamedTuple):
 
     params: Record
     inputs: Record
-    dt: Number
+    dt: Array
     delay: tuple[Array, Array] | None
     discrete: Discrete | None
 
@@ -152,8 +152,10 @@ def advance(
     # XLA fuses into one loop. A product of many 4x4 matrices calls a routine for each of them.
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
+        assert before is not None
         new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
     if discrete.Bn is not None:
+        assert after is not None
         new = [v + dot(b, after) for v, b in zip(new, discrete.Bn, strict=True)]
     return new
 
@@ -191,7 +193,7 @@ class RK4(_Stateless):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        h = t1 - t0
+        h: Any = t1 - t0
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
         # which XLA does not fuse into one loop over a batch of vehicles.
@@ -218,7 +220,7 @@ class RK4(_Stateless):
 
     @staticmethod
     def _rolled(
-        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Number, y0: PyTree
+        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Array, y0: PyTree
     ) -> PyTree:
         # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
         # reach of zero, and any slope will do.
@@ -235,7 +237,7 @@ class RK4(_Stateless):
         return y1
 
 
-type _Part = tuple[Number, IntervalArgs | RampArgs]
+type _Part = tuple[Array, IntervalArgs | RampArgs]
 
 
 class PerSample(SolverWrapper):
@@ -288,7 +290,7 @@ class PerSample(SolverWrapper):
         ]
 
     def _steps(
-        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
     ) -> Any:
         """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
         moves it is counted from the step's begin, so each begins at 0: a step length that is the
@@ -296,7 +298,7 @@ class PerSample(SolverWrapper):
         """
         begin = jnp.zeros_like(h)
 
-        def body(carry: PyTree, j: Array | None) -> tuple[PyTree, None]:
+        def body(carry: PyTree, j: Any) -> tuple[PyTree, None]:
             y, result = carry
             here = now.after(j * h) if isinstance(now, RampArgs) else now
             state = self.solver.init(terms, begin, h, y, here)
@@ -317,7 +319,7 @@ class Adaptive(PerSample):
     max_steps: int = eqx.field(static=True)
 
     def _steps(
-        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
     ) -> Any:
         sol = dfx.diffeqsolve(
             terms,
