@@ -7,19 +7,23 @@ from collections.abc import Iterable
 class InputError(ValueError):
     """A file or a configuration is wrong.
 
-    Its text is one whole sentence that names the file, the place, what was found and what is
-    wanted. The command line prints it and ends with exit code 2.
+    Its text is one whole sentence that names the file, the place, what was expected and what was
+    got. The command line prints it and ends with exit code 2.
     """
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"` for the known name closest to `name`, or what is known, as text."""
+    # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is
+    # half.
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if not close:
+        # Case counts above: only if nothing is near is 'HELICOPTER' compared without it.
         lower = {k.lower(): k for k in known}
         close = [lower[c] for c in difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)]
     if close:
         return f"; did you mean {close[0]!r}?"
+    # A model has up to sixty parameters: a sentence of all is read by nobody.
     shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"; known are {shown}" if known else ""

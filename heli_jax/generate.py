@@ -1,6 +1,5 @@
 """Runs that a configuration describes and the project makes itself."""
 
-import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +12,6 @@ from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, t
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
-    StickConfig,
     disturbed,
     in_wind,
     read_flights,
@@ -24,13 +22,15 @@ from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.holds import decide
+from heli_jax.naming import Record
 from heli_jax.simulation import events
-from heli_jax.simulation import inputs as sticks
 from heli_jax.simulation.simulate import simulate, substeps_for
 from heli_jax.simulation.trajectory import Trajectory
+from heli_jax.stick_inputs import factor_to_si, stick_inputs
 from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
+"""of a stick's travel: what trim leaves of one in the middle, 1e-79, is for no reader of a log"""
 
 
 class Simulated(NamedTuple):
@@ -46,7 +46,7 @@ class Simulated(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether it was a whole helicopter that flew."""
+        """Whether it was the full nonlinear helicopter that flew."""
         return is_full_nonlinear(self.model)
 
 
@@ -61,34 +61,39 @@ def generate(experiment: Experiment) -> Simulated:
         InputError: an input or output that the model lacks, a unit of the wrong kind, a vehicle
             that lacks something, or no trim of that flight.
     """
-    wanted = experiment.config.simulate
-    assert wanted is not None
+    settings = experiment.config.simulate
+    assert settings is not None
     where = f"{experiment.path}: simulate"
-    rng = np.random.default_rng(wanted.seed)
-    n = round(wanted.duration * wanted.rate)
+    # One generator for all: inputs are drawn before the noise, so that another noise leaves the
+    # manoeuvre as it is.
+    rng = np.random.default_rng(settings.seed)
+    n = round(settings.duration * settings.rate)
     drawn = experiment.config.disturbance
     if drawn is not None and (drawn.sigma_w is None or drawn.tau_w is None):
         raise InputError(f"{experiment.path}: disturbance: simulate needs its sigma_w and tau_w")
-    _check_outputs(experiment, wanted, where)
-    driven = _inputs(experiment, wanted, n, rng, where)
-    _check_whole(experiment, wanted, where)
-    plain = in_wind(experiment) if wanted.wind is not None else experiment
-    run = _run(plain, wanted, n, driven, where)
+    # What can be refused is refused before the run, which takes longest.
+    _check_outputs(experiment, settings, where)
+    driven = stick_inputs(experiment, settings, n, rng, where)
+    _check_full_nonlinear(experiment, settings, where)
+    flown = in_wind(experiment) if settings.wind is not None else experiment
+    run = _run(flown, settings, n, driven, where)
     if not bool(run.finite):
         raise InputError(f"{where}: {_diverged(experiment, run)}")
+    # A log ends where the machine is on the ground; the frozen state after it is no flight.
     notes = _notes(experiment, run)
     if np.isfinite(run.ended):
         run = run.first(int(np.searchsorted(run.times, run.ended, side="right")))
     outputs = {k: np.asarray(v) for k, v in naming.asdict(run.outputs).items()}
-    for name, noise in wanted.noise.items():
+    for name, noise in settings.noise.items():
         si = naming.unit(experiment.model.Outputs, name) or "1"
-        scale = _factor(noise.unit or si, si, f"{where}.noise.{name}.unit")
+        scale = factor_to_si(noise.unit or si, si, f"{where}.noise.{name}.unit")
+        # Drawn for the whole record, so that a ground does not change the noise of what is left.
         draws = noise.sd * scale * rng.standard_normal(n)
         outputs[name] = outputs[name] + draws[: outputs[name].size]
     acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
     columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
     notes = (*notes, *_held_notes(experiment, acted))
-    return Simulated(columns, plain.model, {experiment.path.stem: run}, notes)
+    return Simulated(columns, flown.model, {experiment.path.stem: run}, notes)
 
 
 class Made(NamedTuple):
@@ -109,29 +114,33 @@ def drive(experiment: Experiment) -> Made:
     Raises:
         InputError: as `generate`, or a ground, which a sweep has not.
     """
-    wanted = experiment.config.simulate
-    assert wanted is not None
+    settings = experiment.config.simulate
+    assert settings is not None
     where = f"{experiment.path}: simulate"
-    _check_whole(experiment, wanted, where)
-    if wanted.ground is not None:
-        raise InputError(f"{where}.ground: a sweep has none, wanted is a configuration without it")
-    n, rng = round(wanted.duration * wanted.rate), np.random.default_rng(wanted.seed)
-    plain = in_wind(experiment) if wanted.wind is not None else experiment
-    inputs = _inputs(plain, wanted, n, rng, where)
-    flight = Flight(dt=1.0 / wanted.rate, inputs=inputs, outputs={}, name="simulate")
-    if not is_full_nonlinear(plain.model):
-        return Made(plain, flight, None, None)
-    begin = Condition(**wanted.start.model_dump()) if wanted.start else Condition()
-    trimmed = Trimmed(begin, wanted.wind or (0.0, 0.0, 0.0), of=plain.model)
+    _check_full_nonlinear(experiment, settings, where)
+    # A sweep reduces while it flies, and its results are of runs of one length.
+    if settings.ground is not None:
+        raise InputError(f"{where}.ground: a sweep has none, expected a configuration without it")
+    n, rng = round(settings.duration * settings.rate), np.random.default_rng(settings.seed)
+    flown = in_wind(experiment) if settings.wind is not None else experiment
+    # The same draws as `generate` makes: element by element the sweep flies that manoeuvre.
+    inputs = stick_inputs(flown, settings, n, rng, where)
+    flight = Flight(dt=1.0 / settings.rate, inputs=inputs, outputs={}, name="simulate")
+    if not is_full_nonlinear(flown.model):
+        return Made(flown, flight, None, None)
+    # Each element trims itself, so only the condition goes along; the pilot's gains are those for
+    # the vehicle of the file, as a pilot's would be.
+    begin = Condition(**settings.start.model_dump()) if settings.start else Condition()
+    trimmed = Trimmed(begin, settings.wind or (0.0, 0.0, 0.0), of=flown.model)
     pilot = None
-    if wanted.hold_attitude:
-        pilot = _pilot(plain, _begin(plain, wanted, where), where)
-    return Made(plain, flight, trimmed, pilot)
+    if settings.hold_attitude:
+        pilot = _pilot(flown, _begin(flown, settings, where), where)
+    return Made(flown, flight, trimmed, pilot)
 
 
-def _check_outputs(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
+def _check_outputs(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
     known = naming.names(experiment.model.Outputs)
-    for name in wanted.noise:
+    for name in settings.noise:
         if name not in known:
             raise InputError(
                 f"{where}.noise: model {experiment.model.name} has no output {name!r}"
@@ -141,12 +150,13 @@ def _check_outputs(experiment: Experiment, wanted: SimulateConfig, where: str) -
 
 def _run(
     experiment: Experiment,
-    wanted: SimulateConfig,
+    settings: SimulateConfig,
     n: int,
     driven: dict[str, np.ndarray],
     where: str,
 ) -> Trajectory:
     """The run as NumPy arrays, without measurement noise."""
+    # Said by name: what is missing is NaN, and the run would only be called not finite.
     missing = needed_but_missing(experiment.model, experiment.vehicle.params)
     if missing:
         raise InputError(
@@ -156,56 +166,59 @@ def _run(
     model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
     if is_full_nonlinear(experiment.model):
-        begin = _begin(experiment, wanted, where)
-        given = {n: jnp.asarray(v) for n, v in experiment.config.initial_state.items()}
-        start = _extended(model, naming.replace(begin.state, **given))
+        begin = _begin(experiment, settings, where)
+        changed = {n: jnp.asarray(v) for n, v in experiment.config.initial_state.items()}
+        start = _extended(model, naming.replace(begin.state, **changed))
         trimmed = {k: float(v) for k, v in naming.asdict(begin.inputs).items()}
-        # What trim leaves of a stick in the middle, 1e-79, is for no reader of a log.
+        # The configuration's inputs are what a pilot adds: sticks at zero would let it fall.
         trimmed = {k: v if abs(v) > _MIDDLE else 0.0 for k, v in trimmed.items()}
         driven = {k: v + driven.get(k, np.zeros(n)) for k, v in trimmed.items()}
-        if wanted.hold_attitude:
+        if settings.hold_attitude:
             pilot = _pilot(experiment, begin, where)
-        if wanted.ground is not None:
-            ends = {"ground": events.ground(wanted.ground)}
+        if settings.ground is not None:
+            ends = {"ground": events.ground(settings.ground)}
 
-    def one(p: Any, u: Any, x: Any, pilot: Pilot | None) -> Trajectory:
+    def fly(p: Record, u: Record, x: Record | None, pilot: Pilot | None) -> Trajectory:
         return simulate(
             model,
             p,
             u,
-            dt=1.0 / wanted.rate,
+            dt=1.0 / settings.rate,
             initial_state=x,
-            substeps=substeps_for(1.0 / wanted.rate),
-            key=jax.random.key(wanted.seed) if experiment.config.disturbance else None,
+            substeps=substeps_for(1.0 / settings.rate),
+            key=jax.random.key(settings.seed) if experiment.config.disturbance else None,
             feedback=pilot,
             events=ends or None,
         )
 
     inputs = model.Inputs(**{k: jnp.asarray(v) for k, v in driven.items()})
-    run = jax.device_get(jax.jit(one)(params, inputs, start, pilot))
-    return run._replace(times=np.arange(n) / wanted.rate)
+    # jit around the whole: without it simulate would run its outputs and limits operation by
+    # operation. The key and the rate are constants of that one program.
+    run = jax.device_get(jax.jit(fly)(params, inputs, start, pilot))
+    # In float64 whatever the run was in: k/rate to the last digit, as a log has it.
+    return run._replace(times=np.arange(n) / settings.rate)
 
 
-def _check_whole(experiment: Experiment, wanted: SimulateConfig, where: str) -> None:
+def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
     if is_full_nonlinear(experiment.model):
         return
-    given = {
-        "start": wanted.start is not None,
-        "wind": wanted.wind is not None,
-        "hold_attitude": wanted.hold_attitude,
-        "ground": wanted.ground is not None,
+    keys = {
+        "start": settings.start is not None,
+        "wind": settings.wind is not None,
+        "hold_attitude": settings.hold_attitude,
+        "ground": settings.ground is not None,
     }
-    for name in (n for n, there in given.items() if there):
+    for name in (n for n, given in keys.items() if given):
         raise InputError(
-            f"{where}.{name}: model {experiment.model.name} is not a whole helicopter, wanted is "
-            "model: helicopter or helicopter-paper"
+            f"{where}.{name}: model {experiment.model.name} is not the full nonlinear model, "
+            "expected model: helicopter or helicopter-paper"
         )
 
 
-def _begin(experiment: Experiment, wanted: SimulateConfig, where: str) -> Trim:
+def _begin(experiment: Experiment, settings: SimulateConfig, where: str) -> Trim:
     """The trimmed flight that a run begins in."""
-    condition = Condition(**wanted.start.model_dump()) if wanted.start else Condition()
-    wind = wanted.wind or (0.0, 0.0, 0.0)
+    condition = Condition(**settings.start.model_dump()) if settings.start else Condition()
+    wind = settings.wind or (0.0, 0.0, 0.0)
     try:
         return trim(experiment.model, experiment.vehicle.params, condition, wind=wind)
     except ValueError as e:
@@ -219,57 +232,67 @@ def _pilot(experiment: Experiment, begin: Trim, where: str) -> Pilot:
         raise InputError(f"{where}.hold_attitude: {e}") from e
 
 
-def _extended(model: Model, state: Any) -> Any:
+def _extended(model: Model, state: Record) -> Record:
     """A state of the model without disturbance as one of the model with it, at zero there."""
-    given = {k: jnp.asarray(v) for k, v in naming.asdict(state).items()}
-    return naming.replace(zeros(model.State), **given)
+    undisturbed = {k: jnp.asarray(v) for k, v in naming.asdict(state).items()}
+    return naming.replace(zeros(model.State), **undisturbed)
 
 
 def _diverged(experiment: Experiment, run: Trajectory) -> str:
+    # Two causes look alike: a model that cannot begin where it begins, and one that runs away.
     if not is_full_nonlinear(experiment.model):
         first = {k: float(np.asarray(v)[0]) for k, v in naming.asdict(run.inputs).items()}
-        wrong = cannot_start(experiment.model, experiment.vehicle.params, first)
-        return wrong or "the run is not finite: the model is unstable with this vehicle"
+        reason = cannot_start(experiment.model, experiment.vehicle.params, first)
+        return reason or "the run is not finite: the model is unstable with this vehicle"
     return (
-        f"the run is not finite from {_lost(run):g} s on, wanted is a shorter duration, gentler "
-        "inputs or hold_attitude: true"
+        f"the run is not finite from {_diverged_at(run):g} s on, expected a shorter duration, "
+        "gentler inputs or hold_attitude: true"
     )
 
 
-def _lost(run: Trajectory) -> float:
+def _diverged_at(run: Trajectory) -> float:
     """When a run ceases to be finite [s]."""
+    # argmin of booleans: the first sample at which any state is not finite.
     good = np.all([np.isfinite(v) for v in jax.tree.leaves(run.states)], axis=0)
     return float(run.times[np.argmin(good)])
 
 
 def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
     """What is to be said of a run: its end, and where it left the range of model and sticks."""
-    found = []
+    notes = []
     if np.isfinite(run.ended):
-        wanted = experiment.config.simulate
-        assert wanted is not None
-        found.append(
-            f"the machine comes down to {wanted.ground:g} m at {float(run.ended):.4g} s: nothing "
+        settings = experiment.config.simulate
+        assert settings is not None
+        notes.append(
+            f"the machine comes down to {settings.ground:g} m at {float(run.ended):.4g} s: nothing "
             "is written after that"
         )
-    flown = run.times <= float(run.ended)
+    # After an event the state stands still; what it does there says nothing of the flight.
+    flown = np.asarray(run.times <= float(run.ended))
     for name, out in run.outside.items():
         left = np.asarray(out) & flown
         if left.any():
             share = left.sum() / flown.sum()
-            found.append(
+            notes.append(
                 f"the run leaves the model's range at {run.times[np.argmax(left)]:g} s: {name} "
                 f"({100 * share:.2g} % of the samples)"
             )
+    return (*notes, *_stick_notes(experiment, run, flown))
+
+
+def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> list[str]:
+    """Where sticks are past their ends, in the samples that are `flown`."""
+    # Other models' inputs are lengths or anyone's own, without known ends.
+    if not is_full_nonlinear(experiment.model):
+        return []
+    notes = []
     for name, (low, high) in STICKS.items():
-        if not is_full_nonlinear(experiment.model):
-            break
         stick = np.asarray(getattr(run.inputs, name))[flown]
         beyond = (stick < low) | (stick > high)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
-            found.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
-    return tuple(found)
+            notes.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")
+    return notes
 
 
 def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[str]:
@@ -280,7 +303,7 @@ def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[st
     if not experiment.config.flights:
         return []
     signals = experiment.config.flights[0].signals.inputs
-    auto = [n for n, one in signals.items() if one.hold == "auto" and n in acted]
+    auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in acted]
     moving = [n for n in auto if decide(acted[n]).hold == "linear"]
     if not moving:
         return []
@@ -308,60 +331,17 @@ def follow(experiment: Experiment) -> Simulated:
         label = np.array([flight.name] * flight.n_samples)
         parts.append({"flight": label, "time": flight.times, **flight.inputs, **outputs})
         run = jax.device_get(run)._replace(times=flight.times)
+        # Numbered, since two flights may have the same name.
         runs[f"{len(runs) + 1}: {flight.name}"] = run
         notes += [f"{flight.name}: {note}" for note in _notes(experiment, run)]
         if not run.finite:
             first = {n: float(u[0]) for n, u in flight.inputs.items()}
             params = naming.replace(experiment.vehicle.params, **known)
-            wrong = "" if is_full_nonlinear(model) else cannot_start(model, params, first)
-            notes.append(
-                f"{flight.name}: {wrong or f'the run is not finite from {_lost(run):g} s on'}"
-            )
+            reason = "" if is_full_nonlinear(model) else cannot_start(model, params, first)
+            reason = reason or f"the run is not finite from {_diverged_at(run):g} s on"
+            notes.append(f"{flight.name}: {reason}")
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     return Simulated(columns, model, runs, tuple(notes))
-
-
-def _inputs(
-    experiment: Experiment, wanted: SimulateConfig, n: int, rng: np.random.Generator, where: str
-) -> dict[str, np.ndarray]:
-    """Every input of the model in SI; one that is not named stays at neutral."""
-    record = experiment.model.Inputs
-    for name in wanted.inputs:
-        if name not in naming.names(record):
-            raise InputError(
-                f"{where}.inputs: model {experiment.model.name} has no input {name!r}"
-                f"{nearest(name, naming.names(record))}"
-            )
-    out = {}
-    for name in naming.names(record):
-        one = wanted.inputs.get(name)
-        if one is None:
-            out[name] = np.zeros(n)
-            continue
-        si = naming.unit(record, name) or "1"
-        scale = _factor(one.unit or si, si, f"{where}.inputs.{name}.unit")
-        out[name] = one.amplitude * scale * _stick(one, n, 1.0 / wanted.rate, rng)
-    return out
-
-
-def _stick(one: StickConfig, n: int, dt: float, rng: np.random.Generator) -> np.ndarray:
-    if one.kind == "random-steps":
-        return sticks.random_steps(n, dt, rng, one.hold)
-    if one.kind == "3-2-1-1":
-        return sticks.multistep_3211(n, dt, rng, one.step, one.pause)
-    if one.kind == "sweep":
-        # Now the word for a parameter sweep alone.
-        warnings.warn("kind: sweep is deprecated, expected chirp", DeprecationWarning, stacklevel=2)
-    if one.kind in ("chirp", "sweep"):
-        return sticks.chirp(n, dt, *one.band)
-    return np.zeros(n)
-
-
-def _factor(unit: str, si: str, where: str) -> float:
-    try:
-        return units.factor(unit, si)
-    except ValueError as e:
-        raise InputError(f"{where}: {e}") from e
 
 
 def _as_logged(
@@ -371,14 +351,17 @@ def _as_logged(
     outputs: dict[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     if not experiment.config.flights:
+        # Without flights nobody has named a column or a unit.
         return {"time": times, **driven, **outputs}
-    given, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
+    logged, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
     model = experiment.model
-    columns = {given.time.signal: times / _factor(given.time.unit, "s", f"{where}.time.unit")}
-    for signal, values in (
-        (signals(model, "inputs", given.inputs, where), driven),
-        (signals(model, "outputs", given.outputs, where), outputs),
+    columns = {
+        logged.time.signal: times / factor_to_si(logged.time.unit, "s", f"{where}.time.unit")
+    }
+    for by_name, values in (
+        (signals(model, "inputs", logged.inputs, where), driven),
+        (signals(model, "outputs", logged.outputs, where), outputs),
     ):
-        for name, one in signal.items():
-            columns[one.name] = values[name] / units.factor(one.unit, one.si)
+        for name, signal in by_name.items():
+            columns[signal.name] = values[name] / units.factor(signal.unit, signal.si)
     return columns

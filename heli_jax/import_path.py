@@ -24,7 +24,10 @@ def is_path(text: str) -> bool:
 def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     """The object at 'package.module:name', or None where the module has nothing of that name.
 
-    The module may lie in `folder`, as beside the configuration that names it.
+    Args:
+        path: 'package.module:name'.
+        where: what errors begin with, such as the file and the key.
+        folder: where the module may lie, as beside the configuration that names it.
 
     Raises:
         InputError: it is no such path, or the module cannot be imported, whatever goes wrong in
@@ -33,6 +36,7 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
     if not is_path(path):
         raise InputError(f"{where}: got {path!r:.60}, expected package.module:name")
     module_name, attribute = path.split(":")
+    # First in the path and left there: the module's own imports, also later ones, find its folder.
     if folder is not None and str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
     try:
@@ -42,6 +46,7 @@ def by_path(path: str, where: str, folder: str | Path | None = None) -> Any:
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r} ({e})") from e
     except InputError:
         raise
+    # SystemExit too: a script that ends in sys.exit() would end the command without a word.
     except (Exception, SystemExit) as e:  # whatever the module does while it is imported
         raise InputError(f"{where}: cannot import {module_name!r} for {path!r}: {_words(e)}") from e
     return getattr(module, attribute, None)
@@ -57,16 +62,18 @@ def _check_size(module_name: str, where: str) -> None:
         name = ".".join(parts[:i])
         if name in sys.modules:
             continue
-        found = importlib.util.find_spec(name)  # of a part: it imports those before it
-        if found is not None and found.has_location and str(found.origin).endswith(".py"):
+        spec = importlib.util.find_spec(name)  # of a part: it imports those before it
+        # Compiled modules and packages without a file have no source that Python would read.
+        if spec is not None and spec.has_location and str(spec.origin).endswith(".py"):
             try:
-                require_regular(str(found.origin), "a module in Python", _LARGEST)
+                require_regular(str(spec.origin), "a module in Python", _LARGEST)
             except InputError as e:
                 raise InputError(f"{where}: {e}") from e
 
 
 def _words(e: BaseException) -> str:
     """What went wrong and in which line of which file."""
+    # The last frame: the line in the user's module, or in what it called with wrong arguments.
     at = traceback.extract_tb(e.__traceback__)
     line = f"{at[-1].filename}, line {at[-1].lineno}: " if at else ""
     said = " ".join(str(e).split())[:200]

@@ -16,6 +16,8 @@ pitch_on_stand = on_stand(pitch)
 
 __all__ = ["by_name", "helicopter", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
 
+# By the names that a configuration, fit.json and the report use; in Python the names are
+# attributes.
 _SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
 _HELICOPTERS: dict[str, Literal["paper", "consistent"]] = {
     "helicopter": "consistent",
@@ -34,28 +36,33 @@ def by_name(
 ) -> Model:
     """The shipped model of that name, or anyone's own at 'package.module:name'.
 
-    A module of one's own may lie in `folder`, as beside the configuration that names it.
-    `corrections` and `wind` are those of `helicopter`, and for the whole helicopter only.
+    Args:
+        name: such as 'roll', 'helicopter-paper' or 'package.module:name'.
+        where: what errors begin with, such as the file and the key.
+        folder: where a module of one's own may lie, as beside the configuration that names it.
+        corrections: those of `helicopter`, for the whole helicopter only.
+        wind: as that of `helicopter`, likewise.
 
     Raises:
         InputError: neither exists, or it takes no such correction or no wind; `where` begins the
             sentence.
     """
     if name in _HELICOPTERS:
-        for one in corrections or {}:
-            if one not in Corrections._fields:
+        for correction in corrections or {}:
+            if correction not in Corrections._fields:
                 raise InputError(
-                    f"{where}: the helicopter has no correction {one!r}"
-                    f"{nearest(one, Corrections._fields)}"
+                    f"{where}: the helicopter has no correction {correction!r}"
+                    f"{nearest(correction, Corrections._fields)}"
                 )
         # Always called in this way: the cache then gives the same model for the same switches.
         switches = dict(sorted((corrections or {}).items()))
         return helicopter(_HELICOPTERS[name], wind=wind, **switches)
     model = _SHIPPED[name] if name in _SHIPPED else _imported(name, where, folder)
+    # Refused although an empty `corrections` would change nothing: who writes it expects an effect.
     if corrections is not None or wind:
         what = "wind" if wind else "corrections"
         raise InputError(
-            f"{where}: {name!r} takes no {what}, wanted is one of {', '.join(_HELICOPTERS)}"
+            f"{where}: {name!r} takes no {what}, expected one of {', '.join(_HELICOPTERS)}"
         )
     return model
 
@@ -66,8 +73,9 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):
-        found = "nothing" if model is None else f"a {type(model).__name__}"
-        raise InputError(f"{where}: {name!r} is {found}, wanted is a heli_jax.Model")
+        kind = "nothing" if model is None else f"a {type(model).__name__}"
+        raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
+    # Here and not at the first run: the message can name the configuration's key.
     try:
         check_model(model)
     except ValueError as e:

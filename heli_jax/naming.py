@@ -12,22 +12,35 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
+
+type Number = Real[Array, ""] | Real[np.ndarray, ""] | np.number | int | float
+"""As Scalar, or whatever else JAX takes for one number: an int, a NumPy scalar."""
+
+# Models are anyone's own, and so are the classes of their parameters, states, inputs and outputs:
+# no base class or protocol holds them all, since their field names are what the model says.
+# A plain name, not a `type` statement: beartype cannot check `Record | None` of an alias to Any.
+Record = Any
+"""An instance of a record class: a model's Params, State, Inputs or Outputs."""
 
 
 @functools.cache
 def names(record: type) -> tuple[str, ...]:
     """The field names of a record class, in order."""
+    # By the constructor's signature: named tuples, dataclasses, equinox modules and plain classes
+    # all have one. A dataclass may have an __init__ of its own, so its fields are asked first.
     fields = getattr(record, "__dataclass_fields__", None)
     return tuple(fields) if fields is not None else tuple(inspect.signature(record).parameters)
 
 
 @functools.cache
 def _notes(record: type) -> Mapping[str, tuple[Any, ...]]:
+    # Through typing, which also resolves annotations that are text (from __future__ annotations).
     hints = get_type_hints(record, include_extras=True)
     return {
         name: get_args(hint)[1:] if get_origin(hint) is Annotated else ()
@@ -53,18 +66,19 @@ def defaults(record: type) -> dict[str, Any]:
     return {n: p.default for n, p in signature.items() if p.default is not inspect.Parameter.empty}
 
 
-def asdict(record: Any) -> dict[str, Any]:
+def asdict(record: Record) -> dict[str, Any]:
     """A record's fields by name, not copied."""
     return {name: getattr(record, name) for name in names(type(record))}
 
 
-def replace(record: Any, **changes: Any) -> Any:
+def replace(record: Record, **changes: Any) -> Record:
     """A new record of the same class with some fields changed."""
+    # Not dataclasses.replace, nor _replace: a model's classes may be either, or neither.
     return type(record)(**{**asdict(record), **changes})
 
 
 def ravel(
-    record: Any, dtype: DTypeLike | None = None, only: Sequence[str] | None = None
+    record: Record, dtype: DTypeLike | None = None, only: Sequence[str] | None = None
 ) -> Float[Array, " n"]:
     """A record as a vector, in the order of its class's fields.
 
@@ -77,7 +91,7 @@ def ravel(
     return jnp.stack([jnp.asarray(getattr(record, name), dtype) for name in taken])
 
 
-def unravel(record: type, vector: Float[Array, " n"]) -> Any:
+def unravel(record: type, vector: Float[Array, " n"]) -> Record:
     """The record of a class from a vector in the order of its fields: what `ravel` makes, back.
 
     Raises:
@@ -93,15 +107,21 @@ def fields(record: type) -> dict[str, Any]:
 
 
 def extended(record: type, title: str, more: Mapping[str, tuple[Any, Any]]) -> type:
-    """A record class with the fields of `record` and `more`, given as (annotation, default).
+    """A record class with the fields of `record` and `more`.
 
-    The fields without a default come first, as Python wants.
+    Args:
+        record: the class to extend, not changed.
+        title: name of the new class.
+        more: by name, (annotation, default); None for no default.
     """
+    # A named tuple, whatever `record` is: it needs no base class, and JAX knows it. Fields without
+    # a default have to come first, so the order of `record` is not kept.
     known = fields(record)
-    given = {**defaults(record), **{n: d for n, (_, d) in more.items() if d is not None}}
+    with_default = {**defaults(record), **{n: d for n, (_, d) in more.items() if d is not None}}
     known.update({n: annotation for n, (annotation, _) in more.items()})
-    ordered = sorted(known, key=lambda n: n in given)
+    ordered = sorted(known, key=lambda n: n in with_default)
     made: Any = NamedTuple(title, [(n, known[n]) for n in ordered])  # type: ignore[misc]
-    made.__new__.__defaults__ = tuple(given[n] for n in ordered if n in given)
-    made._field_defaults = {n: given[n] for n in ordered if n in given}
+    # The functional form of NamedTuple takes no defaults: they are set where the other form does.
+    made.__new__.__defaults__ = tuple(with_default[n] for n in ordered if n in with_default)
+    made._field_defaults = {n: with_default[n] for n in ordered if n in with_default}
     return made

@@ -8,12 +8,15 @@ _UP = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def number(value: float | None, digits: int = 4) -> str:
     """A number to some significant digits, with a power of ten where it is far from one."""
+    # None and NaN stand for 'not estimated': a dash, since a reader would take 'nan' for an error.
     if value is None or math.isnan(value):
         return NOTHING
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     power = _power(value)
     text = f"{value / 10.0**power:.{digits}g}"
+    # `g` falls back to an exponent where the digits left of the point are more than asked for;
+    # the power of ten has been taken out already, and a number has one.
     if "e" in text:
         text = f"{value / 10.0**power:.0f}"
     return _signed(text) + _times(power)
@@ -31,12 +34,33 @@ def relative(sd: float | None, value: float) -> str:
     if sd is None or value == 0 or not math.isfinite(sd / value):
         return NOTHING
     share = 100 * abs(sd / value)
+    # Past 100 % the digits say nothing, and '1.2e+02 %' is what two of them would look like.
     if share >= 100:
         return f"{share:.0f} %"
+    # '#' keeps the zero of 1.0 %: two digits are promised, and 1 % could be 0.6 to 1.4.
     return f"{share:#.2g}".rstrip(".") + " %" if share >= 1e-4 else f"{number(share, 2)} %"
 
 
 _FAR = 10.0
+"""standard deviations, or times the value, past which an end of an interval is on its own"""
+
+
+# Two functions round to the digits of a standard deviation, for two readers. `measured` is for
+# pages: a value and the ends of its interval share a power of ten and have true minus signs, so
+# that a column can be compared by eye. `rounded` is for the terminal and for programs that read
+# it: ASCII, an exponent as Python writes it, so that a number can be pasted into a vehicle file.
+
+
+def rounded(value: float, sd: float) -> tuple[str, str]:
+    """A value to the second digit of its standard deviation, and that deviation, in ASCII."""
+    if not (sd > 0 and math.isfinite(sd) and math.isfinite(value)):
+        return f"{value:.6g}", f"{sd:.2g}"
+    # Significant digits of the value: two, and one for each decade that it is above its sd.
+    digits = 2
+    if value != 0:
+        digits += max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(sd)))
+    # At most nine: a parameter at a bound may have an sd of 1e-15, and its digits are noise.
+    return f"{value:#.{min(digits, 9)}g}".rstrip("."), f"{sd:.2g}"
 
 
 def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
@@ -47,18 +71,22 @@ def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:
     first = values[0]
     if sd is None or not (math.isfinite(sd) and sd > 0) or first is None:
         return (*(number(v, 6) for v in values), number(sd, 2))
+    # The larger of the two decides on the power: an sd above its value must be readable too.
     power = _power(max(abs(first), sd))
+    # The second digit of sd stands this many places after the point, once the power is out; past
+    # 15 a double has none.
     places = min(1 - math.floor(math.log10(sd)) + power, 15)
 
-    def one(v: float | None) -> str:
+    def text_of(v: float | None) -> str:
         if v is None or not math.isfinite(v):
             return number(v)
         # An end of an interval over powers of ten has digits of its own.
         if abs(v - first) > _FAR * sd and abs(v) > _FAR * abs(first):
             return number(v, 3)
+        # Rounded first, since the format alone cannot round to the left of the point (places < 0).
         return _signed(f"{round(v / 10.0**power, places):.{max(places, 0)}f}") + _times(power)
 
-    return (*(one(v) for v in values), one(sd))
+    return (*(text_of(v) for v in values), text_of(sd))
 
 
 def with_sd(value: float, sd: float) -> str:
@@ -72,6 +100,7 @@ def _power(value: float) -> int:
     if value == 0 or not math.isfinite(value):
         return 0
     power = math.floor(math.log10(abs(value)))
+    # 0.01 and 12345 read better as they are than as 1·10⁻² and 1.2345·10⁴.
     return 0 if -3 < power < 5 else power
 
 
@@ -81,6 +110,7 @@ def _times(power: int) -> str:
 
 def _signed(text: str) -> str:
     """A true minus sign, and none before a zero."""
+    # What rounds to zero has no sign: '−0.000' would claim one that the digits do not show.
     if text.startswith("-"):
         return text[1:] if not text.strip("-0.") else f"−{text[1:]}"
     return text

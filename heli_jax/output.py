@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,19 +18,21 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.numbers import rounded
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
 from heli_jax.workflow import FitRun
 
 if TYPE_CHECKING:
+    from heli_jax.flights.describe import LogInfo, TimeInfo
     from heli_jax.generate import Simulated
     from heli_jax.sweeps.run import Progress
 
 
 def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
-    problem, fit, further = run.problem, run.fit, run.supplementary
+    problem, fit, supplementary = run.problem, run.fit, run.supplementary
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Did the optimiser arrive; what do the data determine; is the model adequate.
@@ -38,17 +40,21 @@ def print_fit(run: FitRun) -> None:
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")
+    # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
+    # stand in fit.json and the report.
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
     rows = [_row(name, e) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     _table((*head[:3], fit.interval, *head[4:]), rows)
     for c in fit.verdict.combinations:
         print(_determined(c))
-    if further.intervals is not None:
-        found = report_tables.intervals(further.intervals, fit)
-        _table(found.head, found.rows)
-        for sentence in further.intervals.sentences:
+    if supplementary.intervals is not None:
+        table = report_tables.intervals(supplementary.intervals, fit)
+        _table(table.head, table.rows)
+        for sentence in supplementary.intervals.sentences:
             print(f"! {sentence}")
+    # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
+    # of those held out, where a model that was fitted too closely shows.
     for name, m in fit.metrics.items():
         _print_agreement(f"{name}, simulated", m)
     for name, m in fit.one_step.items():
@@ -56,6 +62,7 @@ def print_fit(run: FitRun) -> None:
     for name, m in fit.validation.items():
         _print_agreement(f"{name}, held out, simulated", m)
     for name, m in fit.validation_free_run.items():
+        # An unstable machine simulated in one piece leaves any record: numbers would say nothing.
         if diverges(m):
             print(f"{name}, held out, simulated in one piece: diverges")
         else:
@@ -63,10 +70,10 @@ def print_fit(run: FitRun) -> None:
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     print(f"acceptance card: {summary(card(problem, fit))}")
-    if further.choice is not None:
-        compared = report_tables.choice(further.choice)
+    if supplementary.choice is not None:
+        compared = report_tables.choice(supplementary.choice)
         _table(compared.head, compared.rows)
-        for sentence in further.choice.sentences:
+        for sentence in supplementary.choice.sentences:
             print(sentence)
     if run.baseline is not None:
         _print_baseline(run.baseline)
@@ -80,20 +87,22 @@ def _determined(c: Combination) -> str:
     return f"determined: {c.name} = {value}, sd {sd}, 95 % interval {_range(c)}"
 
 
-def _range(one: Estimate | Combination) -> str:
+def _range(estimate: Estimate | Combination) -> str:
     """An interval to the digits that its sd leaves; ends far from the value to three."""
-    assert one.sd is not None
-    ends = (one.lower95, one.upper95)
+    value, sd = estimate.value, estimate.sd
+    assert sd is not None
+    ends = (estimate.lower95, estimate.upper95)
     shown = []
     for end in ends:
         assert end is not None
         # Where an interval spans powers of ten its ends have digits of their own.
-        near = abs(end - one.value) < _NEAR * one.sd and abs(end) > abs(one.value) / _NEAR
-        shown.append(rounded(end, one.sd)[0] if near or end == 0 else f"{end:.3g}")
+        near = abs(end - value) < _NEAR * sd and abs(end) > abs(value) / _NEAR
+        shown.append(rounded(end, sd)[0] if near or end == 0 else f"{end:.3g}")
     return f"{shown[0]} to {shown[1]}"
 
 
 _NEAR = 10.0
+"""standard deviations from the value, or share of it, up to which an end shares its digits"""
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
@@ -109,6 +118,8 @@ def _print_baseline(b: Baseline) -> None:
 
 
 def _row(name: str, e: Estimate) -> tuple[str, ...]:
+    # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
+    # as an estimate.
     if e.sd is None or e.lower95 is None or e.upper95 is None:
         return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
     at_bound = " (at bound)" if e.at_bound else ""
@@ -116,17 +127,8 @@ def _row(name: str, e: Estimate) -> tuple[str, ...]:
     return (name, value + at_bound, sd, _range(e), e.unit, f"{e.prior_share:.2f}")
 
 
-def rounded(value: float, sd: float) -> tuple[str, str]:
-    """A value to the second digit of its standard deviation, and that deviation."""
-    if not (sd > 0 and math.isfinite(sd) and math.isfinite(value)):
-        return f"{value:.6g}", f"{sd:.2g}"
-    digits = 2
-    if value != 0:
-        digits += max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(sd)))
-    return f"{value:#.{min(digits, 9)}g}".rstrip("."), f"{sd:.2g}"
-
-
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -136,6 +138,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
         table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(_escaped(cell) for cell in row))
+    # In a pipe rich assumes 80 columns and cuts off what is wider.
     width = None if sys.stdout.isatty() else 120
     Console(file=sys.stdout, highlight=False, width=width).print(table)
 
@@ -143,23 +146,26 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
 def _escaped(text: str) -> str:
     from rich.markup import escape
 
+    # '[deg]' in a unit or a signal's name is markup to rich, and would vanish.
     return escape(text)
 
 
-def print_check(found: Check) -> None:
-    """The verdict at the start values, on standard output."""
-    _print_verdict(found.verdict)
+def print_check(check: Check) -> None:
+    """The identifiability at the initial guess, on standard output."""
+    verdict = check.verdict
+    _print_verdict(verdict)
     rows = []
-    for i, name in enumerate(found.verdict.names):
-        relative = math.sqrt(found.verdict.covariance[i, i])
-        lost = name in found.verdict.undetermined or name in found.verdict.without_effect
-        expected = "not determined" if lost else f"{100 * relative:.2g} %"
-        rows.append((name, expected, f"{found.verdict.prior_share[name]:.2f}"))
+    for i, name in enumerate(verdict.names):
+        # The covariance is that of the logarithms: its root is the relative sd.
+        relative = math.sqrt(verdict.covariance[i, i])
+        lacking = name in verdict.undetermined or name in verdict.without_effect
+        expected = "not determined" if lacking else f"{100 * relative:.2g} %"
+        rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
     _table(("parameter", "expected sd", "prior share"), rows)
-    for name, sd in found.noise.items():
+    for name, sd in check.noise.items():
         guess = " (guessed: too small where the log was smoothed; state the output's sd)"
-        print(f"noise of {name}: {sd:.3g}{guess if name in found.guessed else ''}")
-    for note in found.notes:
+        print(f"noise of {name}: {sd:.3g}{guess if name in check.guessed else ''}")
+    for note in check.notes:
         print(f"! {note}")
 
 
@@ -191,9 +197,15 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
 def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simulated") -> None:
     """The page of what was simulated at `out`, which appears whole or not at all.
 
+    Args:
+        out: the HTML file to write.
+        experiment: the configuration, of which the page shows the vehicle.
+        simulated: the runs.
+
     Raises:
         InputError: the place cannot be written to.
     """
+    # Imported here: no other command needs the page.
     from heli_jax.report.view import write_view as write
 
     title, params = experiment.path.stem, experiment.vehicle.params
@@ -208,6 +220,7 @@ def sweep_progress() -> Iterator["Callable[[Progress], None]"]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
+    # A bar in a log file is a line of carriage returns.
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -224,7 +237,7 @@ class _Lines:
         self.last = -math.inf
 
     def __call__(self, p: "Progress") -> None:
-        now = time.monotonic()
+        now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
         if p.done == p.total or now - self.last > 10.0:
             self.last = now
             print(f"heli-jax: sweep: {_progress_words(p)}", file=sys.stderr, flush=True)
@@ -232,6 +245,7 @@ class _Lines:
 
 def _progress_words(p: "Progress") -> str:
     words = f"{p.done} of {p.total} elements"
+    # The first chunk compiles: a rate that contained it would foretell hours.
     if math.isnan(p.rate):
         return words
     words = f"{words}, {p.rate:.3g} a second"
@@ -247,35 +261,42 @@ def _counted(elements: int) -> str:
 
 def print_sweep(out: Path) -> None:
     """The summary of a sweep on standard output."""
-    found = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    counts = {k: v for k, v in found["status"].items() if v}
+    # From the file, not from memory: a resumed sweep prints what all its runs have computed.
+    totals = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    counts = {k: v for k, v in totals["status"].items() if v}
     words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
-    print(f"{_counted(found['elements'])} of {found['model']}: {words}")
+    print(f"{_counted(totals['elements'])} of {totals['model']}: {words}")
     rows = []
-    for name, one in found["results"].items():
+    for name, result in totals["results"].items():
         numbers = [
-            f"{one[k]:.4g}" if k in one else "" for k in ("min", "q05", "median", "q95", "max")
+            f"{result[k]:.4g}" if k in result else ""
+            for k in ("min", "q05", "median", "q95", "max")
         ]
-        error = found.get("float32_error", {}).get(name)
-        rows.append((name, *numbers, one.get("unit", ""), "" if error is None else f"{error:.1g}"))
+        error = totals.get("float32_error", {}).get(name)
+        rows.append(
+            (name, *numbers, result.get("unit", ""), "" if error is None else f"{error:.1g}")
+        )
+    # The last column only where the sweep compared single with double precision.
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
-    width = len(head) if "float32_error" in found else len(head) - 1
+    width = len(head) if "float32_error" in totals else len(head) - 1
     _table(head[:width], [row[:width] for row in rows])
-    for name, worst_ones in found["worst"].items():
-        one = worst_ones[0]
-        at = ", ".join(f"{n} = {v:.4g}" for n, v in one["axes"].items())
-        print(f"worst {name}: element {one['element']}, {at}")
-    for note in found["notes"]:
+    for name, worst_ones in totals["worst"].items():
+        element = worst_ones[0]
+        at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
+        print(f"worst {name}: element {element['element']}, {at}")
+    for note in totals["notes"]:
         print(f"! {note}")
-    for name, one in found["results"].items():
-        apart = {"infinite": one.get("infinite", 0), "not a number": one.get("nan", 0)}
+    for name, result in totals["results"].items():
+        # Quantiles are of the finite values alone: how many were not is part of the answer.
+        apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}
         if sum(apart.values()):
             words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
-            of = one["n"] + sum(apart.values())
+            of = result["n"] + sum(apart.values())
             print(f"! {name}: of {of} values {words}, which its line leaves out")
-    if not found["status"].get("ok"):
+    if not totals["status"].get("ok"):
         print("! no element is ok: see docs/sweeps.md for what each status means")
-    timing = found["timing"]
+    timing = totals["timing"]
+    # A sweep that was resumed when all was there has computed nothing, and has no rate.
     if timing["computed_elements"]:
         print(
             f"{_counted(timing['computed_elements'])} in {timing['seconds']:.3g} s "
@@ -284,7 +305,7 @@ def print_sweep(out: Path) -> None:
     print(f"store: {out / 'sweep.zarr'}")
 
 
-def print_info(info: Any) -> None:
+def print_info(info: "LogInfo") -> None:
     """What a log holds, on standard output."""
     print(f"{info.path}: {info.format}, {info.size} bytes, {info.n_rows} rows")
     print(f"sha256 {info.sha256}")
@@ -303,7 +324,7 @@ def print_info(info: Any) -> None:
     _table(("signal", "kind", "count", "min", "max", "mean", "sd", "NaN"), rows)
 
 
-def _print_clock(clock: Any) -> None:
+def _print_clock(clock: "TimeInfo") -> None:
     uniform = (
         f"uniform (jitter {100 * clock.jitter:.2g} % of a step)" if clock.uniform else "not uniform"
     )

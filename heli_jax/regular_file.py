@@ -35,6 +35,7 @@ _PIECE = 1 << 20
 
 def size_words(size: int) -> str:
     """A size in bytes in words: `1 MB`, `16 GB`."""
+    # Powers of ten, as disks are sold; the limits are stated in them too.
     for unit, scale in (("TB", 10**12), ("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if size >= scale:
             return f"{size / scale:.3g} {unit}"
@@ -52,6 +53,7 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
     Raises:
         InputError: there is none, it is no regular file, or it is larger.
     """
+    # A ValueError is a path with a null character, which os refuses before the system sees it.
     try:
         return _checked(os.stat(path), path, what, at_most)
     except (OSError, ValueError) as e:
@@ -60,11 +62,17 @@ def require_regular(path: str | Path, what: str, at_most: int) -> int:
 
 @contextlib.contextmanager
 def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO]:
-    """A regular file opened for reading; the arguments are those of `require_regular`.
+    """A regular file opened for reading.
+
+    Args:
+        path: the file, or a link to it.
+        what: what it should be, with its article.
+        at_most: the largest size that is read [bytes].
 
     Raises:
         InputError: as `require_regular`, or it cannot be opened or read.
     """
+    # Before it is opened: to open some devices has an effect (a tape rewinds, a watchdog starts).
     require_regular(path, what, at_most)
     try:
         descriptor = os.open(path, _FLAGS)
@@ -76,13 +84,17 @@ def open_regular(path: str | Path, what: str, at_most: int) -> Iterator[BinaryIO
 
 
 def read_regular(path: str | Path, what: str, at_most: int) -> bytes:
-    """All of a regular file; the arguments are those of `require_regular`.
+    """All of a regular file.
 
-    A file of /proc says that it is empty and gives without end: what is read is counted too.
+    Args:
+        path: the file, or a link to it.
+        what: what it should be, with its article.
+        at_most: the largest size that is read [bytes].
 
     Raises:
         InputError: as `open_regular`.
     """
+    # A file of /proc says that it is empty and gives without end: what is read is counted too.
     pieces, size = [], 0
     with open_regular(path, what, at_most) as file:
         while piece := file.read(_PIECE):
@@ -108,20 +120,21 @@ def kind_of(mode: int) -> str:
     return next((words for is_it, words in _KINDS if is_it(mode)), "no regular file")
 
 
-def _checked(found: os.stat_result, path: str | Path, what: str, at_most: int) -> int:
-    if not stat.S_ISREG(found.st_mode):
-        raise InputError(f"{path}: expected {what}, got {kind_of(found.st_mode)}")
-    if found.st_size > at_most:
-        raise _too_large(path, what, at_most, found.st_size)
-    return found.st_size
+def _checked(status: os.stat_result, path: str | Path, what: str, at_most: int) -> int:
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: expected {what}, got {kind_of(status.st_mode)}")
+    if status.st_size > at_most:
+        raise _too_large(path, what, at_most, status.st_size)
+    return status.st_size
 
 
 def _too_large(path: str | Path, what: str, at_most: int, size: int | None = None) -> InputError:
     got = "more" if size is None else size_words(size)
-    return InputError(f"{path}: larger than {size_words(at_most)}, expected {what}, got {got}")
+    return InputError(f"{path}: expected {what} of at most {size_words(at_most)}, got {got}")
 
 
 def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError:
+    # An InputError is a ValueError: one that was raised on purpose keeps its words.
     if isinstance(e, InputError):
         return e
     if isinstance(e, FileNotFoundError):
@@ -131,4 +144,4 @@ def _refusal(e: OSError | ValueError, path: str | Path, what: str) -> InputError
         waits = e.errno in (errno.EAGAIN, errno.EWOULDBLOCK)
         why = "it gives nothing" if waits else e.strerror or type(e).__name__
         return InputError(f"{path}: cannot be read ({why}), expected {what}")
-    return InputError(f"{path!r:.80}: is no name of a file")  # one with a null character
+    return InputError(f"expected the name of a file, got {path!r:.80}")  # one with a null character

@@ -11,6 +11,9 @@ from typing import Any
 
 from heli_jax.errors import nearest
 
+# A registry of its own rather than pint's default: that calls the radian dimensionless (so that a
+# metre of stick would pass for a radian of blade), reads 'a' as a year, and has a thousand
+# units to read before the first is used.
 _DEFINITIONS = """
 milli- = 1e-3 = m-
 micro- = 1e-6 = u- = µ-
@@ -83,6 +86,7 @@ _EXAMPLES = [
 ]
 
 
+# Any, as pint's quantities have no type that can be imported without pint.
 @functools.cache
 def _parse(unit: str) -> Any:
     registry = _registry()
@@ -90,6 +94,7 @@ def _parse(unit: str) -> Any:
     if text in ("", "1", "-", "dimensionless"):
         return registry.Quantity(1.0)
     try:
+        # Before pint sees it: pint evaluates powers, and 9**9**9**9 does not end.
         if len(text) > 60 or not _UNIT.fullmatch(text):
             raise ValueError
         expression = text.replace("%", "percent").replace("°", "degree")
@@ -114,6 +119,8 @@ def factor(unit: str, si: str) -> float:
     have, want = _parse(unit), _parse(si)
     if have.dimensionality == want.dimensionality:
         return float((have / want).to_base_units().magnitude)
+    # Only where the file leaves the angle out: '1/s' may stand for rad/s. The other way round, Hz
+    # or rad/s for 1/s, is refused, since a factor of 2 pi would go unseen.
     if _angle_free(have) and _without_angle(have) == _without_angle(want):
         base = have.to_base_units()
         if float(base.magnitude) == 1.0 or dict(base.dimensionality):
@@ -149,6 +156,7 @@ def si_of(unit: str) -> str:
     Raises:
         ValueError: the unit is unknown, or none of the kinds that occur here.
     """
+    # A list and not pint's base units: those write kg m^2/s^2 where a reader knows N m.
     kind = _parse(unit).dimensionality
     for si in _SI:
         if _parse(si).dimensionality == kind:

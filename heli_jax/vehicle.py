@@ -16,17 +16,20 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.errors import InputError, nearest
-from heli_jax.naming import Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.yaml_file import read_mapping
 
 
 def _scalar(value: Any) -> Any:
     """Python and NumPy numbers become arrays of the default float; anything else passes."""
+    # Tracers, batches and the placeholders of JAX's tree functions are left as they are: a pytree's
+    # class has to build from whatever its leaves have become.
     if isinstance(value, (bool, int, float, np.floating, np.integer)):
         return jnp.asarray(value, dtype=jnp.result_type(float))
     return value
 
 
+# Any, since a field's default stands where the class says Scalar.
 def _field(default: float | None = None) -> Any:
     if default is None:
         return eqx.field(converter=_scalar)
@@ -42,6 +45,8 @@ class Helicopter(eqx.Module):
     a c / (a_paddle c_paddle).
     """
 
+    # What the reduced roll model reads has no default; what only the whole helicopter reads is NaN
+    # until it is given, and `needed_but_missing` says so.
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
     If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field()
     R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field()
@@ -57,6 +62,7 @@ class Helicopter(eqx.Module):
     Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field()
     rho: Annotated[Scalar, "kg/m^3", "air density"] = _field(1.2)
     g: Annotated[Scalar, "m/s^2", "gravitational acceleration"] = _field(9.80665)
+    # Eq. 10's B = 0.97: lift ends at 97 % of the blade.
     B: Annotated[Scalar, "1", "tip loss factor"] = _field(0.97)
     m: Annotated[Scalar, "kg", "total mass"] = _field(math.nan)
     Iyy: Annotated[Scalar, "kg m^2", "fuselage inertia about the pitch axis"] = _field(math.nan)
@@ -69,11 +75,13 @@ class Helicopter(eqx.Module):
     c_T: Annotated[Scalar, "m", "tail rotor blade chord"] = _field(math.nan)
     a_T: Annotated[Scalar, "1/rad", "tail rotor lift slope"] = _field(math.nan)
     L_T: Annotated[Scalar, "m", "tail rotor axis to the centre of gravity"] = _field(math.nan)
+    # rad/s^2 for a full stick, by eq. 10; the paper's nomenclature says another unit.
     K_throttle: Annotated[Scalar, "rad/s^2", "throttle to rotor acceleration"] = _field(math.nan)
     K_theta0: Annotated[Scalar, "rad", "throttle to collective pitch"] = _field(math.nan)
     K_theta0T: Annotated[Scalar, "rad", "yaw stick to tail rotor pitch"] = _field(math.nan)
     K_Tm: Annotated[Scalar, "N m", "throttle to motor torque"] = _field(math.nan)
     K_Omega: Annotated[Scalar, "1", "tail rotor speed over main rotor speed"] = _field(math.nan)
+    # Beyond the paper from here on: zero leaves its equations as they are printed.
     Sx: Annotated[Scalar, "m^2", "fuselage drag area along the body, beyond the paper"] = _field(
         0.0
     )
@@ -83,12 +91,15 @@ class Helicopter(eqx.Module):
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
     zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
+    # Four times what blade-element theory gives for two blades over a turn: see
+    # `aero.cyclic_moment`.
     cyclic_moment: Annotated[Scalar, "1", "the factor 1/2 of eqs 14-15"] = _field(0.5)
     c_paddle: Annotated[Scalar, "m", "flybar paddle chord; c where not given"] = _field(math.nan)
     a_paddle: Annotated[Scalar, "1/rad", "flybar paddle lift slope; a where not given"] = _field(
         math.nan
     )
 
+    # Imported where they are used: summaries import this module.
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_vehicle
 
@@ -101,6 +112,7 @@ class Helicopter(eqx.Module):
 
 
 # A vehicle may leave out what the model at hand does not read; what it gives must be possible.
+# Gains have the sign of how a servo is mounted, and hr and lr that of where a rotor stands.
 _MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}
 _MAY_BE_ZERO = {"Sx", "Sy", "Sz", "Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
 
@@ -113,26 +125,28 @@ def of_helicopter(record: type) -> bool:
 def impossible(params: Mapping[str, float]) -> str | None:
     """What cannot be in a helicopter's constants, as the end of a sentence; None where all can.
 
-    `params` are numbers by name; a name that is missing is not judged.
+    `params` are numbers by name; a name that is missing is not checked.
     """
     for name, value in params.items():
         if _too_small(name, value):
-            wanted = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
-            return f"{name} is {value:g}, wanted is {wanted}"
+            bound = "zero or more" if name in _MAY_BE_ZERO else "more than zero"
+            return f"{name} must be {bound}, got {value:g}"
+    # Exchanged ends would make the flybar's damping negative, and a fit would end in an If below 0.
     r1, r2 = params.get("R1"), params.get("R2")
     if r1 is not None and r2 is not None and r1 >= r2:
         return (
-            f"R1 is {r1:g} and R2 is {r2:g}, wanted is R1 < R2: R1 is the inner and R2 the outer "
-            "end of the flybar paddle (the paper's nomenclature exchanges them)"
+            f"R1 must be less than R2, got R1 = {r1:g} and R2 = {r2:g}: R1 is the inner and R2 the "
+            "outer end of the flybar paddle (the paper's nomenclature exchanges them)"
         )
     if (b := params.get("B")) is not None and b > 1:
-        return f"B is {b:g}, wanted is a tip loss factor of at most 1"
+        return f"B must be a tip loss factor of at most 1, got {b:g}"
     return None
 
 
 def possible(params: Mapping[str, Any]) -> np.ndarray:
     """Which of many helicopters can be, (k,), from arrays (k,) or numbers by name, as `impossible`
-    judges one; a value that is not a number is not judged."""
+    checks one; a value that is not a number is not checked."""
+    # The same rules for a batch of a sweep: what cannot be is a status there, not an error.
     fine = np.asarray(True)
     for name, value in params.items():
         fine = fine & ~_too_small(name, np.asarray(value))
@@ -143,7 +157,7 @@ def possible(params: Mapping[str, Any]) -> np.ndarray:
     return np.asarray(fine)
 
 
-def _too_small(name: str, value: Any) -> Any:
+def _too_small(name: str, value: float | int | np.ndarray) -> Any:
     """Whether values [SI] of a constant are below what it can be."""
     if name not in naming.names(Helicopter) or name in _MAY_BE_NEGATIVE:
         return np.zeros(np.shape(value), bool)
@@ -162,7 +176,7 @@ class Constant(NamedTuple):
 class Vehicle(NamedTuple):
     """A vehicle file: the parameters, and where each number comes from."""
 
-    params: Any
+    params: Record
     constants: dict[str, Constant]
     path: str
 
@@ -186,6 +200,11 @@ def vehicle_from_mapping(
 ) -> Vehicle:
     """Build the parameters from a mapping of names to numbers or {value, unit, source}.
 
+    Args:
+        content: constants by name.
+        where: what errors name, such as the file.
+        params: the class to build, Helicopter or a model's own Params.
+
     Raises:
         InputError: an unknown name, a missing or an impossible value; `where` is named.
     """
@@ -197,7 +216,8 @@ def vehicle_from_mapping(
         constants[name] = _constant(entry, name, naming.unit(params, name), where)
     missing = [n for n in known if n not in constants and n not in naming.defaults(params)]
     if missing:
-        raise InputError(f"{where}: {', '.join(missing)} missing, wanted is a number for each")
+        raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
+    # Of a class of one's own nobody knows what is possible.
     if params is Helicopter:
         wrong = impossible({n: c.value for n, c in constants.items()})
         if wrong:
@@ -213,19 +233,21 @@ def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
         unknown = [k for k in entry if k not in ("value", "unit", "source")]
         if unknown:
             raise InputError(
-                f"{place}: unknown key {unknown[0]!r}, known are value, unit and source"
+                f"{place}: expected the keys value, unit and source, got {unknown[0]!r}"
             )
         if "value" not in entry:
-            raise InputError(f"{place}: no value, wanted is a number")
+            raise InputError(f"{place}: expected a number under value, got none")
         unit, source = str(entry.get("unit", unit)), str(entry.get("source", ""))
         entry = entry["value"]
+    # YAML's true is a bool, which Python counts among the integers.
     if isinstance(entry, bool) or not isinstance(entry, int | float):
-        raise InputError(f"{place}: found {entry!r:.40}, wanted is a number")
+        raise InputError(f"{place}: expected a number, got {entry!r:.40}")
     try:
         scale = units.factor(unit, si) if si is not None else 1.0
     except ValueError as e:
         raise InputError(f"{place}: {e}") from e
+    # An integer past 1e308 cannot become a float: OverflowError would be the message.
     value = float(entry) * scale if abs(entry) < 1e300 else math.inf
     if not math.isfinite(value):
-        raise InputError(f"{place}: found {entry!r:.40}, wanted is a finite number")
+        raise InputError(f"{place}: expected a finite number, got {entry!r:.40}")
     return Constant(value, si or unit, source)

@@ -10,6 +10,8 @@ import yaml
 from heli_jax.errors import InputError
 from heli_jax.regular_file import read_regular
 
+# A configuration has some hundred keys in five levels. Past these limits a file is a mistake or a
+# trap: nine aliases of nine aliases of ... fill any memory from twelve lines.
 _LIMIT_BYTES = 1_000_000
 _LIMIT_NODES = 100_000
 _LIMIT_DEPTH = 40
@@ -17,6 +19,7 @@ _LONGEST_KEY = 200
 """characters: a message that names a key stays a sentence"""
 
 
+# libyaml where it is there: the parser in Python takes seconds for a large mapping.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -24,6 +27,9 @@ class _Loader(_Base):
     """SafeLoader without YAML 1.1's traps: `1e-4` is a number; `on`, `yes` and dates are text."""
 
 
+# YAML 1.1, which PyYAML follows, reads 1e-4 as text (it wants 1.0e-4), `on` and `no` as booleans
+# and 1:30 as ninety. All its rules but those for null and << go, and those of YAML 1.2's core
+# schema take their place.
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, rx) for tag, rx in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -36,6 +42,7 @@ _Loader.add_implicit_resolver(
 )
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
+    # Also integers of more than 18 digits and with leading zeros, which the rule above leaves.
     re.compile(
         r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
         r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
@@ -54,7 +61,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """
     data = read_regular(path, "a YAML file (a configuration or a vehicle)", _LIMIT_BYTES)
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-8-sig")  # Windows editors put a byte-order mark first
     except UnicodeDecodeError as e:
         raise InputError(f"{path}: is not text, expected a YAML file") from e
     return parse_mapping(text, str(path))
@@ -64,8 +71,8 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
     """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
     value = _load(text, where)
     if not isinstance(value, dict):
-        found = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{where}: holds {found}, expected keys with values")
+        kind = "nothing" if value is None else f"a {type(value).__name__}"
+        raise InputError(f"{where}: expected keys with values, got {kind}")
     return value
 
 
@@ -82,12 +89,18 @@ def as_yaml(content: Mapping[str, Any]) -> str:
 def _load(text: str, where: str) -> Any:
     loader = None
     try:
+        # Before the parser: it recurses in C, and enough brackets overflow its stack, which no
+        # handler of exceptions sees.
         if _deepest(text) > _LIMIT_DEPTH:
-            raise InputError(f"{where}: nested more than {_LIMIT_DEPTH} deep")
+            raise InputError(
+                f"{where}: expected at most {_LIMIT_DEPTH} levels, got data nested deeper"
+            )
         loader = _Loader(text)
         node = loader.get_single_node()
         if node is None:
             return None
+        # Nodes, not values: they still have lines, doubled keys and aliases that are not written
+        # out.
         _inspect(node, where, 0, set(), [0])
         return loader.construct_document(node)
     except yaml.MarkedYAMLError as e:
@@ -95,6 +108,7 @@ def _load(text: str, where: str) -> Any:
         line = f", line {mark.line + 1}" if mark else ""
         problem = " ".join(str(e.problem or e.context or "broken").split())
         raise InputError(f"{where}{line}: {problem}; expected plain YAML") from e
+    # Constructors raise many kinds for a tag with a wrong value (!!int x, !!timestamp 2024-13-45).
     except (
         yaml.YAMLError,
         ValueError,
@@ -122,6 +136,7 @@ def _deepest(text: str) -> int:
             most = max(most, depth)
         elif character in "]}":
             depth -= 1
+    # Block style nests by indents and by dashes; each width of indent is a level at most.
     indents = {len(line) - len(line.lstrip(" ")) for line in text.splitlines() if line.strip()}
     dashes = max((len(m.group()) // 2 for m in re.finditer(r"(?:- )+", text)), default=0)
     return max(most, len(indents), dashes)
@@ -132,21 +147,31 @@ def _inspect(node: Any, where: str, depth: int, above: set[int], count: list[int
     count[0] += 1
     if count[0] > _LIMIT_NODES or depth > _LIMIT_DEPTH or id(node) in above:
         line = node.start_mark.line + 1
-        raise InputError(f"{where}, line {line}: larger or deeper than any configuration")
+        raise InputError(
+            f"{where}, line {line}: expected at most {_LIMIT_NODES} values in {_LIMIT_DEPTH} "
+            "levels and no alias within itself, got more"
+        )
+    # A new set for each branch: the same alias beside itself is no cycle, within itself it is one.
     above = above | {id(node)}
     if isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
-                raise InputError(f"{where}, line {line}: a key must be a name")
+                raise InputError(
+                    f"{where}, line {line}: expected a name as key, got a list or a mapping"
+                )
             if len(key.value) > _LONGEST_KEY:
                 raise InputError(
                     f"{where}, line {line}: expected a key of at most {_LONGEST_KEY} characters, "
                     f"got {len(key.value)}"
                 )
+            # YAML takes the last of two silently: the first, perhaps the one that is meant, is
+            # lost.
             if key.value in seen and key.value != "<<":
-                raise InputError(f"{where}, line {line}: key {key.value!r} stands here twice")
+                raise InputError(
+                    f"{where}, line {line}: expected each key once, got {key.value!r} twice"
+                )
             seen.add(key.value)
             _inspect(value, where, depth + 1, above, count)
     elif isinstance(node, yaml.SequenceNode):

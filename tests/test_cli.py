@@ -173,7 +173,7 @@ WRONG = {
         lambda c: c["fit"]["free"]["Ixx"].update(start=float("nan")), ["free.Ixx.start", "finite"],
     ),
     "negative inertia": (
-        lambda c: c["fit"]["free"].update(If={"start": -1e-4}), ["If is -0.0001"],
+        lambda c: c["fit"]["free"].update(If={"start": -1e-4}), ["got -0.0001"],
     ),
     "missing column": (
         lambda c: c["flights"][0]["signals"]["outputs"]["roll"].update(signal="ph"),
@@ -202,10 +202,10 @@ WRONG = {
     "missing log": (lambda c: c["flights"][0].update(log="none.csv"), ["none.csv"]),
     "missing vehicle": (lambda c: c.update(vehicle="none.yaml"), ["none.yaml", "no such file"]),
     "rotor at rest": (
-        lambda c: c.update(vehicle={**BENCH_30, "Omega": 0}), ["vehicle", "Omega is 0"],
+        lambda c: c.update(vehicle={**BENCH_30, "Omega": 0}), ["vehicle", "Omega must be"],
     ),
     "paddle inside out": (
-        lambda c: c.update(vehicle={**BENCH_30, "R1": 0.3}), ["R1 is 0.3", "inner"],
+        lambda c: c.update(vehicle={**BENCH_30, "R1": 0.3}), ["got R1 = 0.3", "inner"],
     ),
     "vehicle nan": (
         lambda c: c.update(vehicle={**BENCH_30, "c": float("nan")}), ["vehicle: c", "finite"],

@@ -52,7 +52,7 @@ def test_hover_stays_and_sticks_are_added_to_the_trim(made):
 
 def test_start_wind_pilot_and_ground(made):
     found = made(
-        start={"ahead": 4.0, "climb": -1.0, "heading": 0.5},
+        start={"forward_speed": 4.0, "climb": -1.0, "heading": 0.5},
         wind=[2.0, 0.0, 0.0],
         hold_attitude=True,
         ground=-1.0,
@@ -108,7 +108,9 @@ def test_what_cannot_be_flown(made, simulate, words):
     ids=lambda key: next(iter(key)),
 )
 def test_keys_of_the_whole_helicopter_alone(made, key):
-    with pytest.raises(InputError, match=rf"simulate.{next(iter(key))}: model roll is not a whole"):
+    with pytest.raises(
+        InputError, match=rf"simulate.{next(iter(key))}: model roll is not the full"
+    ):
         made(model="roll", **key)
 
 

@@ -48,7 +48,8 @@ ALLOWED = {
 }  # fmt: skip
 # Entry points may import everything below them, never the command line.
 ENTRY = {
-    "config", "generate", "new_model", "output", "run_directory", "workflow", "cli", "__init__",
+    "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
+    "__init__",
     "__main__",
 }  # fmt: skip
 

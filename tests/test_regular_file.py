@@ -194,7 +194,7 @@ def test_a_sweep_goes_on_only_in_a_directory_of_files(tmp_path, configuration):
 def test_a_file_that_grows_while_it_is_read_is_no_larger_than_stated():
     # A file of /proc is a regular one of no size, and this one of 256 TB.
     assert os.stat("/proc/self/pagemap").st_size == 0
-    with pytest.raises(InputError, match="larger than 1 MB"):
+    with pytest.raises(InputError, match="expected a configuration of at most 1 MB, got more"):
         read_regular("/proc/self/pagemap", "a configuration", 10**6)
 
 
@@ -203,7 +203,7 @@ def test_size_is_the_files_and_the_limit_is_included(tmp_path):
     path.write_bytes(b"x" * 1000)
     assert require_regular(path, "a file", 1000) == 1000
     assert read_regular(path, "a file", 1000) == b"x" * 1000
-    with pytest.raises(InputError, match="larger than 999 bytes, expected a file, got 1 kB"):
+    with pytest.raises(InputError, match="expected a file of at most 999 bytes, got 1 kB"):
         read_regular(path, "a file", 999)
 
 

@@ -153,25 +153,28 @@ def test_source_is_kept():
         ({1: 1.0}, "unknown constant 1"),
         ({"Ixx": None}, "Ixx missing"),
         ({"Ixx": None, "L3": None}, "Ixx, L3 missing"),
-        ({"Ixx": math.nan}, "Ixx: found nan, wanted is a finite number"),
-        ({"Ixx": math.inf}, "Ixx: found inf, wanted is a finite number"),
-        ({"Ixx": -math.inf}, "Ixx: found -inf, wanted is a finite number"),
-        ({"Ixx": 10**400}, "Ixx: found 1000.*, wanted is a finite number"),
-        ({"Ixx": {"value": 1e299, "unit": "kg Mm^2"}}, "Ixx: found"),
-        ({"Omega": 0.0}, "Omega is 0, wanted is more than zero"),
-        ({"Omega": -150.0}, "Omega is -150, wanted is more than zero"),
-        ({"Ixx": -0.024}, "Ixx is -0.024, wanted is more than zero"),
-        ({"If": 0}, "If is 0, wanted is more than zero"),
-        ({"Ixx_added": -1e-3}, "Ixx_added is -0.001, wanted is zero or more"),
-        ({"zeta": -0.1}, "zeta is -0.1, wanted is zero or more"),
-        ({"B": 1.2}, "B is 1.2, wanted is a tip loss factor"),
-        ({"Ixx": "heavy"}, "Ixx: found 'heavy', wanted is a number"),
-        ({"Ixx": True}, "Ixx: found True, wanted is a number"),
-        ({"Ixx": [0.024]}, r"Ixx: found \[0.024\], wanted is a number"),
-        ({"Ixx": {"value": "x"}}, "Ixx: found 'x', wanted is a number"),
-        ({"Ixx": {}}, "Ixx: no value, wanted is a number"),
-        ({"Ixx": {"unit": "kg m^2"}}, "Ixx: no value, wanted is a number"),
-        ({"Ixx": {"value": 1, "units": "kg"}}, "Ixx: unknown key 'units'"),
+        ({"Ixx": math.nan}, "Ixx: expected a finite number, got nan"),
+        ({"Ixx": math.inf}, "Ixx: expected a finite number, got inf"),
+        ({"Ixx": -math.inf}, "Ixx: expected a finite number, got -inf"),
+        ({"Ixx": 10**400}, "Ixx: expected a finite number, got 1000.*"),
+        ({"Ixx": {"value": 1e299, "unit": "kg Mm^2"}}, "Ixx: expected a finite number, got"),
+        ({"Omega": 0.0}, "Omega must be more than zero, got 0"),
+        ({"Omega": -150.0}, "Omega must be more than zero, got -150"),
+        ({"Ixx": -0.024}, "Ixx must be more than zero, got -0.024"),
+        ({"If": 0}, "If must be more than zero, got 0"),
+        ({"Ixx_added": -1e-3}, "Ixx_added must be zero or more, got -0.001"),
+        ({"zeta": -0.1}, "zeta must be zero or more, got -0.1"),
+        ({"B": 1.2}, "B must be a tip loss factor of at most 1, got 1.2"),
+        ({"Ixx": "heavy"}, "Ixx: expected a number, got 'heavy'"),
+        ({"Ixx": True}, "Ixx: expected a number, got True"),
+        ({"Ixx": [0.024]}, r"Ixx: expected a number, got \[0.024\]"),
+        ({"Ixx": {"value": "x"}}, "Ixx: expected a number, got 'x'"),
+        ({"Ixx": {}}, "Ixx: expected a number under value, got none"),
+        ({"Ixx": {"unit": "kg m^2"}}, "Ixx: expected a number under value, got none"),
+        (
+            {"Ixx": {"value": 1, "units": "kg"}},
+            "Ixx: expected the keys value, unit and source, got 'units'",
+        ),
         ({"Ixx": {"value": 1, "unit": "kg"}}, "Ixx: .*a mass.*a moment of inertia"),
         ({"R": {"value": 1, "unit": "deg"}}, "R: .*an angle.*a length"),
         ({"R": {"value": 1, "unit": "metters"}}, "R: unknown unit 'metters'"),
@@ -188,7 +191,7 @@ def test_wrong_constants_are_said_in_one_sentence(changes, said):
 
 
 def test_none_is_no_number():
-    with pytest.raises(InputError, match="Ixx: found None"):
+    with pytest.raises(InputError, match="Ixx: expected a number, got None"):
         vehicle_from_mapping({**BENCH_30, "Ixx": None}, "file.yaml")
 
 

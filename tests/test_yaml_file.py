@@ -143,7 +143,7 @@ def test_nothing_runs(tmp_path):
     [
         (b"\xff\xfe\x00\x01\x02", "not text"),
         (bytes(range(256)) * 10, "not text"),
-        (b"a: 1\n" * 300_000, "larger than 1 MB"),
+        (b"a: 1\n" * 300_000, "of at most 1 MB, got 1.5 MB"),
     ],
 )
 def test_files_that_are_no_text(content, said, tmp_path):

@@ -50,7 +50,14 @@ def cyclic_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar) -> Scalar:
 
     The factor 1/2 is the named parameter `cyclic_moment`; blade-element theory averaged over a
     turn gives 1/8 for two blades, so an inertia found with 1/2 is a number of this model.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta_cyc: cyclic pitch of the blades [rad], eq. 11.
     """
+    # The paper's 1/2 is the default, not 1/8: its Ixx and a can be compared with it alone.
+    # No rate enters here, while a rotor damps the body by -omega/Omega: see `hub_moment`.
     return (p.cyclic_moment * p.rho * p.a * p.c * p.R**4) * Omega**2 * theta_cyc
 
 
@@ -59,9 +66,15 @@ def hub_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar, omega: Scalar) -
 
     $$M = \tfrac18 \rho \Omega^2 a c R^4 (\theta_{cyc} - \omega/\Omega)$$
 
-    In place of eqs 14-15: blade-element theory's factor, and the rotor's damping of the body's
-    rate `omega` [rad/s].
+    In place of eqs 14-15: blade-element theory's factor, and the rotor's damping.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta_cyc: cyclic pitch of the blades [rad], eq. 11.
+        omega: rate of the body about the same axis [rad/s].
     """
+    # Omega^2 (theta - omega/Omega) without the division: finite and smooth with the rotor at rest.
     return (0.125 * p.rho * p.a * p.c * p.R**4) * Omega * (Omega * theta_cyc - omega)
 
 
@@ -75,11 +88,21 @@ def thrust(
       + \tfrac{B^2}{2}\mu\,\theta_{edge}\right], \qquad \lambda = -\nu + \frac{v_i}{R\Omega}$$
 
     `flow.edgewise` holds $\mu R\Omega\,\theta_{edge}$, where the paper has
-    $\theta_{edge} = (x_{roll} + x_{pitch})/L_1$. `vi` is found here unless it is given, as by
-    dynamic inflow.
+    $\theta_{edge} = (x_{roll} + x_{pitch})/L_1$.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0: collective pitch [rad], eq. 18.
+        flow: the air that the rotor meets.
+        vi: induced velocity [m/s]; solved for unless given, as by dynamic inflow.
     """
+    # Blade-element theory has B/2 mu^2 theta0 in the bracket beside these three; the paper drops
+    # it, and the tests' quadrature agrees with eq. 13 up to that term alone.
     half = 0.5 * p.a * solidity(p.R, p.c)
     b = (half * 0.5 * p.B**2 * p.R) * Omega
+    # T over rho pi R^2 is linear in vi, T0 - b vi: so momentum theory, which the paper leaves out,
+    # closes the loop between thrust and inflow with one scalar equation.
     lifting = (half * p.B**3 / 3.0 * p.R**2) * Omega**2 * theta0 + b * flow.edgewise
     T0 = lifting - b * flow.W
     if vi is None:
@@ -94,8 +117,14 @@ def torque(p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, inflow: Sca
       \left(\tfrac{B^3}{3}\theta_0 - \tfrac{B^2}{2}\lambda
       + \tfrac{B^2}{4}\mu\,\theta_{edge}\right)\right]$$
 
-    `inflow` is $\lambda R\Omega$ [m/s].
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0: collective pitch [rad], eq. 18.
+        flow: the air that the rotor meets.
+        inflow: lambda R Omega [m/s], of the same flow by `thrust`.
     """
+    # B^2/4 before mu here, B^2/2 in eq. 13: both are right, the quadrature gives them so.
     sigma = solidity(p.R, p.c)
     scale = p.rho * math.pi * p.R**3
     lifting = (p.B**3 / 3.0 * p.R) * Omega * theta0 - (0.5 * p.B**2) * inflow
@@ -108,7 +137,13 @@ def tail_moment(p: Helicopter, Omega: Scalar, theta0T: Scalar) -> Scalar:
 
     $$M_\psi = \tfrac12\rho\pi R_T^4\Omega_T^2 a_T\sigma_T\tfrac{B^3}{3}\theta_{0T}L_T,
       \qquad \Omega_T = K_\Omega\Omega$$
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0T: pitch of the tail rotor's blades [rad], eq. 17.
     """
+    # No inflow: a yaw rate changes nothing here, so the heading is undamped. See `tail_thrust`.
     scale = 0.5 * p.rho * math.pi * p.R_T**4 * p.a_T * solidity(p.R_T, p.c_T) * p.B**3 / 3.0
     return (scale * p.L_T * p.K_Omega**2) * Omega**2 * theta0T
 
@@ -119,7 +154,12 @@ def tail_thrust(p: Helicopter, Omega: Scalar, theta0T: Scalar, V2: Scalar, W: Sc
     $$T_T = \tfrac12\rho\pi R_T^4\Omega_T^2 a_T\sigma_T
       \left[\tfrac{B^3}{3}\theta_{0T} - \tfrac{B^2}{2}\lambda_T\right]$$
 
-    `V2` and `W` are as in `Flow`, in the tail rotor's plane and against its thrust.
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0T: pitch of the tail rotor's blades [rad], eq. 17.
+        V2: square of the speed in the tail rotor's plane [m^2/s^2].
+        W: speed against its thrust [m/s].
     """
     half = 0.5 * p.a_T * solidity(p.R_T, p.c_T)
     b = (half * 0.5 * p.B**2 * p.R_T * p.K_Omega) * Omega
@@ -135,7 +175,13 @@ def inflow_rate(p: Helicopter, force: RotorForce, V2: Scalar) -> Scalar:
       = T - 2\rho\pi R^2 v_i\sqrt{V^2 + (W + v_i)^2}$$
 
     Source: Carpenter and Fridovich, NACA TN 3044 (1953).
+
+    Args:
+        p: vehicle, SI.
+        force: thrust and inflow of the main rotor.
+        V2: square of the speed in its plane [m^2/s^2].
     """
+    # 0.637 is theirs: the share of a sphere of air with the rotor's radius that takes part.
     # A little flow is always there: the root has a derivative even where nothing moves.
     through = jnp.sqrt(V2 + force.inflow**2 + 1e-16)
     area = math.pi * p.R**2

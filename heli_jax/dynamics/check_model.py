@@ -19,6 +19,10 @@ from heli_jax.dynamics.model import Model
 _RECORDS = ("Params", "State", "Inputs", "Outputs")
 
 
+# What is checked here is anyone's: the parameters annotated Any are whatever a user has passed, and
+# what their functions have returned.
+
+
 def check_model(model: Any, *, traceable: bool = True) -> None:
     """Refuse what is no Model, and a Model whose functions cannot be traced or return something
     else than is expected. A model is looked at once; later calls cost a look-up.
@@ -26,7 +30,7 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     Args:
         model: what should be a Model.
         traceable: whether parameters, states and inputs are all traced, as in a fit or a sweep.
-            Without it only the return values are judged: parameters that stay plain numbers may
+            Without it only the return values are checked: parameters that stay plain numbers may
             be branched on.
 
     Raises:
@@ -43,6 +47,8 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
         return
     parts = _Parts(*(getattr(model, name) for name in _Parts._fields))
+    # The check traces every function: once for each set of functions and classes, not
+    # for each call of `simulate`.
     try:
         hash(parts)
     except TypeError:  # such as a function with arrays in it
@@ -80,6 +86,9 @@ def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         model = args[0] if args else kwargs.get("model")
         check_model(model, traceable=False)
+        # Whether all is traced is not known beforehand: parameters that are plain numbers may be
+        # branched on. So the full check is made only after a failure, and where it finds nothing
+        # the failure was not the model's.
         try:
             return function(*args, **kwargs)
         except Exception:
@@ -90,6 +99,7 @@ def explained[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _check(model: _Parts, traceable: bool) -> None:
+    # The classes first: functions are traced with records of them.
     for role in _RECORDS:
         _check_record(model, role)
 
@@ -122,6 +132,7 @@ def _check_record(model: _Parts, role: str) -> None:
             f"model {model.name!r}: {role}: {expected}, got {record.__name__}, whose fields "
             f"cannot be told ({type(e).__name__}: {said})"
         ) from e
+    # A machine without inputs may fall; one without states has nothing to integrate.
     if not names and role != "Inputs":
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
 
@@ -146,31 +157,38 @@ class _Function:
     def returns(self, role: str) -> None:
         """Refuse a return value that is no record of that role, with one number a field."""
         record = getattr(self.model, role)
-        self.traced(lambda found: self.check_fields(found, record, role))
+        self.traced(lambda returned: self.check_fields(returned, record, role))
 
     def returns_by_name(self, known: tuple[str, ...] | None) -> None:
         """Refuse a return value that is no dictionary of numbers, by some of the known names."""
 
-        def check(found: Any) -> None:
-            if not isinstance(found, dict):
-                self.refuse(f"expected a dictionary by name, got {_kind(found)}")
-            for name, value in found.items():
+        def check(returned: Any) -> None:
+            if not isinstance(returned, dict):
+                self.refuse(f"expected a dictionary by name, got {_kind(returned)}")
+            for name, value in returned.items():
                 if known is not None and name not in known:
                     self.refuse(f"expected names of states ({', '.join(known)}), got {name!r}")
                 self.check_number(name, value)
 
         self.traced(check)
 
-    def check_fields(self, found: Any, record: type, role: str) -> None:
+    def check_fields(self, returned: Any, record: type, role: str) -> None:
+        """Refuse a return value that is no such record.
+
+        Args:
+            returned: what the function gave, of tracers.
+            record: the class that was expected.
+            role: its role in the model.
+        """
         fields = ", ".join(f"{n}=..." for n in naming.names(record)[:4])
         more = ", ..." if len(naming.names(record)) > 4 else ""
         expected = f"expected the model's {role}, as `return {record.__name__}({fields}{more})`"
         # Another class with the same fields serves for outputs; states are added to one another.
-        alike = role == "Outputs" and all(hasattr(found, n) for n in naming.names(record))
-        if not (isinstance(found, record) or alike):
-            self.refuse(f"{expected}, got {_kind(found)}")
+        alike = role == "Outputs" and all(hasattr(returned, n) for n in naming.names(record))
+        if not (isinstance(returned, record) or alike):
+            self.refuse(f"{expected}, got {_kind(returned)}")
         for name in naming.names(record):
-            self.check_number(name, getattr(found, name))
+            self.check_number(name, getattr(returned, name))
 
     def check_number(self, name: str, value: Any) -> None:
         try:
@@ -193,7 +211,8 @@ class _Function:
     def traced(self, check: Callable[[Any], None]) -> None:
         """Call the function with tracers, and look at what it returns while they last."""
         classes = [getattr(self.model, a.capitalize()) for a in self.arguments]
-        one = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        # Shapes and types alone: nothing is computed, so a model may take as long as it likes.
+        number = jax.ShapeDtypeStruct((), jnp.result_type(float))
 
         def call(numbers: list[list[Any]]) -> None:
             try:
@@ -204,16 +223,17 @@ class _Function:
             except Exception:  # a class that looks at its values has to do without this check
                 return
             try:
-                found = self.function(*records)
+                returned = self.function(*records)
             except Exception as e:
                 if self.traceable:
                     self.refuse(_words(e), e)
                 return
-            check(found)
+            check(returned)
 
-        jax.eval_shape(call, [[one] * len(naming.names(record)) for record in classes])
+        jax.eval_shape(call, [[number] * len(naming.names(record)) for record in classes])
 
 
+# Arguments in another order are the most common mistake, and show as a missing attribute.
 def _words(e: Exception) -> str:
     """What went wrong in a function, with the remedy where it is known."""
     if isinstance(e, jax.errors.TracerBoolConversionError):
@@ -259,6 +279,7 @@ def _kind(value: Any) -> str:
 
 def _bare(function: Any) -> Any:
     """The function within partial applications and other wrappers."""
+    # functools.partial has `func`, jit and functools.wraps have `__wrapped__`.
     while True:
         inner = getattr(function, "func", None) or getattr(function, "__wrapped__", None)
         if inner is None or not callable(inner):
@@ -281,6 +302,8 @@ def _line(function: Any, cause: BaseException | None) -> str:
         return ""
     line = code.co_firstlineno
     if cause is not None:
+        # The deepest line in the function's own file: deeper ones are JAX's and tell the user
+        # nothing.
         inside = [
             frame.lineno
             for frame in traceback.extract_tb(cause.__traceback__)

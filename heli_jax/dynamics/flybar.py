@@ -16,8 +16,13 @@ def cyclic_pitch(p: Helicopter, x_cyc: Scalar, beta: Scalar) -> Scalar:
 
     $$\theta_{cyc} L_1 = \frac{L_3}{L_2+L_3} x_{cyc} + \frac{L_2 L_4}{L_2+L_3} \beta$$
 
-    `x_cyc` is the cyclic input displacement [m], `beta` the flybar's flapping angle [rad].
+    Args:
+        p: vehicle, SI.
+        x_cyc: cyclic input displacement [m].
+        beta: flapping angle of the flybar [rad].
     """
+    # L3/(L2 + L3) is the Bell path, straight from the stick; L2 L4/(L2 + L3) the Hiller path by way
+    # of the bar. L2 and L3 enter by their ratio alone: freed together they are not identifiable.
     return (1.0 / (p.L1 * (p.L2 + p.L3))) * (p.L3 * x_cyc + (p.L2 * p.L4) * beta)
 
 
@@ -30,6 +35,9 @@ def flapping_rate_gain(p: Helicopter) -> Scalar:
 
 
 def _paddle(p: Helicopter) -> Scalar:
+    # R2 is the outer and R1 the inner end of the paddle. The paper's nomenclature names them the
+    # other way round, which would make the bracket, and the damping of eq. 12, negative.
+    # 1/8 is one paddle: an If that is identified with eq. 12 is half the inertia of the whole bar.
     return p.rho * paddle_lift_slope(p) * paddle_chord(p) * (p.R2**4 - p.R1**4) / (8.0 * p.If)
 
 
@@ -56,10 +64,16 @@ def flapping_acceleration(
     $$I_f \ddot\beta + \Omega^2 I_f \beta = \tfrac18 \rho \Omega^2 a c
       \left(\frac{x_{cyc}}{L_5} - \frac{\dot\beta + \omega}{\Omega}\right)(R_2^4 - R_1^4)$$
 
-    `Omega` is the rotor's speed, `omega` the body's rate about the same axis [rad/s]. The paper's
-    text prints $\beta + \omega/\Omega$; only $\dot\beta$ agrees in units and gives the
-    denominator of eq. 23.
+    Args:
+        p: vehicle, SI.
+        Omega: rotor speed [rad/s].
+        x_cyc: cyclic input displacement [m].
+        beta: flapping angle [rad], and its derivative `dbeta` [rad/s].
+        dbeta: see `beta`.
+        omega: rate of the body about the same axis [rad/s].
     """
+    # The text of the paper reads beta + omega/Omega in the bracket (dots over symbols get lost in
+    # it). Only (dbeta + omega)/Omega has one unit, and only it gives c1 = k1/Omega in eq. 23.
     pull = (Omega * (1.0 / p.L5)) * x_cyc - (dbeta + omega)
     return (_paddle(p) * Omega) * pull - (Omega**2) * beta
 
@@ -69,6 +83,7 @@ def flybar_time_constant(p: Helicopter, Omega: Scalar) -> Scalar:
 
     Two paddles and the inertia of the whole bar, where eq. 12 has one paddle.
     """
+    # The same number as _paddle: two paddles, but 1/4 with K and the 2 of tau make 1/8 again.
     return 1.0 / (_paddle(p) * Omega)
 
 
@@ -77,7 +92,17 @@ def flybar_rate(p: Helicopter, Omega: Scalar, x_cyc: Scalar, beta: Scalar, omega
 
     $$\dot\beta = (x_{cyc}/L_5 - \beta)/\tau - \omega$$
 
-    Eq. 12 is an equation of the rotating frame driven by inputs of the fixed one; averaged over a
-    turn the bar is of first order, with the time constant of `flybar_time_constant`.
+    In place of eq. 12, with the time constant of `flybar_time_constant`.
+
+    Args:
+        p: vehicle, SI.
+        Omega: rotor speed [rad/s].
+        x_cyc: cyclic input displacement [m].
+        beta: tilt of the bar's plane [rad].
+        omega: rate of the body about the same axis [rad/s].
     """
+    # Eq. 12 is an equation of the rotating frame, driven by inputs of the fixed one: at its own
+    # frequency Omega the bar is in resonance, and a constant stick is far below it. Simulated in
+    # the rotating frame the bar settles at x/L5; eq. 12 settles at a twentieth of that, and its
+    # rate feedback is some 400 times too weak. Averaged over a turn the bar is of first order.
     return (_paddle(p) * Omega) * ((1.0 / p.L5) * x_cyc - beta) - omega

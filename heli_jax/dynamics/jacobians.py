@@ -1,6 +1,6 @@
 """Derivatives of a model about a point: the matrices that nobody writes by hand."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model, field_and_output, zeros
+from heli_jax.naming import Record
 
 
 class StateSpace(NamedTuple):
@@ -23,14 +24,21 @@ class StateSpace(NamedTuple):
 
 @explained
 @eqx.filter_jit
-def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) -> StateSpace:
-    """The model's A, B, C, D at a state and inputs, by forward mode.
+def jacobians(
+    model: Model, params: Record, state: Record | None = None, inputs: Record | None = None
+) -> StateSpace:
+    """The model's A, B, C, D at a state and inputs.
 
-    Unless given the state is the model's initial one and the inputs are zero.
+    Args:
+        model: of one machine, with n states, m inputs and p outputs.
+        params: the model's Params, SI.
+        state: where to differentiate; the model's initial state unless given.
+        inputs: likewise; zero unless given.
 
     Raises:
         ValueError: the model's functions cannot be traced; TypeError: it is no Model.
     """
+    # The dtype of the parameters: a float32 vehicle has float32 matrices, in a float64 session too.
     dtype = jnp.result_type(*(jnp.asarray(v).dtype for v in jax.tree.leaves(params)))
     dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
     x = model.initial_state(params) if state is None else state
@@ -41,6 +49,8 @@ def jacobians(model: Model, params: Any, state: Any = None, inputs: Any = None) 
         rates, outputs = field_and_output(model, params, state, inputs)
         return naming.ravel(rates, dtype), naming.ravel(outputs, dtype)
 
+    # Forward mode: as many columns as states and inputs, and no graph of the model is kept. Rates
+    # and outputs in one pass, since they share most of what they compute.
     at_state, at_inputs = naming.ravel(x, dtype), naming.ravel(u, dtype)
     (A, B), (C, D) = jax.jacfwd(rates_and_outputs, argnums=(0, 1))(at_state, at_inputs)
     return StateSpace(A, B, C, D)

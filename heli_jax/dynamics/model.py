@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.naming import Record
 
 
 class Axis(NamedTuple):
@@ -58,6 +59,8 @@ class Model(eqx.Module):
     equations. A model that leaves them out has what its names say: see `axes_of`.
     """
 
+    # All static: a model is what is compiled, and its numbers are parameters. Two models are the
+    # same program where they have the same functions and classes, so these are made once and kept.
     name: str = eqx.field(static=True)
     vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
     output: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
@@ -110,16 +113,17 @@ class Model(eqx.Module):
         """The states that are random at the first sample."""
         if self.initial_sd is None:
             return ()
+        # Names alone are asked for, and they may not depend on parameters: any numbers will do.
         return tuple(self.initial_sd(self.Params(**dict.fromkeys(naming.names(self.Params), 1.0))))
 
-    def initial_state(self, params: Any) -> Any:
+    def initial_state(self, params: Record) -> Record:
         """The state at the first sample: `start(params)`, or all zeros."""
         if self.start is not None:
             return self.start(params)
         return zeros(self.State)
 
 
-def zeros(record: type, dtype: Any = None) -> Any:
+def zeros(record: type, dtype: DTypeLike | None = None) -> Record:
     """A record of scalar zeros of the default float type (or `dtype`)."""
     dtype = jnp.result_type(float) if dtype is None else dtype
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
@@ -138,6 +142,8 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
     whose rate is among its states under the name that it has in the models here."""
     if model.axes is not None:
         return model.axes
+    # A model of one's own that names its states as here gets disturbances and the stand for
+    # nothing; one with other names states its axes.
     states = naming.names(model.State)
     return tuple(
         axis._replace(
@@ -149,7 +155,7 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
     )
 
 
-def initial_sd_of(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, " n"]:
+def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array, " n"]:
     """The standard deviations (n,) of all states at the first sample; zero where not random.
 
     Args:
@@ -162,8 +168,13 @@ def initial_sd_of(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "
     return naming.ravel(model.State(**{n: random.get(n, 0.0) for n in states}), dtype)
 
 
-def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
+def correlation_of(model: Model, params: Record, dtype: DTypeLike) -> Array:
     """The correlation matrix (n, n) of all states at the first sample.
+
+    Args:
+        model: with n states.
+        params: the model's Params.
+        dtype: of the result.
 
     Raises:
         ValueError: the model correlates a state that is not random there.
@@ -172,6 +183,7 @@ def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
     matrix = jnp.eye(len(names), dtype=dtype)
     pairs = model.correlation(params) if model.correlation is not None else {}
     for pair, value in pairs.items():
+        # A correlation with a state that is known would be lost without a word: its sd is zero.
         if not set(pair) <= set(random):
             raise ValueError(
                 f"model {model.name}: correlation of {' and '.join(pair)}: expected two of the "
@@ -183,18 +195,19 @@ def correlation_of(model: Model, params: Any, dtype: Any) -> Array:
     return matrix
 
 
-def linear_misfit(model: Model, params: Any) -> float:
+def linear_misfit(model: Model, params: Record) -> float:
     """How far a model is from `linear=True`: 0 where f(x, u) and h(x, u) are linear, else ~1.
 
     Compares f and h at two states with the sum of both, relative to their size. Concrete
     parameters only.
     """
+    # A seed of its own: the answer must not depend on who drew before.
     rng = np.random.default_rng(7)
 
-    def draw(record: type) -> Any:
+    def draw(record: type) -> Record:
         return record(**{n: np.float64(rng.standard_normal()) for n in naming.names(record)})
 
-    def both(state: Any, inputs: Any) -> np.ndarray:
+    def both(state: Record, inputs: Record) -> np.ndarray:
         with np.errstate(all="ignore"):
             rates, outputs = field_and_output(model, params, state, inputs)
         return np.array([float(v) for v in jax.tree.leaves((rates, outputs))])
@@ -205,18 +218,28 @@ def linear_misfit(model: Model, params: Any) -> float:
         summed = both(jax.tree.map(np.add, x1, x2), jax.tree.map(np.add, u1, u2))
         parts = both(x1, u1) + both(x2, u2)
         size = np.max(np.abs(summed)) + np.max(np.abs(parts))
+        # The sum of the parts is compared, so an offset (gravity, say) shows as well as a curve.
         return float(np.max(np.abs(summed - parts)) / max(size, 1e-300))
 
 
-def field_and_output(model: Model, params: Any, state: Any, inputs: Any) -> tuple[Any, Any]:
-    """The model's rates and outputs at one point."""
+def field_and_output(
+    model: Model, params: Record, state: Record, inputs: Record
+) -> tuple[Any, Any]:
+    """The model's rates and outputs at one point.
+
+    Args:
+        model: of one machine.
+        params: the model's Params, SI.
+        state: the model's State.
+        inputs: the model's Inputs.
+    """
     return (
         model.vector_field(params, state, inputs),
         model.output(params, state, inputs),
     )
 
 
-def plain(record: Any, **changes: Any) -> Any:
+def plain(record: Record, **changes: Any) -> Record:
     """A record of concrete numbers, some of them changed, as NumPy scalars: quicker than JAX
     outside jit."""
     values = {n: np.float64(v) for n, v in {**naming.asdict(record), **changes}.items()}
@@ -229,25 +252,34 @@ def plain(record: Any, **changes: Any) -> Any:
     return made
 
 
-def needed_but_missing(model: Model, params: Any) -> list[str]:
+def needed_but_missing(model: Model, params: Record) -> list[str]:
     """The parameters that are NaN (not given) and that the model reads, in field order."""
+    # NaN goes through every operation that uses it: what the model reads shows at the end. One that
+    # may be left out (c_paddle) has another in its place by jnp.where, and does not show.
     params = plain(params)
-    open_ = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
-    return [n for n in open_ if np.isnan(_at_one(model, params, n, np.nan)).any()]
+    missing = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    return [n for n in missing if np.isnan(_at_one(model, params, n, np.nan)).any()]
 
 
-def reads(model: Model, params: Any, name: str) -> bool:
-    """Whether the rates or the outputs depend on a parameter, where states and inputs are one."""
+def reads(model: Model, params: Record, name: str) -> bool:
+    """Whether the rates or the outputs depend on a parameter, where states and inputs are one.
+
+    Args:
+        model: of one machine.
+        params: the model's Params; concrete numbers.
+        name: of the parameter.
+    """
     if np.isnan(_at_one(model, params, name, np.nan)).any():
         return True
     # One that may be left out has another in its place where it is NaN.
-    given, larger = (_at_one(model, params, name, value) for value in (1.0, 2.0))
-    return not np.array_equal(given, larger, equal_nan=True)
+    at_one, at_two = (_at_one(model, params, name, value) for value in (1.0, 2.0))
+    return not np.array_equal(at_one, at_two, equal_nan=True)
 
 
-def _at_one(model: Model, params: Any, name: str, value: float) -> np.ndarray:
+def _at_one(model: Model, params: Record, name: str, value: float) -> np.ndarray:
     """Rates and outputs where states, inputs and what is not given are one, and a parameter is
     `value`."""
+    # One and not zero: a parameter that multiplies a state or another parameter must show.
     one = np.float64(1.0)
     others = {n: one for n, v in naming.asdict(params).items() if np.isnan(v)}
     filled = plain(params, **{**others, name: value})

@@ -7,17 +7,20 @@ README on where the paper and physics part.
 
 import dataclasses
 import functools
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import core
+from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.aerodynamics import cyclic_moment
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.flybar import cyclic_pitch, flapping_acceleration, flapping_rate_gain
 from heli_jax.dynamics.model import PITCH, ROLL, Axis, Model, axes_of
-from heli_jax.naming import Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.vehicle import Helicopter
 
 
@@ -68,12 +71,26 @@ def roll_acceleration(p: Helicopter, x_roll: Scalar, beta: Scalar) -> Scalar:
 
     $$\ddot\phi = \frac{\rho\Omega^2 a c R^4}{2 I_{xx} L_1 (L_2+L_3)}
       (L_3 x_{roll} + L_2 L_4 \beta)$$
+
+    Args:
+        p: vehicle, SI.
+        x_roll: cyclic input displacement [m].
+        beta: flapping angle of the flybar about the same axis [rad].
     """
+    # `a` enters eqs 21-22 as a/If and a/Ixx alone: Ixx, If and a times one number change nothing.
+    # Roll data therefore give two ratios; the third number takes a prior or an added inertia.
     return (1.0 / roll_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_roll, beta))
 
 
 def pitch_acceleration(p: Helicopter, x_pitch: Scalar, beta: Scalar) -> Scalar:
-    """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll."""
+    """Pitch acceleration [rad/s^2]: eqs 6, 11 and 15 as eq. 22 has them for roll.
+
+    Args:
+        p: vehicle, SI.
+        x_pitch: cyclic input displacement [m].
+        beta: flapping angle of the flybar about the same axis [rad].
+    """
+    # Without eq. 6's -T lr: in hover trim balances it, and this is the motion about trim.
     return (1.0 / pitch_inertia(p)) * cyclic_moment(p, p.Omega, cyclic_pitch(p, x_pitch, beta))
 
 
@@ -152,10 +169,13 @@ def on_stand(model: Model) -> Model:
     if not axes:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
-    def vector_field(p: Any, s: Any, u: Any) -> Any:
+    def vector_field(p: Record, s: Record, u: Record) -> Record:
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)
+            # kappa and zeta are per unit of the machine's own inertia: the stand is a spring, and a
+            # known inertia that is bolted on slows it. So runs with and without it share them,
+            # which is what tells a from Ixx.
             pull = p.kappa * getattr(s, str(axis.angle)) + p.zeta * getattr(s, axis.rate)
             slowed = getattr(rates, axis.rate) - (inertia / (inertia + added)) * pull
             rates = naming.replace(rates, **{axis.rate: slowed})
@@ -166,7 +186,7 @@ def on_stand(model: Model) -> Model:
     )
 
 
-def _inertias(p: Any, axis: Axis) -> tuple[Scalar, Scalar]:
+def _inertias(p: Record, axis: Axis) -> tuple[Scalar, Scalar]:
     """An axis's own inertia and what is added to it [kg m^2]."""
     return getattr(p, str(axis.inertia)), getattr(p, str(axis.added_inertia))
 
@@ -184,13 +204,17 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
     $$H = \frac{d_1 s^2 + d_2 s + d_3}{s(s^3 + c_1 s^2 + c_2 s + c_3)}$$
 
     On the stand the denominator is $(s^2 + \zeta s + \kappa)(s^2 + c_1 s + c_2) + c_3 s$.
-    The second numerator $d_3 = k_2 (L_3\Omega^2 + L_2 L_4 k_1/L_5)$. num has 3, den 5 numbers.
+    num has 3, den 5 numbers.
     """
+    # Written out by hand beside the model that `linearize` differentiates: a test compares the two.
     k1 = flapping_rate_gain(p)
     k2 = cyclic_moment(p, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
     share = p.Ixx / roll_inertia(p)
     c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
+    # Zeros and ones made of k1 have its type and its batch axis.
     kappa, zeta = (share * p.kappa, share * p.zeta) if stand else (0.0 * k1, 0.0 * k1)
+    # The last is d3 = k2 (L3 Omega^2 + L2 L4 k1/L5). Stable, beside the pole at the origin, if and
+    # only if Omega^2 > k2 L2 L4 (Routh).
     num = (k2 * p.L3, k1 * k2 * p.L3 / p.Omega, k2 * (p.L3 * c2 + p.L2 * p.L4 * k1 / p.L5))
     one = k1 / k1
     den = (one, c1 + zeta, c2 + zeta * c1 + kappa, zeta * c2 + kappa * c1 + c3, kappa * c2)
@@ -207,15 +231,22 @@ class Ratios(NamedTuple):
     """the coefficient of s^2 that the other coefficients and Omega ask for"""
 
 
-def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Ratios:
+def ratios_from_denominator(
+    p: Helicopter, den: Sequence[Scalar] | np.ndarray | Array, angle: str = "roll"
+) -> Ratios:
     r"""a/Ixx and a/If from the denominator of an identified fourth-order H(s), eq. 23.
 
-    `den` holds (1, p1, p2, p3, p4), highest power first, of the angle `roll` or `pitch`. The
-    stand's damping zeta, the geometry and Omega are taken from `p`; the stand's stiffness is read
-    from p4 = kappa c2. With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and
-    k2 follow. Where `a_paddle` is given (concrete), the paddle's lift slope is not `a` and k1 is
-    a_paddle/If. What the model says of p2 = c2 + zeta c1 + kappa is left over as a check.
+    With $c_1 = p_1 - \zeta$ and $c_3 = p_3 - \zeta c_2 - \kappa c_1$, k1 and k2 follow. Where
+    `a_paddle` is given (concrete), the paddle's lift slope is not `a` and k1 is a_paddle/If.
+
+    Args:
+        p: vehicle, SI, of which the stand's zeta, the geometry and Omega are taken.
+        den: (1, p1, p2, p3, p4), highest power of s first.
+        angle: `roll` or `pitch`.
     """
+    # Five unknowns are not in four coefficients: zeta is taken as known, kappa is read from
+    # p4 = kappa c2, and Omega is measured. What p2 = c2 + zeta c1 + kappa should be is then left
+    # over as a check: an identified model that misses it by far is not this model.
     axis = {"roll": ROLL, "pitch": PITCH}[angle]
     inertia, added = _inertias(p, axis)
     zeta, c2 = p.zeta * inertia / (inertia + added), p.Omega**2
@@ -225,6 +256,7 @@ def ratios_from_denominator(p: Helicopter, den: Any, angle: str = "roll") -> Rat
     k1 = c1 * p.Omega
     k2 = c3 * p.Omega / (k1 * p.L2 * p.L4)
     slope = "a_paddle" if _is_given(p.a_paddle) else "a"
+    # Moment and k1 are proportional to a and to 1/If: at one they are the factors of the ratios.
     unit_a = naming.replace(p, **{"a": 1.0, "If": 1.0, slope: 1.0})
     moment_per_a = cyclic_moment(unit_a, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3)))
     over = f"a/{axis.inertia}"

@@ -10,21 +10,26 @@ from typing import Any
 import jax
 from jax import core
 from jax.extend.core import Literal
+from jaxtyping import PyTree
 
 
 def hoisted(
-    function: Callable[..., Any], params: Any, *others: Any
+    function: Callable[..., Any], params: PyTree, *others: PyTree
 ) -> tuple[list[Any], Callable[..., Any]]:
     """A function of params and others in two parts.
 
     Returns values that depend on params alone, and a function of these and of others that gives
-    what `function(params, *others)` does, operation for operation. `others` are examples: their
-    shapes and types count. XLA itself takes little out of a loop, and with a batch of vehicles
-    every division of one parameter by another would be made at every step.
+    what `function(params, *others)` does, operation for operation.
+
+    Args:
+        function: of params and others, anything that JAX can trace.
+        params: what stays the same at every step; its leaves may be tracers.
+        *others: examples of what changes; their shapes and types count.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(params, *others)
     jaxpr, structure = closed.jaxpr, jax.tree.structure(shape)
     leaves = jax.tree.leaves(params)
+    # The variables of params come first among the inputs, so that zip ends where they do.
     known = dict(zip(jaxpr.invars, leaves, strict=False))
     known |= dict(zip(jaxpr.constvars, closed.consts, strict=True))
     later = []
@@ -40,11 +45,14 @@ def hoisted(
         )  # fmt: skip
         computed = core.eval_jaxpr(alone, (), *(known[v] for v in inputs))
         known |= dict(zip(equation.outvars, computed, strict=True))
+    # Of all that was computed only what a later equation or the result asks for is handed on; the
+    # dictionary keeps an order that does not change between runs, or nothing would be found in the
+    # cache of compiled programs.
     needed = [v for e in later for v in e.invars] + list(jaxpr.outvars)
     kept = list(dict.fromkeys(v for v in needed if not isinstance(v, Literal) and v in known))
     rest = jaxpr.replace(eqns=later, constvars=kept, invars=jaxpr.invars[len(leaves) :])
 
-    def remaining(values: list[Any], *others: Any) -> Any:
+    def remaining(values: list[Any], *others: PyTree) -> PyTree:
         leaves = core.eval_jaxpr(rest, values, *jax.tree.leaves(others))
         return jax.tree.unflatten(structure, leaves)
 

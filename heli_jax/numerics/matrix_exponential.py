@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from heli_jax.naming import Scalar
 
@@ -43,35 +43,43 @@ def expm(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.custom_batching.custom_vmap
 def _side_by_side(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The exponential where no derivative is wanted, as in sweeps."""
+    """The exponential without derivatives, as in sweeps."""
     return _many(M[:, :, None])[:, :, 0]
 
 
 @_side_by_side.def_vmap
-def _side_by_side_batched(size: int, batched: Any, M: Any) -> Any:
+def _side_by_side_batched(
+    size: int, batched: list[bool], M: Float[Array, "L n n"]
+) -> tuple[Float[Array, "L n n"], bool]:
     # Matrices last beside each other, so that the processor takes several of them at a time.
     return jnp.moveaxis(_many(jnp.moveaxis(M, 0, 2)), 2, 0), True
 
 
 def _many(M: Float[Array, "n n L"]) -> Float[Array, "n n L"]:
     """The exponentials of L matrices, with no more squarings than one of them needs."""
+    # A flybar has Omega^2 = 2e4 beside 1 in its A: balanced, the norm falls to about Omega, and
+    # with it seven squarings. Powers of two, so that nothing is rounded.
     d = _balance(M)
     X = M * (d[None, :] / d[:, None])
     s = _halvings(X)[None, None]
     E = _taylor(X * jnp.exp2(-s))
     count = jnp.max(jnp.where(s <= _SQUARINGS, s, 0.0)).astype(int)
+    # Each matrix is squared as often as itself needs: one more squaring would be another number.
     E = jax.lax.fori_loop(0, count, lambda i, E: jnp.where(i < s, product(E, E), E), E)
     E = jnp.where(s <= _SQUARINGS, E, jnp.nan)
     return E * (d[:, None] / d[None, :])
 
 
 @expm.defjvp
-def _expm_jvp(primals: Any, tangents: Any) -> Any:
+def _expm_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    # A loop whose length depends on its input has no reverse mode, so derivatives go through the
+    # other form; the value comes from there too, and differs in the last digit at most.
     return jax.jvp(_expm_in_loops, primals, tangents)
 
 
 def _expm_in_loops(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The same in loops of fixed length, which have derivatives of both modes."""
+    # The result does not depend on d and s but for rounding: no derivative goes through them.
     d = _balance(jax.lax.stop_gradient(M))
     X = M * (d[None, :] / d[:, None])
     s = _halvings(X)
@@ -82,6 +90,7 @@ def _expm_in_loops(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def _taylor(X: Float[Array, "n n *L"]) -> Float[Array, "n n *L"]:
     eye = _eye(X)
     # Loops rather than unrolled sums: they run as fast and compile in half the time.
+    # Horner's scheme, from the highest term.
     degrees = jnp.arange(_DEGREE, 0, -1, dtype=X.dtype)
     begin = jnp.broadcast_to(eye, X.shape)
     return jax.lax.scan(lambda E, k: (eye + product(X, E) / k, None), begin, degrees)[0]
@@ -99,10 +108,11 @@ def _halvings(X: Float[Array, "n n *L"]) -> Float[Array, "*L"]:
     return jnp.ceil(jnp.log2(jnp.maximum(norm, _THETA) / _THETA))
 
 
-def _doubled(s: Float[Array, ""], double: Callable[[Any], Any], first: Any) -> Any:
+def _doubled(s: Float[Array, ""], double: Callable[[Any], Any], first: PyTree) -> PyTree:
     """`double` applied s times; NaN where that is too often."""
 
-    def step(i: Array, value: Any) -> Any:
+    # A fixed number of passes with a branch in each, not a loop of s: that has no reverse mode.
+    def step(i: Array | int, value: PyTree) -> PyTree:
         return jax.lax.cond(i < s, double, lambda value: value, value)
 
     last = jax.lax.fori_loop(0, _SQUARINGS, step, first)
@@ -131,18 +141,20 @@ def van_loan(
         g: the noise intensity, states per second times sqrt(s).
         h: the step [s], a number.
 
-    The series of a fraction of the step, doubled until it is whole. The integrals are those that
-    Van Loan (1978) takes from exponentials of larger matrices; these hold e^{-A h}, and no digit
-    of them is left where a mode decays fast. Where the norm is past what `expm` takes the result
-    is NaN.
+    Where the norm is past what `expm` takes the result is NaN.
     """
+    # The series of a fraction of the step, doubled until it is whole. Van Loan (1978) takes the
+    # same integrals from exponentials of larger matrices; these hold e^{-A h}, and no digit of them
+    # is left where a mode decays fast.
     d = _balance(jax.lax.stop_gradient(A))
     X = A * (d[None, :] / d[:, None]) * h
     s = _halvings(X)
     X, h = X * jnp.exp2(-s), h * jnp.exp2(-s)
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
-    def term(carry: Any, k: Array) -> Any:
+    # Terms of degree k of e^{A h}, of the integral of e^{A s} f and of that of e^{A s} g g^T e^{A^T
+    # s}, each from the one before.
+    def term(carry: PyTree, k: Array) -> tuple[PyTree, None]:
         (P, m, M), total = carry
         XM = product(X, M)
         new = (
@@ -156,8 +168,9 @@ def van_loan(
     degrees = jnp.arange(1, _DEGREE + 1, dtype=A.dtype)
     (_, total), _ = jax.lax.scan(term, (first, first), degrees)
 
-    def double(whole: Any) -> Any:
+    def double(whole: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         P, m, M = whole
+        # Symmetric by force: else rounding grows with each doubling, and Q has no root.
         through = product(product(P, M), P.T)
         return product(P, P), m + jnp.sum(P * m[None, :], axis=1), M + 0.5 * (through + through.T)
 
@@ -167,6 +180,8 @@ def van_loan(
 
 def product(X: Float[Array, "n k *L"], Y: Float[Array, "k m *L"]) -> Float[Array, "n m *L"]:
     """X Y; for small k as a sum of outer products, which takes a batch of them 5 times faster."""
+    # A matrix product calls a routine that is made for large matrices; sums fuse with what is
+    # around them.
     inner = X.shape[1]
     if inner > _SMALL:
         return X @ Y if X.ndim == 2 else jnp.einsum("ijl,jkl->ikl", X, Y)

@@ -5,10 +5,10 @@
 # `experiments/benchmarks/helicopter.py`; this polynomial is vectorised with the rest.
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from heli_jax.naming import Scalar
 
@@ -29,6 +29,8 @@ def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
     x = jnp.asarray(x)
     if x.dtype != jnp.float64:
         return jnp.sin(x), jnp.cos(x)
+    # Only sines are summed: the cosine is a sine a right angle away, with the same series, and both
+    # are evaluated where |r| <= pi/2. Half turns k and m + 1/2 are the nearest ones.
     k = jnp.round(x * (1.0 / math.pi))
     m = jnp.round(x * (1.0 / math.pi) - 0.5)
     return _sign(k) * _sine_past(x, 2.0 * k), -_sign(m) * _sine_past(x, 2.0 * m + 1.0)
@@ -36,12 +38,14 @@ def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
 
 def _sign(k: Scalar) -> Scalar:
     """1 for even k and -1 for odd."""
+    # Without integers: a conversion is slow, and k may be past what an int32 holds.
     half = 0.5 * k
     return 1.0 - 4.0 * (half - jnp.floor(half))
 
 
 def _sine_past(x: Scalar, right_angles: Scalar) -> Scalar:
     """The sine of x less so many right angles, which is a right angle or less."""
+    # Part by part (Cody and Waite): one product with pi/2 would lose what x and it have in common.
     r = x
     for part in _RIGHT_ANGLE:
         r = r - right_angles * part
@@ -52,6 +56,9 @@ def _sine_past(x: Scalar, right_angles: Scalar) -> Scalar:
 
 
 @sincos.defjvp
-def _sincos_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _sincos_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
+    # The derivative is there already; that of the rounding would be zero almost everywhere.
     s, c = sincos(*primals)
     return (s, c), (c * tangents[0], -s * tangents[0])

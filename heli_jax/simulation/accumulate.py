@@ -7,27 +7,29 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
+from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
 from heli_jax.numerics.matrix_exponential import product
 from heli_jax.simulation.blocks import without_next
 from heli_jax.simulation.discretize import Discrete, scalars
-from heli_jax.simulation.hold import linear_inputs
+from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
 from heli_jax.simulation.options import DEFAULT
-from heli_jax.simulation.simulate import field_term, held_inputs, per_sample, start_state
-from heli_jax.simulation.solvers import Accumulating, ZeroOrderHoldArgs, advance, at, dot
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, at, dot
+from heli_jax.simulation.stepping import field_term, held_inputs, per_sample, start_state
+from heli_jax.simulation.wrappers import Accumulating
 
 
 class Accumulated(NamedTuple):
     """What is left of a run."""
 
-    value: Any
-    state: Any
+    value: PyTree
+    state: Record
     """the model's State at the last sample"""
     outside: dict[str, Bool[Array, ""]]
     """by name of a limit of the model, whether it was left; empty for a model without limits"""
@@ -37,10 +39,10 @@ class Accumulated(NamedTuple):
 @explained
 def accumulate(
     model: Model,
-    params: Any,
-    flight: Any,
+    params: Record,
+    flight: FlightOrInputs,
     update: Callable[[Any, Any, Any], Any],
-    start: Any,
+    start: PyTree,
     **keywords: Any,
 ) -> tuple[Any, dfx.RESULTS]:
     """Reduce a run to a value without keeping it: for large batches.
@@ -66,12 +68,12 @@ _NOT_HERE = ("controller", "delay", "max_steps", "key", "feedback", "events")
 
 def accumulated(
     model: Model,
-    params: Any,
-    flight: Any,
+    params: Record,
+    flight: FlightOrInputs,
     update: Callable[[Any, Any, Any], Any],
-    start: Any,
+    start: PyTree,
     *,
-    data: Any = (),
+    data: PyTree = (),
     limits: bool = False,
     **keywords: Any,
 ) -> Accumulated:
@@ -93,17 +95,19 @@ def accumulated(
             option that only `simulate` has.
         TypeError: a keyword that is no option.
     """
+    # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
     options = keywords.pop("options", DEFAULT).changed(keywords)
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")
     linear = linear_inputs(model, flight, options.hold)
     inputs, dt = held_inputs(model, flight, options.dt)
-    x0 = start_state(model, params, options.initial_state, inputs, dt)
+    x0 = start_state(model, params, options.initial_state, inputs)
     run = per_sample(model, params, inputs, options._replace(dt=dt), linear)
     block = options.block
     if block != 1 and (run[1].discrete is None or block < 1):
         raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
+    # Limits are looked at sample by sample, so they take the way of one step a sample.
     reducer = _Reducer(model, params, update, model.limits if limits else None)
     if block > 1 and reducer.limits is None:
         value, state = _in_blocks(reducer, run[1], block, x0, start, data)
@@ -116,11 +120,12 @@ class _Reducer(NamedTuple):
     """What is done at a sample."""
 
     model: Model
-    params: Any
+    params: Record
     update: Callable[[Any, Any, Any], Any]
     limits: Callable[[Any, Any, Any], dict[str, Any]] | None
 
-    def __call__(self, carried: Any, state: Any, inputs: Any, data: Any) -> Any:
+    def __call__(self, carried: PyTree, state: Record, inputs: Record, data: PyTree) -> Any:
+        # Once left, the range stays left: a run that came back has been out of it.
         value, outside = carried
         if self.limits is not None:
             left = self.limits(self.params, state, inputs)
@@ -131,9 +136,9 @@ class _Reducer(NamedTuple):
 def _by_samples(
     reducer: _Reducer,
     run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm],
-    x0: Any,
-    start: Any,
-    data: Any,
+    x0: Record,
+    start: PyTree,
+    data: PyTree,
     adjoint: dfx.AbstractAdjoint,
 ) -> Accumulated:
     """The run one step a sample."""
@@ -141,10 +146,12 @@ def _by_samples(
     model, params, inputs = reducer.model, reducer.params, args.inputs
     n = jax.tree.leaves(inputs)[0].shape[0]
     args = args.in_scalars()
+    # What depends on the parameters alone is taken out of the loop over time.
     if args.discrete is None:
         values, field = hoisted(model.vector_field, params, x0, at(inputs, 0))
         term = field_term(model, field)
         args = args._replace(params=values)
+    # No limits: an empty record is carried, and costs nothing.
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
     if reducer.limits is not None:
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
@@ -159,7 +166,9 @@ def _by_samples(
         dt0=jnp.ones((), dtype),
         y0=(x0, (start, outside)),
         args=(args, data),
-        saveat=dfx.SaveAt(t1=True),
+        saveat=dfx.SaveAt(
+            t1=True
+        ),  # the end alone: what a large batch has no memory for is the rest
         max_steps=n - 1,
         adjoint=adjoint,
         throw=False,
@@ -201,6 +210,7 @@ def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Di
         # held ones.
         discrete, D = without_next(discrete), D + product(C, Bn)
         B = discrete.Bd
+    # C A^j and A^j B for all j in m - 1 products each, in place of powers of A.
     rows, columns, power = [C], [B], A
     for _ in range(m - 1):
         rows.append(product(rows[-1], A))
@@ -215,25 +225,30 @@ def _block_of(model: Model, args: ZeroOrderHoldArgs, m: int) -> tuple[_Block, Di
 
 
 def _in_blocks(
-    reducer: _Reducer, args: ZeroOrderHoldArgs, m: int, x0: Any, start: Any, data: Any
+    reducer: _Reducer, args: ZeroOrderHoldArgs, m: int, x0: Record, start: PyTree, data: PyTree
 ) -> tuple[Any, Any]:
     """The exact recurrence m samples a step: x[k+m] = A^m x[k] + ..., and each output between
     from x[k] directly, C A^j x[k] + ..., with coefficients of the vehicle's own."""
+    # Unrolled over the m samples, and a loop over the blocks: a block is a few hundred operations,
+    # all of them on vectors over the batch.
     block, discrete = _block_of(reducer.model, args, m)
     x0 = _plus(x0, block.of_next, at(args.inputs, 0), -1.0)
     structure, inputs = jax.tree.structure(x0), jax.tree.structure(args.inputs)
     U = jax.tree.leaves(args.inputs)
     n = U[0].shape[0]
+    # At least one sample is left over: the last one has outputs but no step after it.
     steps = (n - 1) // m
     outputs = functools.partial(_outputs_in_block, reducer, block, structure, inputs)
 
-    def samples(x: Any, value: Any, u: Any, now: Any, count: int) -> Any:
+    def samples(
+        x: list[Array], value: PyTree, u: list[list[Array]], now: PyTree, count: int
+    ) -> PyTree:
         for j in range(count):
             data_now = jax.tree.map(lambda v, j=j: v[j], now)
             value = reducer.update(value, outputs(x, u, j), data_now)
         return value
 
-    def step(carried: Any, slices: Any) -> tuple[Any, None]:
+    def step(carried: PyTree, slices: tuple[list[Array], PyTree]) -> tuple[PyTree, None]:
         x, value = carried
         rows, now = slices
         u = [[v[j] for v in rows] for j in range(m)]
@@ -260,14 +275,22 @@ def _in_blocks(
 
 
 def _outputs_in_block(
-    reducer: _Reducer, block: _Block, structure: Any, inputs: Any, x: Any, u: Any, j: int
+    reducer: _Reducer,
+    block: _Block,
+    structure: Any,  # tree structures, of which JAX exports no type
+    inputs: Any,
+    x: list[Array],
+    u: list[list[Array]],
+    j: int,
 ) -> Any:
     """The outputs of the j-th sample of a block that begins at x with the inputs u[0..j]."""
     model = reducer.model
+    # The first sample by the model itself: nothing is gained there by the recurrence.
     if j == 0:
         now = jax.tree.unflatten(inputs, u[0])
         state = _plus(jax.tree.unflatten(structure, x), block.of_next, now)
         return model.output(reducer.params, state, now)
+    # y[j] = C A^j x + the inputs of this sample and of those before it in the block.
     outputs = {}
     for i, name in enumerate(naming.names(model.Outputs)):
         total = dot(block.free[j - 1][i], x)
@@ -277,7 +300,7 @@ def _outputs_in_block(
     return model.Outputs(**outputs)
 
 
-def _plus(state: Any, rows: Any, inputs: Any, sign: float = 1.0) -> Any:
+def _plus(state: Record, rows: Any, inputs: Record, sign: float = 1.0) -> Record:
     """A State plus (or minus) a matrix, row by row in scalars, times the inputs; None adds none."""
     if rows is None:
         return state

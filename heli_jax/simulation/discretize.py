@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
+from heli_jax.naming import Number, Record
 from heli_jax.numerics.matrix_exponential import expm, product, van_loan
 
 
@@ -32,11 +33,18 @@ class Discrete(NamedTuple):
 
 
 def discretize(
-    model: Model, params: Any, dt: Any, late: Any = None, linear: tuple[bool, ...] = ()
+    model: Model,
+    params: Record,
+    dt: Number,
+    late: Number | None = None,
+    linear: tuple[bool, ...] = (),
 ) -> Discrete:
     """The exact equivalent of a linear model for steps of `dt` [s], in matrices.
 
     Args:
+        model: linear, with n states and m inputs.
+        params: the model's Params, SI.
+        dt: [s].
         late: [s], within [0, dt]: the part of each interval before the delayed sample u[k] acts.
             Under a zero-order hold x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] +
             G(dt-late) u[k].
@@ -49,16 +57,18 @@ def discretize(
     if late is None:
         return _once(Discrete(*_zero_order_hold(A, B, dt), None))
     late = jnp.asarray(late, A.dtype)
+    # Two exact steps, u[k-1] over the first and u[k] over the second.
     first, second = _zero_order_hold(A, B, late), _zero_order_hold(A, B, dt - late)
     return _once(Discrete(second[0] @ first[0], second[1], second[0] @ first[1]))
 
 
 def _discretize_ramps(
-    A: Array, B: Array, dt: Array, late: Any, linear: tuple[bool, ...]
+    A: Array, B: Array, dt: Array, late: Number | None, linear: tuple[bool, ...]
 ) -> Discrete:
     """`discretize` with some inputs on straight lines between samples (first-order hold)."""
     if late is None:
         Ad, G, R = _first_order_hold(A, B, dt, dt, linear)
+        # u[k] + (u[k+1] - u[k]) t/dt: the ramp takes from this sample what it gives to the next.
         return Discrete(Ad, G - R, None, R)
     late = jnp.asarray(late, A.dtype)
     first, second = (
@@ -83,8 +93,14 @@ def _once(discrete: Discrete) -> Discrete:
     return jax.lax.optimization_barrier(discrete)
 
 
-def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
-    """Covariance of the noise that a linear model's white-noise drive adds in one step."""
+def process_noise(model: Model, params: Record, dt: Number) -> Float[Array, "n n"]:
+    """Covariance of the noise that a linear model's white-noise drive adds in one step.
+
+    Args:
+        model: linear, with n states.
+        params: the model's Params, SI.
+        dt: [s].
+    """
     A = jacobians(model, params).A
     if model.noise_intensity is None:
         return jnp.zeros(A.shape, A.dtype)
@@ -94,12 +110,15 @@ def process_noise(model: Model, params: Any, dt: Any) -> Float[Array, "n n"]:
 
 def square_root(Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A factor L with L L^T = Q for a covariance that may be singular."""
+    # Not Cholesky: noise that drives one state of many has a Q of low rank, with eigenvalues of
+    # minus a rounding error.
     values, vectors = jnp.linalg.eigh(Q)
     return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
 
 
 def _zero_order_hold(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
     """e^{A dt} and its integral times B: one exponential of [[A, B], [0, 0]] dt."""
+    # In place of A^-1 (e^{A dt} - I) B: a free axis integrates, and its A has no inverse.
     n, m = B.shape
     M = jnp.zeros((n + m, n + m), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     E = expm(M * dt)
@@ -114,6 +133,7 @@ def _first_order_hold(
     One exponential of [[A, B, 0], [0, 0, I/dt], [0, 0, 0]] h (Franklin, Powell and Workman, 1998,
     section 6.3.2); the last is zero for inputs that are not linear.
     """
+    # A chain of two integrators per moving input: the ramp drives the input, the input the state.
     n, m = B.shape
     moving = np.flatnonzero(linear)
     q = n + m + moving.size
@@ -124,6 +144,7 @@ def _first_order_hold(
     return E[:n, :n], E[:n, n : n + m], ramps
 
 
+# Nested tuples are pytrees of scalars: under vmap each coefficient is a vector over the batch.
 def scalars(M: Float[Array, "n m"]) -> tuple[tuple[Any, ...], ...]:
     """A matrix row by row as nested tuples of scalars."""
     return tuple(tuple(M[i, j] for j in range(M.shape[1])) for i in range(M.shape[0]))

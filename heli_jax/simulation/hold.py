@@ -9,22 +9,29 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import nearest
+from heli_jax.naming import Number, Record
 
 HOLDS = ("zero-order", "linear")
 """The names of what an input may do between samples."""
+
+# A Flight is a class of flights/, which this part does not import; Inputs are anyone's own.
+FlightOrInputs = Any
+"""a Flight, or a model's Inputs with arrays (N,)"""
 
 type Hold = str | Mapping[str, str] | None
 """one name for all inputs, or names by input"""
 
 
-def linear_inputs(model: Model, flight: Any, hold: Hold) -> tuple[bool, ...]:
+def linear_inputs(model: Model, flight: FlightOrInputs, hold: Hold) -> tuple[bool, ...]:
     """Of each of the model's inputs whether it is linear between samples; () where none is.
 
     Args:
+        model: of which the names of the inputs count.
         flight: a Flight, whose own `hold` counts for what `hold` does not name, or Inputs.
         hold: as `simulate` takes it.
 
@@ -32,8 +39,11 @@ def linear_inputs(model: Model, flight: Any, hold: Hold) -> tuple[bool, ...]:
         ValueError: an unknown name of an input or of a hold.
     """
     names = naming.names(model.Inputs)
-    own = getattr(flight, "hold", None)
-    by_name = {n: own.get(n, "zero-order") for n in names} if isinstance(own, dict) else {}
+    # What is asked for goes before what the Flight says of its log; arrays alone are held.
+    of_flight = getattr(flight, "hold", None)
+    by_name = {}
+    if isinstance(of_flight, dict):
+        by_name = {n: of_flight.get(n, "zero-order") for n in names}
     if isinstance(hold, str):
         by_name = dict.fromkeys(names, hold)
     elif hold is not None:
@@ -43,11 +53,12 @@ def linear_inputs(model: Model, flight: Any, hold: Hold) -> tuple[bool, ...]:
         by_name |= hold
     for value in by_name.values():
         check_hold(value)
+    # The empty tuple where none moves: the simpler program, with one matrix less in its recurrence.
     linear = tuple(by_name.get(n) == "linear" for n in names)
     return linear if any(linear) else ()
 
 
-def check_hold(value: Any, where: str = "hold") -> None:
+def check_hold(value: PyTree, where: str = "hold") -> None:
     """Refuse what is no hold.
 
     Raises:
@@ -57,13 +68,21 @@ def check_hold(value: Any, where: str = "hold") -> None:
         raise ValueError(f"{where}: expected one of {', '.join(HOLDS)}, got {value!r:.60}")
 
 
-def at(inputs: Any, k: Any) -> Any:
+def at(inputs: PyTree, k: Int[Array, "..."] | int) -> PyTree:
     """The inputs of sample k; before the first the first, after the last the last."""
+    # Clipped on purpose and in sight: JAX would clip an index past the end, and wrap one below
+    # zero.
     return jax.tree.map(lambda u: u[jnp.clip(k, 0, u.shape[0] - 1)], inputs)
 
 
-def at_end(inputs: Any, k: Any, linear: tuple[bool, ...]) -> Any:
-    """The inputs at the end of the interval from sample k on, before any of them jumps."""
+def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...]) -> Record:
+    """The inputs at the end of the interval from sample k on, before any of them jumps.
+
+    Args:
+        inputs: arrays (N,).
+        k: the sample.
+        linear: of each input whether it moves between samples; () holds all.
+    """
     held = at(inputs, k)
     return _chosen(linear, at(inputs, k + 1), held) if linear else held
 
@@ -71,16 +90,20 @@ def at_end(inputs: Any, k: Any, linear: tuple[bool, ...]) -> Any:
 class Segment(NamedTuple):
     """A part of a sample interval in which every input stays or follows one straight line."""
 
-    length: Any
+    length: Array
     """[s]"""
-    inputs: Any
+    inputs: Record
     """at its begin"""
-    slope: Any
+    slope: Record
     """of the inputs, per second; zero where they stay"""
 
 
 def segments(
-    inputs: Any, dt: Any, delay: tuple[Any, Any] | None, k: Any, linear: tuple[bool, ...]
+    inputs: Record,
+    dt: Number,
+    delay: tuple[Array, Array] | None,
+    k: Int[Array, "..."] | int,
+    linear: tuple[bool, ...],
 ) -> list[Segment]:
     """The parts of the interval from sample k (an integer or a whole array of them) to the next.
 
@@ -96,6 +119,8 @@ def segments(
         return [Segment(dt, now, _slope(linear, now, at(inputs, k + 1), dt))]
     whole, rest = delay
     before, now, after = (at(inputs, k - whole + i) for i in (-1, 0, 1))
+    # The interval begins `rest` before sample k - whole: on the line towards it for what moves,
+    # still at the sample before for what is held.
     begin = _by_hold(linear, lambda a, b: rest * a + (1.0 - rest) * b, before, now)
     return [
         Segment(rest * dt, begin, _slope(linear, before, now, dt)),
@@ -103,14 +128,24 @@ def segments(
     ]
 
 
-def _slope(linear: tuple[bool, ...], first: Any, second: Any, dt: Any) -> Any:
+def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) -> Record:
     slopes = _by_hold(linear, lambda a, b: (b - a) / dt, first, second)
     held = jax.tree.map(jnp.zeros_like, first)
     return _chosen(linear, slopes, held)
 
 
-def delayed(inputs: Any, whole: Any, rest: Any, n: int, linear: tuple[bool, ...]) -> Any:
-    """The inputs that act at the n samples when they are late by `whole` + `rest` samples."""
+def delayed(inputs: Record, whole: Array, rest: Array, n: int, linear: tuple[bool, ...]) -> Record:
+    """The inputs that act at the n samples when they are late.
+
+    Args:
+        inputs: arrays (N,).
+        whole: samples, an integer.
+        rest: the rest of a sample, in [0, 1).
+        n: how many samples.
+        linear: of each input whether it moves between samples; () holds all.
+    """
+    # At the sample itself one that is late by a part of a sample has not arrived: the one before
+    # still acts.
     k = jnp.arange(n) - whole
     held = at(inputs, k - (rest > 0).astype(int))
     if not linear:
@@ -120,11 +155,14 @@ def delayed(inputs: Any, whole: Any, rest: Any, n: int, linear: tuple[bool, ...]
     return _chosen(linear, between, held)
 
 
-def _by_hold(linear: tuple[bool, ...], moving: Callable[..., Any], first: Any, second: Any) -> Any:
+def _by_hold(
+    linear: tuple[bool, ...], moving: Callable[..., Any], first: Record, second: Record
+) -> Record:
     """moving(first, second) for the inputs that are linear, the first for the others."""
     return _chosen(linear, jax.tree.map(moving, first, second), first)
 
 
-def _chosen(linear: tuple[bool, ...], moving: Any, held: Any) -> Any:
+def _chosen(linear: tuple[bool, ...], moving: Record, held: Record) -> Record:
+    """The moving ones of the inputs that are linear, the held ones of the others."""
     leaves = zip(linear, jax.tree.leaves(moving), jax.tree.leaves(held), strict=True)
     return jax.tree.unflatten(jax.tree.structure(held), [a if is_ else b for is_, a, b in leaves])

@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+from jaxtyping import Array
 
 from heli_jax.errors import nearest
+from heli_jax.naming import Number, Record
 from heli_jax.simulation.events import Event
 from heli_jax.simulation.hold import Hold
 
@@ -13,9 +15,11 @@ from heli_jax.simulation.hold import Hold
 class SimulationOptions(NamedTuple):
     """How `simulate` and `accumulate` carry out a run; each field is also a keyword of theirs."""
 
+    # Any, as a number that is never None once a run has begun: the Flight has one, or it is
+    # refused.
     dt: Any = None
     """sample time [s]; that of the Flight unless given"""
-    initial_state: Any = None
+    initial_state: Record | None = None
     """the model's State at the first sample; `model.initial_state` unless given"""
     solver: str | dfx.AbstractSolver | None = None
     """"exact" (linear models, the default there), "rk4" (the default elsewhere), or any diffrax
@@ -25,7 +29,7 @@ class SimulationOptions(NamedTuple):
     controller: dfx.AbstractStepSizeController | None = None
     """a diffrax step-size controller makes the steps adaptive, with Dopri8 unless another solver
     is given; they end at every sample"""
-    delay: Any = None
+    delay: Number | None = None
     """the inputs act this much later (+) or earlier (-) than given [s]; differentiable. Before the
     first sample its value holds, after the last the last one's"""
     adjoint: dfx.AbstractAdjoint | None = None
@@ -33,7 +37,7 @@ class SimulationOptions(NamedTuple):
     compiles faster, `RecursiveCheckpointAdjoint()` saves memory in reverse mode"""
     max_steps: int = 4096
     """bound on adaptive steps a sample; where it ends a run, `result` says so"""
-    key: Any = None
+    key: Array | None = None
     """a JAX random key: the model's process noise is drawn with it, by the discrete process noise
     of a sample: exact for linear models with solver "exact", of the model linearised at each sample
     for others with fixed steps; without it there is none"""
@@ -58,6 +62,7 @@ class SimulationOptions(NamedTuple):
         Raises:
             TypeError: a keyword that is no field.
         """
+        # `_replace` refuses an unknown field too, without saying which one was meant.
         for name in keywords:
             if name not in self._fields:
                 raise TypeError(

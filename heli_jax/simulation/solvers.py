@@ -5,17 +5,19 @@ error of first order. Here the input of an interval is picked once and held whil
 one that is linear between samples is followed along its line by every stage.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
 
 from heli_jax.errors import nearest
+from heli_jax.naming import Number, Record, Scalar
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import at, at_end, segments
+from heli_jax.simulation.hold import at, segments
 
 
 class ZeroOrderHoldArgs(NamedTuple):
@@ -26,10 +28,10 @@ class ZeroOrderHoldArgs(NamedTuple):
     sample time.
     """
 
-    params: Any
-    inputs: Any
-    dt: Any
-    delay: Any
+    params: Record
+    inputs: Record
+    dt: Array
+    delay: tuple[Array, Array] | None
     discrete: Discrete | None
 
     def in_scalars(self) -> "ZeroOrderHoldArgs":
@@ -42,26 +44,33 @@ class ZeroOrderHoldArgs(NamedTuple):
 class IntervalArgs(NamedTuple):
     """The arguments of a vector field within one interval: parameters and the held inputs."""
 
-    params: Any
-    inputs: Any
+    params: Record
+    inputs: Record
 
 
 class RampArgs(NamedTuple):
     """As `IntervalArgs`, for inputs that move: those at the begin of a step, and their slope per
     second."""
 
-    params: Any
-    inputs: Any
-    slope: Any
+    params: Record
+    inputs: Record
+    slope: Record
 
-    def after(self, t: Any) -> "RampArgs":
+    def after(self, t: Number) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
 
-def _sample(t: Any) -> Any:
+def sample_index(t: Number) -> Int[Array, ""]:
+    """The sample that an interval begins with, from its time in samples."""
+    # Time is counted in samples: a rounding error short of a whole number is that number.
     return jnp.floor(t + 1e-3).astype(int)
+
+
+# The arguments of `init`, `func` and `step` are those of diffrax.AbstractSolver: terms, times, the
+# state y0 and `args`. Time is counted in samples in the solvers of a whole sample, in seconds from
+# the begin of a step within it.
 
 
 class _Stateless(dfx.AbstractSolver):
@@ -72,43 +81,47 @@ class _Stateless(dfx.AbstractSolver):
         dfx.LocalLinearInterpolation
     )
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(
+        self, terms: dfx.AbstractTerm, t0: Number, t1: Number, y0: PyTree, args: PyTree
+    ) -> None:
         return None
 
 
-class _Wrapper(_Stateless):
-    """A solver of whole samples around another."""
+class SolverWrapper(_Stateless):
+    """A solver of whole samples around another (see also `heli_jax.simulation.wrappers`)."""
 
     solver: dfx.AbstractSolver
 
-    def order(self, terms: Any) -> int | None:
+    def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return y0
 
 
 class Exact(_Stateless):
     """Exact for linear models, held inputs or linear ones: a recurrence of scalar coefficients."""
 
-    def order(self, terms: Any) -> None:
+    def order(self, terms: dfx.AbstractTerm) -> None:
+        # No error to have an order: diffrax takes None where nobody asks for one.
         return None
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0))))
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+        return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
         assert args.discrete is not None
-        k = _sample(t0)
+        # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
+        k = sample_index(t0)
         if args.delay is not None:
             k = k - args.delay[0]
         before = None if args.delay is None else jax.tree.leaves(at(args.inputs, k - 1))
@@ -119,18 +132,37 @@ class Exact(_Stateless):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
-def advance(discrete: Discrete, x: Any, u: Any, before: Any = None, after: Any = None) -> list[Any]:
-    """x[k+1] from lists of scalars; `before` and `after` are the inputs of the samples beside."""
+def advance(
+    discrete: Discrete,
+    x: Sequence[Scalar],
+    u: Sequence[Scalar],
+    before: Sequence[Scalar] | None = None,
+    after: Sequence[Scalar] | None = None,
+) -> list[Scalar]:
+    """x[k+1] from x[k] and the inputs.
+
+    Args:
+        discrete: the recurrence, in scalars.
+        x: the n states at sample k.
+        u: the m inputs at sample k.
+        before: those of the sample before, where the recurrence has a Bp.
+        after: those of the next sample, where it has a Bn.
+    """
+    # Sums of scalars and not a matrix product: under vmap each is a vector over the batch, which
+    # XLA fuses into one loop. A product of many 4x4 matrices calls a routine for each of them.
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
+        assert before is not None
         new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
     if discrete.Bn is not None:
+        assert after is not None
         new = [v + dot(b, after) for v, b in zip(new, discrete.Bn, strict=True)]
     return new
 
 
-def dot(coefficients: Any, values: Any) -> Any:
+def dot(coefficients: Sequence[Scalar], values: Sequence[Scalar]) -> Scalar:
     """The sum of products of two lists of scalars, term by term from the first."""
+    # Not sum(): that begins with a 0, and an addition more at each step.
     total = coefficients[0] * values[0]
     for c, v in zip(coefficients[1:], values[1:], strict=True):
         total = total + c * v
@@ -145,25 +177,35 @@ class RK4(_Stateless):
 
     rolled: bool = eqx.field(static=True, default=False)
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: dfx.AbstractTerm) -> int:
         return 4
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        h = t1 - t0
+        h: Any = t1 - t0
 
-        def f(t: Any, y: Any) -> Any:
+        # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
+        # which XLA does not fuse into one loop over a batch of vehicles.
+        def f(t: Number, y: PyTree) -> Any:
             # Behind a barrier each slope is computed once: without it XLA computes all of them
             # again for every state variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
-        def along(y: Any, slope: Any, step: Any) -> Any:
+        def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
+        # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
         if self.rolled:
             y1 = self._rolled(f, along, t0, h, y0)
             return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
@@ -177,8 +219,12 @@ class RK4(_Stateless):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
     @staticmethod
-    def _rolled(f: Any, along: Any, t0: Any, h: Any, y0: Any) -> Any:
-        def stage(carry: Any, node: Any) -> Any:
+    def _rolled(
+        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Array, y0: PyTree
+    ) -> PyTree:
+        # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
+        # reach of zero, and any slope will do.
+        def stage(carry: PyTree, node: tuple[Array, Array]) -> tuple[PyTree, None]:
             total, slope = carry
             reach, weight = node
             slope = f(t0 + reach * h, along(y0, slope, reach * h))
@@ -191,7 +237,10 @@ class RK4(_Stateless):
         return y1
 
 
-class PerSample(_Wrapper):
+type _Part = tuple[Array, IntervalArgs | RampArgs]
+
+
+class PerSample(SolverWrapper):
     """Any solver inside one sample: `substeps` equal steps.
 
     With a delayed input the interval has two parts, before and after the change of the input,
@@ -202,48 +251,54 @@ class PerSample(_Wrapper):
     linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
     """of each input whether it is linear between samples; () holds all"""
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(
-            terms, t0, y0, IntervalArgs(args.params, at(args.inputs, _sample(t0)))
+            terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
 
     def step(
         self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
+        terms: dfx.AbstractTerm,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
         args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
-        for length, now in self._parts(args, _sample(t0)):
+        for length, now in self._parts(args, sample_index(t0)):
             y, part = self._steps(terms, length / self.substeps, y, now)
             result = dfx.RESULTS.where(result == dfx.RESULTS.successful, part, result)
         return y, None, {"y0": y0, "y1": y}, None, result
 
-    def _parts(self, args: ZeroOrderHoldArgs, k: Any) -> list[tuple[Any, IntervalArgs | RampArgs]]:
+    def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""
+        # A line across a sample is one part; late by a fraction, it bends within the interval.
         if self.linear:
             parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
             return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
         if args.delay is None:
             return [(args.dt, IntervalArgs(args.params, at(args.inputs, k)))]
+        # Each part has its own steps and ends where the input jumps: a step across the jump would
+        # be of first order, whatever the method's.
         whole, rest = args.delay
         return [
             (rest * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole - 1))),
             ((1.0 - rest) * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole))),
         ]
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
+    def _steps(
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
+    ) -> Any:
         """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
         moves it is counted from the step's begin, so each begins at 0: a step length that is the
         same number in all steps makes the code faster.
         """
         begin = jnp.zeros_like(h)
 
-        def body(carry: Any, j: Any) -> Any:
+        def body(carry: PyTree, j: Any) -> tuple[PyTree, None]:
             y, result = carry
             here = now.after(j * h) if isinstance(now, RampArgs) else now
             state = self.solver.init(terms, begin, h, y, here)
@@ -263,13 +318,15 @@ class Adaptive(PerSample):
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
 
-    def _steps(self, terms: Any, h: Any, y0: Any, now: IntervalArgs | RampArgs) -> Any:
+    def _steps(
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
+    ) -> Any:
         sol = dfx.diffeqsolve(
             terms,
             self.solver,
             t0=jnp.zeros_like(h),
             t1=self.substeps * h,
-            dt0=None,
+            dt0=None,  # the controller chooses a first step anew in each interval: inputs jump
             y0=y0,
             args=now,
             saveat=dfx.SaveAt(t1=True),
@@ -284,106 +341,7 @@ class Adaptive(PerSample):
         return reached, fine
 
 
-class StateFeedback(_Wrapper):
-    """A per-sample solver whose inputs are a function of the state at the sample.
-
-    feedback(state, given inputs of that sample) gives the inputs that are held.
-    """
-
-    feedback: Callable[..., Any]
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        u = self.feedback(y0, at(args.inputs, _sample(t0)))
-        held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
-        return self.solver.step(terms, t0, t1, y0, held, solver_state, made_jump)
-
-
-class Stopping(_Wrapper):
-    """A per-sample solver that stays where it is after the first sample at which `over` holds.
-
-    y = (state, going), where going is 1 until then and 0 from there on.
-    """
-
-    over: Callable[..., Any]
-    linear: tuple[bool, ...] = eqx.field(static=True, default=())
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        state, going = y0
-        new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
-        new = jax.tree.map(lambda a, b: jnp.where(going > 0, a, b), new, state)
-        result = dfx.RESULTS.where(going > 0, result, dfx.RESULTS.successful)
-        # The inputs at the end of the interval: those held since its begin, or the next ones.
-        ended = self.over(new, at_end(args.inputs, _sample(t0), self.linear))
-        y1 = (new, jnp.where(ended, jnp.zeros_like(going), going))
-        return y1, None, {"y0": y0, "y1": y1}, None, result
-
-
-class WithProcessNoise(_Wrapper):
-    """A per-sample solver whose state gets its process noise after every sample.
-
-    The inputs are (the model's, standard normal numbers); add_noise(state, held inputs, numbers
-    of that sample) gives the new state.
-    """
-
-    add_noise: Callable[..., Any]
-
-    def step(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        args: ZeroOrderHoldArgs,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> Any:
-        inputs, draws = args.inputs
-        held = args._replace(inputs=inputs)
-        y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
-        k = _sample(t0)
-        y1 = self.add_noise(y, at(inputs, k), at(draws, k))
-        return y1, None, {"y0": y0, "y1": y1}, None, result
-
-
-class Accumulating(_Wrapper):
-    """A per-sample solver that carries a running value beside the state.
-
-    y = (state, value); at each sample, before the step, value = update(value, state, held inputs
-    at that sample, k). Nothing else of the trajectory is kept.
-    """
-
-    update: Callable[..., Any] = eqx.field(static=True)
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> Any:
-        held, data = args
-        state, value = y0
-        k = _sample(t0)
-        value = self.update(value, state, at(held.inputs, k), at(data, k))
-        state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
-        y1 = (state, value)
-        return y1, None, {"y0": y0, "y1": y1}, None, result
-
-
+# An implicit one needs a root finder with tolerances, which a name cannot give.
 NAMED = ("Euler", "Midpoint", "Heun", "Ralston", "Bosh3", "Tsit5", "Dopri5", "Dopri8")
 """Solvers of diffrax that have a name here: explicit ones, of fixed steps."""
 

@@ -1,13 +1,17 @@
 """What a simulation gives."""
 
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from heli_jax.naming import Record
+
+# The functions of summaries and exports are imported where they are used: they build on this class,
+# and pandas, xarray and HTML are no business of a simulation.
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -20,11 +24,11 @@ class Trajectory(NamedTuple):
 
     times: Float[Array, " N"]
     """[s], from 0"""
-    states: Any
+    states: Record
     """the model's State with arrays (N,)"""
-    outputs: Any
+    outputs: Record
     """the model's Outputs with arrays (N,)"""
-    inputs: Any
+    inputs: Record
     """the model's Inputs with arrays (N,), as they acted"""
     result: dfx.RESULTS
     """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
@@ -48,14 +52,17 @@ class Trajectory(NamedTuple):
     @property
     def status(self) -> Int[Array, " *batch"]:
         """The worst that happened, an index into `STATUS`; one a run of a batch."""
+        # From the mildest to the worst, so that what comes later overrules.
         code = jnp.where(jnp.asarray(self.event) >= 0, 1, 0)
         for out in self.outside.values():
             code = jnp.where(jnp.any(out, axis=-1), 2, code)
+        # A run that is not finite has left the range as well, and the solver may call it a success.
         code = jnp.where(self.finite, code, 3)
         return jnp.where(self.result == dfx.RESULTS.successful, code, jnp.maximum(code, 4))
 
     def first(self, n: int) -> "Trajectory":
         """The first n samples of it."""
+        # What belongs to the whole run (result, finite, status) stays as it is.
         parts = (self.times, self.states, self.outputs, self.inputs, self.outside)
         times, states, outputs, inputs, outside = jax.tree.map(lambda v: v[:n], parts)
         return self._replace(

@@ -89,9 +89,9 @@ def test_each_correction_can_be_turned_on_alone():
 
 
 def test_unknown_variants_and_switches_are_refused():
-    with pytest.raises(ValueError, match="wanted is one of paper, consistent"):
+    with pytest.raises(ValueError, match="expected one of paper, consistent"):
         helicopter("physics")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="no correction 'tails'"):
+    with pytest.raises(ValueError, match=r"corrections: expected some of .*, got 'tails'"):
         helicopter("paper", tails=True)
 
 

@@ -143,8 +143,8 @@ def test_own_model_by_import_path(tmp_path):
         ("roll_on_stand", "did you mean 'roll-on-stand'"),
         ("", "unknown model ''"),
         ("no_such_module:model", "cannot import 'no_such_module'"),
-        ("tests.dynamics.test_model:nothing", "is nothing, wanted is a heli_jax.Model"),
-        ("tests.dynamics.test_model:U", "is a ndarray, wanted is a heli_jax.Model"),
+        ("tests.dynamics.test_model:nothing", "expected a heli_jax.Model at .*, got nothing"),
+        ("tests.dynamics.test_model:U", "expected a heli_jax.Model at .*, got a ndarray"),
         ("os:system('ls')", "unknown model"),
     ],
 )

@@ -86,7 +86,7 @@ def test_a_vehicle_need_not_give_them(tmp_path, vehicles_folder):
     path.write_text(yaml.safe_dump({**content, "c_paddle": {"value": 30, "unit": "mm"}}))
     assert float(load_vehicle(path).c_paddle) == pytest.approx(0.03)
     path.write_text(yaml.safe_dump({**content, "a_paddle": 0.0}))
-    with pytest.raises(InputError, match="a_paddle is 0"):
+    with pytest.raises(InputError, match="a_paddle must be more than zero, got 0"):
         load_vehicle(path)
 
 

@@ -204,7 +204,7 @@ def test_feedback_is_applied_once_a_sample(xcell, hover):
         controller=dfx.PIDController(rtol=1e-10, atol=1e-10),
     )  # fmt: skip
     np.testing.assert_allclose(adaptive.states.phi, run.states.phi, atol=1e-6)
-    with pytest.raises(ValueError, match="feedback is for runs without a delay"):
+    with pytest.raises(ValueError, match="feedback: expected a run without a delay"):
         simulate(model, xcell, u, dt=DT, feedback=law, delay=0.01)
 
 

@@ -22,8 +22,8 @@ from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.numerics.matrix_exponential import product, van_loan
 from heli_jax.simulation.discretize import process_noise
 from heli_jax.simulation.hold import Hold, linear_inputs, segments
-from heli_jax.simulation.simulate import acting_inputs, held_columns, split_delay
 from heli_jax.simulation.solvers import at
+from heli_jax.simulation.stepping import acting_inputs, held_columns, split_delay
 
 _SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""

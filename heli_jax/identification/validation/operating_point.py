@@ -131,7 +131,11 @@ def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float
 
 
 def _words(condition: Condition) -> str:
-    named = ("ahead", condition.ahead), ("to the right", condition.aside), ("up", condition.climb)
+    named = (
+        ("ahead", condition.forward_speed),
+        ("to the right", condition.lateral_speed),
+        ("up", condition.climb),
+    )
     parts = [f"{v:.2g} m/s {n}" for n, v in named if v]
     return f"at {', '.join(parts)}" if parts else "in hover"
 

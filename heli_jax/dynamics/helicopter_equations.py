@@ -1,0 +1,346 @@
+r"""The equations of the whole helicopter, one after another: eqs 2-10 and 14-19 with corrections.
+
+Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right.
+Body axes are forward, right and down. `helicopter` puts the equations together.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heli_jax.dynamics import aerodynamics as aero
+from heli_jax.dynamics import flybar
+from heli_jax.dynamics.helicopter_records import Attitude, Corrections, Motion
+from heli_jax.naming import Record, Scalar
+from heli_jax.numerics.sincos import sincos
+from heli_jax.vehicle import Helicopter
+
+# Behind a barrier a number is computed once: without it XLA computes it again for each of the
+# derivatives that need it, the inflow's iteration included.
+once = jax.lax.optimization_barrier
+
+
+def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
+    r"""Attitude, airspeed and rates of the body.
+
+    The body's rates are $p = \dot\phi - \dot\psi s_\theta$,
+    $q = \dot\theta c_\phi + \dot\psi c_\theta s_\phi$,
+    $r = \dot\psi c_\theta c_\phi - \dot\theta s_\phi$; without `rigid_body` they are the
+    angles' derivatives, as the paper has it.
+
+    Args:
+        corrections: the switches of the variant.
+        s: state, with the names of HelicopterState.
+        u: inputs; wind_x, wind_y and wind_z [m/s] where there is wind.
+    """
+    at = once(Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi)))
+    dx, dy, dz = s.dx, s.dy, s.dz
+    # All aerodynamics sees the motion through the air; only the position is over the ground.
+    if hasattr(u, "wind_x"):
+        dx, dy, dz = dx - u.wind_x, dy - u.wind_y, dz - u.wind_z
+    # Turned by psi, theta and phi, one after another.
+    forward_speed, lateral_speed = dx * at.cpsi + dy * at.spsi, dy * at.cpsi - dx * at.spsi
+    below = forward_speed * at.sth - dz * at.cth
+    forward = forward_speed * at.cth + dz * at.sth
+    right, down = (
+        lateral_speed * at.cphi + below * at.sphi,
+        below * at.cphi - lateral_speed * at.sphi,
+    )
+    p, q, r = _body_rates(corrections, s, at)
+    return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
+
+
+def _body_rates(corrections: Corrections, s: Record, at: Attitude) -> tuple[Scalar, ...]:
+    """p, q and r [rad/s]."""
+    # Eqs 5-7 integrate M/I straight into the angles, so the paper's rates are the angles'
+    # derivatives. That is right in level flight alone: a body that turns steadily with dpsi at a
+    # bank phi has a pitch rate.
+    if not corrections.rigid_body:
+        return s.dphi, s.dtheta, s.dpsi
+    p = s.dphi - s.dpsi * at.sth
+    q = s.dtheta * at.cphi + s.dpsi * at.cth * at.sphi
+    r = s.dpsi * at.cth * at.cphi - s.dtheta * at.sphi
+    return p, q, r
+
+
+def _to_earth(at: Attitude, forward: Scalar, right: Scalar, down: Scalar) -> tuple[Scalar, ...]:
+    """A vector in body axes along x, y and z (up)."""
+    # The turns of `motion` in the opposite order and direction.
+    lateral_speed, below = right * at.cphi - down * at.sphi, right * at.sphi + down * at.cphi
+    forward_speed, up = forward * at.cth + below * at.sth, forward * at.sth - below * at.cth
+    return (
+        forward_speed * at.cpsi - lateral_speed * at.spsi,
+        forward_speed * at.spsi + lateral_speed * at.cpsi,
+        up,
+    )
+
+
+class Cyclic(NamedTuple):
+    """Cyclic pitch of the blades, eq. 11 [rad]."""
+
+    roll: Scalar
+    pitch: Scalar
+
+
+def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
+    """Eq. 11 for both axes.
+
+    Args:
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+    """
+    return Cyclic(
+        flybar.cyclic_pitch(p, u.x_roll, s.beta_roll),
+        flybar.cyclic_pitch(p, u.x_pitch, s.beta_pitch),
+    )
+
+
+def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion) -> aero.Flow:
+    r"""The air that the main rotor meets, eqs 8-9.
+
+    $$\mu R\Omega = (\dot x - h_r\dot\theta)\cos\theta + (\dot y + h_r\dot\phi)\cos\phi
+      + (\dot z - \ell_r\dot\theta)\sin\theta$$
+    $$\nu R\Omega = (\dot x - h_r\dot\theta)\sin\theta + (\dot y - h_r\dot\phi)\sin\phi
+      - (\dot z - \ell_r\dot\theta)\cos\theta$$
+
+    With `edgewise` and `descent` both are those of the hub, which stands $h_r$ above and $\ell_r$
+    behind the centre of gravity. The cyclic pitch then meets the air by direction: that of pitch
+    has its largest blade angle on the right, where the blade advances in forward flight, that of
+    roll at the nose, where it advances in flight to the left.
+
+    Args:
+        corrections: the switches of the variant.
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+        m: the `motion` of that state.
+    """
+    # The hub is h_r above the centre of gravity: a nose that rises carries it backwards, a right
+    # side that sinks carries it to the right.
+    forward_speed, lateral_speed, up = (
+        m.dx - p.hr * s.dtheta,
+        m.dy + p.hr * s.dphi,
+        m.dz - p.lr * s.dtheta,
+    )
+    if corrections.descent:
+        # v + omega x r at r = (-lr, 0, -hr), along the mast. With dpsi = 0 this is eq. 9 with
+        # -(dy + hr dphi) sin phi: as printed the sign of hr dphi disagrees with eq. 3, an rms error
+        # of 0.19 m/s against exact kinematics where the other sign leaves 0.04.
+        W = -(m.w + p.lr * m.q)
+    else:
+        W = up * m.at.cth - forward_speed * m.at.sth - (m.dy - p.hr * s.dphi) * m.at.sphi
+    # Eqs 10 and 13 print (x_roll + x_pitch)/L1: sticks straight to the blades, without the ratio
+    # L3/(L2 + L3) and the flybar that eq. 11 puts between the two.
+    tilt = Cyclic((1.0 / p.L1) * u.x_roll, (1.0 / p.L1) * u.x_pitch)
+    if corrections.cyclic:
+        tilt = cyclic(p, s, u)
+    if corrections.edgewise:
+        forward_speed, lateral_speed = m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
+        return aero.Flow(
+            forward_speed**2 + lateral_speed**2,
+            W,
+            forward_speed * tilt.pitch - lateral_speed * tilt.roll,
+        )
+    # Eq. 8 adds the speeds along x and y as if they had one direction: flight ahead and to the left
+    # at the same speed gives mu = 0. It is not turned by psi either, so it holds near psi = 0.
+    speed = forward_speed * m.at.cth + lateral_speed * m.at.cphi + up * m.at.sth
+    return aero.Flow(speed**2, W, speed * (tilt.roll + tilt.pitch))
+
+
+def main_rotor(p: Helicopter, s: Record, u: Record, air: aero.Flow) -> aero.RotorForce:
+    """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state.
+
+    Args:
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+        air: the `flow` at the hub.
+    """
+    vi = getattr(s, "vi", None)
+    return once(aero.thrust(p, s.Omega, p.K_theta0 * u.x_throttle, air, vi))
+
+
+def tail_rotor(p: Helicopter, s: Record, u: Record, m: Motion) -> aero.RotorForce:
+    """Thrust and inflow of the tail rotor; a positive thrust turns the nose to the right.
+
+    Args:
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+        m: the `motion` of that state.
+    """
+    # Its place is (-L_T, 0, 0) and its thrust points to the left: V2 is in its plane, forward and
+    # down. W grows with the yaw rate that the thrust makes, which is where yaw damping comes from;
+    # eq. 16, without inflow, has none.
+    V2 = m.u**2 + (m.w + p.L_T * m.q) ** 2
+    W = p.L_T * m.r - m.v
+    return once(aero.tail_thrust(p, s.Omega, p.K_theta0T * u.x_yaw, V2, W))
+
+
+def motor_torque(corrections: Corrections, p: Helicopter, u: Record) -> Scalar:
+    """T_m [N m], eq. 19, or as eq. 10 has the motor.
+
+    Args:
+        corrections: the switches of the variant.
+        p: vehicle, SI.
+        u: inputs, with the names of HelicopterInputs.
+    """
+    # Eq. 10 accelerates the rotor by K_throttle x_throttle, a torque Ir K_throttle on the fuselage.
+    # K_Tm says the same thing once more: only where the two agree is the motor's torque one number.
+    gain = p.Ir * p.K_throttle if corrections.tied_torque else p.K_Tm
+    return gain * u.x_throttle
+
+
+def rotor_acceleration(
+    p: Helicopter, s: Record, u: Record, air: aero.Flow, force: aero.RotorForce
+) -> Scalar:
+    """dOmega/dt [rad/s^2], eq. 10.
+
+    Args:
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+        air: the `flow` at the hub.
+        force: of the main rotor.
+    """
+    # K_throttle x_throttle stands alone: its unit is rad/s^2 per unit of stick, not the one that
+    # the paper's nomenclature says.
+    Q = aero.torque(p, s.Omega, p.K_theta0 * u.x_throttle, air, force.inflow)
+    return p.K_throttle * u.x_throttle - (1.0 / p.Ir) * Q
+
+
+class Moments(NamedTuple):
+    """About the centre of gravity [N m]: roll right, nose up, nose right."""
+
+    roll: Scalar
+    pitch: Scalar
+    yaw: Scalar
+
+
+def moments(
+    corrections: Corrections,
+    p: Helicopter,
+    s: Record,
+    u: Record,
+    m: Motion,
+    T: Scalar,
+    dOmega: Scalar,
+) -> Moments:
+    """The moments of eqs 5-7 and 14-17.
+
+    Args:
+        corrections: the switches of the variant.
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        u: inputs, with the names of HelicopterInputs.
+        m: the `motion` of that state.
+        T: thrust of the main rotor [N].
+        dOmega: acceleration of the rotor [rad/s^2], eq. 10.
+    """
+    tilt = cyclic(p, s, u)
+    if corrections.rotor_moment:
+        roll = aero.hub_moment(p, s.Omega, tilt.roll, m.p)
+        pitch = aero.hub_moment(p, s.Omega, tilt.pitch, m.q)
+    else:
+        roll = aero.cyclic_moment(p, s.Omega, tilt.roll)
+        pitch = aero.cyclic_moment(p, s.Omega, tilt.pitch)
+    yaw = _yaw_moment(corrections, p, s, u, m, dOmega)
+    # Eq. 6's -T lr: the rotor axis stands behind the centre of gravity, and lifts the tail.
+    return once(Moments(roll, pitch - T * p.lr, yaw))
+
+
+def _yaw_moment(
+    corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, dOmega: Scalar
+) -> Scalar:
+    """M_psi and what the motor does, eqs 7, 16 and 19 [N m]."""
+    # Trim needs M_psi = -T_m: x_yaw K_theta0T is negative in hover.
+    if corrections.tail:
+        yaw = p.L_T * tail_rotor(p, s, u, m).T
+    else:
+        yaw = aero.tail_moment(p, s.Omega, p.K_theta0T * u.x_yaw)
+    yaw = yaw + motor_torque(corrections, p, u)
+    # The fuselage feels the motor's torque T_m alone. Eq. 7 has -Ir dOmega beside it, the motor a
+    # second time: by eq. 10 that takes T_m off again and leaves the rotor's drag torque, which
+    # follows a throttle step only as the rotor speeds up. Trim, where dOmega = 0, stays the same.
+    if not corrections.reaction:
+        yaw = yaw - p.Ir * dOmega
+    return yaw
+
+
+def accelerations(
+    corrections: Corrections, p: Helicopter, m: Motion, T: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
+    r"""Accelerations along x, y and z [m/s^2], eqs 2-4.
+
+    $$\ddot x = -\tfrac1m\cos\psi\,T\sin\theta, \quad
+      \ddot y = \tfrac1m\cos\psi\,T\sin\phi, \quad
+      \ddot z = \tfrac1m\cos\phi\,T\cos\theta - g$$
+
+    With `direction` $\ddot x = -\tfrac{T}{m}(c_\phi s_\theta c_\psi + s_\phi s_\psi)$ and
+    $\ddot y = -\tfrac{T}{m}(c_\phi s_\theta s_\psi - s_\phi c_\psi)$. With `drag` less
+    $\tfrac12\rho V (S_x u, S_y v, S_z w)/m$ in body axes.
+
+    Args:
+        corrections: the switches of the variant.
+        p: vehicle, SI.
+        m: the `motion` of that state.
+        T: thrust of the main rotor [N].
+    """
+    at, pull = m.at, (1.0 / p.m) * T
+    if corrections.direction:
+        ddx = -pull * (at.cphi * at.sth * at.cpsi + at.sphi * at.spsi)
+        ddy = -pull * (at.cphi * at.sth * at.spsi - at.sphi * at.cpsi)
+    else:
+        # cos(psi) in both: at psi = 90 degrees nothing accelerates horizontally. As printed.
+        ddx, ddy = -pull * at.sth * at.cpsi, pull * at.sphi * at.cpsi
+    ddz = pull * at.cphi * at.cth - p.g
+    if not corrections.drag:
+        return ddx, ddy, ddz
+    slowed = _drag(p, m)
+    return ddx - slowed[0], ddy - slowed[1], ddz - slowed[2]
+
+
+def _drag(p: Helicopter, m: Motion) -> tuple[Scalar, ...]:
+    """What drag takes off the accelerations along x, y and z [m/s^2]."""
+    square = m.u**2 + m.v**2 + m.w**2
+    # The root of a speed of zero has no derivative; this one has, and gives zero drag there.
+    speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
+    factor = once((0.5 * p.rho / p.m) * speed)
+    return _to_earth(m.at, factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w)
+
+
+def angular_accelerations(
+    corrections: Corrections, p: Helicopter, s: Record, m: Motion, M: Moments
+) -> tuple[Scalar, Scalar, Scalar]:
+    r"""Second derivatives of phi, theta and psi [rad/s^2].
+
+    Eqs 5-7, $\ddot\phi = M_\phi/I_{xx}$ and so on, or with `rigid_body` Euler's equations for
+    the body rates, $I\dot\omega = M - \omega\times I\omega$, and the derivative of
+    $\dot\phi = p + \dot\psi s_\theta$, $\dot\theta = q c_\phi - r s_\phi$,
+    $\dot\psi = (q s_\phi + r c_\phi)/c_\theta$.
+
+    Args:
+        corrections: the switches of the variant.
+        p: vehicle, SI.
+        s: state, with the names of HelicopterState.
+        m: the `motion` of that state.
+        M: the `moments`.
+    """
+    Ixx, Iyy, Izz = p.Ixx + p.Ixx_added, p.Iyy + p.Iyy_added, p.Izz
+    if not corrections.rigid_body:
+        return (1.0 / Ixx) * M.roll, (1.0 / Iyy) * M.pitch, (1.0 / Izz) * M.yaw
+    at = m.at
+    dp = (1.0 / Ixx) * (M.roll - (Izz - Iyy) * m.q * m.r)
+    dq = (1.0 / Iyy) * (M.pitch - (Ixx - Izz) * m.r * m.p)
+    dr = (1.0 / Izz) * (M.yaw - (Iyy - Ixx) * m.p * m.q)
+    # The states are derivatives of the angles in every variant, so the body's accelerations are
+    # turned into second derivatives. q sin phi + r cos phi is dpsi cos theta, and so on: products
+    # of the angles' derivatives stand for those with the body's rates.
+    ddtheta = dq * at.cphi - dr * at.sphi - s.dphi * s.dpsi * at.cth
+    turn = dq * at.sphi + dr * at.cphi + s.dphi * s.dtheta + s.dpsi * s.dtheta * at.sth
+    # The angles' own singularity, nose straight up: `_limits` says before it is reached.
+    ddpsi = once(turn / at.cth)
+    ddphi = dp + ddpsi * at.sth + s.dpsi * s.dtheta * at.cth
+    return ddphi, ddtheta, ddpsi

@@ -1,0 +1,104 @@
+"""Process noise in a run: drawn once a sample, with the covariance that a sample adds."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.naming import Number, Record, Scalar
+from heli_jax.numerics.matrix_exponential import van_loan
+from heli_jax.simulation.discretize import process_noise, square_root
+from heli_jax.simulation.solvers import Exact, ZeroOrderHoldArgs
+from heli_jax.simulation.wrappers import StateFeedback, WithProcessNoise
+
+
+def with_process_noise(
+    model: Model,
+    args: ZeroOrderHoldArgs,
+    method: dfx.AbstractSolver,
+    dt: Number,
+    key: Array,
+) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs]:
+    """Standard normal numbers as further inputs, multiplied by a root of the process noise.
+
+    Args:
+        model: one with a noise intensity, n states.
+        args: of the run without noise.
+        method: the solver of a sample.
+        dt: [s].
+        key: a JAX random key.
+
+    Raises:
+        ValueError: the model has no noise, or the run a delay.
+    """
+    if model.noise_intensity is None:
+        raise ValueError(
+            f"key: expected a model with process noise, as with_disturbance makes one, got "
+            f"{model.name!r}"
+        )
+    # A delay cuts an interval in two, and both parts would have to have noise of their own.
+    if args.delay is not None:
+        raise ValueError(
+            "key: expected a run without a delay to draw noise for, got one with delay"
+        )
+    n = jax.tree.leaves(args.inputs)[0].shape[0]
+    dtype, states = jax.tree.leaves(args.inputs)[0].dtype, len(naming.names(model.State))
+    # Drawn for all samples at once: the same key gives the same record, whatever the solver does.
+    if not isinstance(method, Exact) or args.discrete is None:
+        feedback = method.feedback if isinstance(method, StateFeedback) else None
+        draws = jax.random.normal(key, (n, states), dtype)
+        args = args._replace(inputs=(args.inputs, tuple(draws.T)))
+        return WithProcessNoise(
+            method, functools.partial(add_process_noise, model, args, feedback)
+        ), args
+    # The recurrence of a linear model takes draws as it takes inputs: L beside Bd, no step more.
+    L = square_root(process_noise(model, args.params, dt))
+    draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
+    discrete = args.discrete._replace(Bd=jnp.concatenate([args.discrete.Bd, L], axis=1))
+    if discrete.Bn is not None:
+        # The draws are no inputs: nothing of them comes from the next sample.
+        Bn = jnp.concatenate([discrete.Bn, jnp.zeros_like(L)], axis=1)
+        discrete = discrete._replace(Bn=Bn)
+    return method, args._replace(inputs=(args.inputs, tuple(draws.T)), discrete=discrete)
+
+
+def add_process_noise(
+    model: Model,
+    args: ZeroOrderHoldArgs,
+    feedback: Callable[..., Any] | None,
+    state: Record,
+    inputs: Record,
+    draws: Sequence[Scalar],
+) -> Record:
+    """The state after a sample with the noise of that sample, of the model linearised there.
+
+    Args:
+        model: one with a noise intensity, n states.
+        args: of which the parameters and dt count.
+        feedback: None, or what makes the acting inputs of the given ones.
+        state: before the noise is added.
+        inputs: of the sample.
+        draws: n standard normal numbers.
+    """
+    params, dt = args.params, args.dt
+    # The linearisation is at the inputs that acted, which the solver within keeps to itself.
+    if feedback is not None:
+        inputs = feedback(state, inputs)
+    x = naming.ravel(state)
+
+    # The model itself filters the drive of a sample: its covariance is not g g^T dt, in which
+    # states without a drive of their own would get none.
+    def rates(x: Array) -> Array:
+        derivatives = model.vector_field(params, naming.unravel(model.State, x), inputs)
+        return naming.ravel(derivatives, x.dtype, naming.names(model.State))
+
+    assert model.noise_intensity is not None
+    g = naming.ravel(model.noise_intensity(params), x.dtype, naming.names(model.State))
+    L = square_root(van_loan(jax.jacfwd(rates)(x), jnp.zeros_like(g), g, dt).Q)
+    return naming.unravel(model.State, x + L @ jnp.stack(draws))

@@ -1,0 +1,214 @@
+"""From a model and its inputs to a solver that makes one step a sample."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.naming import Number, Record
+from heli_jax.simulation.blocks import columns
+from heli_jax.simulation.discretize import discretize
+from heli_jax.simulation.hold import FlightOrInputs, delayed
+from heli_jax.simulation.options import SimulationOptions
+from heli_jax.simulation.solvers import RK4, Adaptive, Exact, PerSample, RampArgs, ZeroOrderHoldArgs
+
+
+def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tuple[Record, Number]:
+    """The model's Inputs as arrays (N,) and the sample time, from a Flight or from Inputs with dt.
+
+    Args:
+        model: of which the names of the inputs count.
+        flight: a Flight, or Inputs with arrays (N,).
+        dt: [s]; that of the Flight unless given.
+
+    Raises:
+        ValueError: a needed input is missing, the lengths differ, or dt is missing.
+    """
+    # By its dictionary, not by its class: anything with `inputs` and `dt` may be a flight, and a
+    # model's Inputs may have a field of that name, which is an array.
+    by_name = getattr(flight, "inputs", None)
+    if isinstance(by_name, dict):
+        missing = [n for n in naming.names(model.Inputs) if n not in by_name]
+        if missing:
+            raise ValueError(f"the flight has no input {missing[0]!r}, which {model.name} needs")
+        inputs = model.Inputs(**{n: jnp.asarray(by_name[n]) for n in naming.names(model.Inputs)})
+        dt = flight.dt if dt is None else dt
+    else:
+        inputs = jax.tree.map(jnp.asarray, flight)
+    if dt is None:
+        raise ValueError(
+            "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
+        )
+    shapes = {u.shape for u in jax.tree.leaves(inputs)}
+    if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
+        raise ValueError(f"inputs: expected the shape (N,) for all, N >= 2, got {sorted(shapes)}")
+    return inputs, dt
+
+
+def start_state(
+    model: Model, params: Record, initial_state: Record | None, inputs: Record
+) -> Record:
+    """The initial state in the dtype that the parameters and inputs give together.
+
+    Args:
+        model: whose `initial_state` counts unless one is given.
+        params: the model's Params, SI.
+        initial_state: the model's State, or None.
+        inputs: the model's Inputs.
+    """
+    # A loop needs one dtype for its state: float32 parameters in a float64 session stay float32,
+    # and a state that is given in integers becomes numbers.
+    state = model.initial_state(params) if initial_state is None else initial_state
+    leaves = (*jax.tree.leaves(params), *jax.tree.leaves(inputs))
+    dtype = jnp.result_type(*(jnp.asarray(v) for v in leaves))
+    dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
+
+
+_LARGE = 8
+"""States beyond which the stages of RK4 are a loop: 5 % slower, a quarter of the compilation."""
+
+
+def _method(model: Model, solver: str | dfx.AbstractSolver | None) -> dfx.AbstractSolver:
+    if solver is None:
+        solver = "exact" if model.linear else "rk4"
+    if solver == "exact":
+        if not model.linear:
+            raise ValueError(
+                f"model {model.name!r} is not linear: expected solver='rk4' or another, got 'exact'"
+            )
+        return Exact()
+    # Long equations are compiled four times over unless the stages are a loop.
+    if solver == "rk4":
+        return RK4(rolled=len(naming.names(model.State)) > _LARGE)
+    if isinstance(solver, dfx.AbstractSolver):
+        return solver
+    raise ValueError(f"solver: expected 'exact', 'rk4' or a diffrax solver, got {solver!r}")
+
+
+def per_sample(
+    model: Model,
+    params: Record,
+    inputs: Record,
+    options: SimulationOptions,
+    linear: tuple[bool, ...] = (),
+) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm]:
+    """The solver, its arguments and the term for time counted in samples.
+
+    Args:
+        model: of one machine.
+        params: the model's Params, SI.
+        inputs: the model's Inputs, arrays (N,).
+        options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    # "exact" and "rk4" have no error estimate to adapt to; a controller alone means Dopri8.
+    controller, solver = options.controller, options.solver
+    method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
+    if controller is not None and isinstance(method, Exact | RK4):
+        raise ValueError(
+            "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
+            f"{options.solver!r}"
+        )
+    parts = None if options.delay is None else split_delay(options.delay, options.dt)
+
+    term = field_term(model, model.vector_field)
+    dt = jnp.asarray(options.dt, jax.tree.leaves(inputs)[0].dtype)
+    if isinstance(method, Exact):
+        # Discretised once, outside the loop: the parameters do not change during a run.
+        late = None if parts is None else parts[1] * dt
+        discrete = discretize(model, params, dt, late, linear)
+        return method, ZeroOrderHoldArgs(params, inputs, dt, parts, discrete), term
+    if options.substeps < 1:
+        raise ValueError(f"substeps must be at least 1, got {options.substeps}")
+    args = ZeroOrderHoldArgs(params, inputs, dt, parts, None)
+    if controller is None:
+        return PerSample(method, options.substeps, linear=linear), args, term
+    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+    adaptive = Adaptive(method, 1, controller, adjoint, options.max_steps, linear=linear)
+    return adaptive, args, term
+
+
+class _Field(eqx.Module):
+    """A vector field as diffrax calls it: equal for equal models, so that it is compiled once."""
+
+    State: type = eqx.field(static=True)
+    vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
+
+    def __call__(self, t: Number, x: PyTree, now: PyTree) -> PyTree:
+        # What is beside the state (a running value, whether it goes on) does not change with time.
+        if not isinstance(x, self.State):
+            return jax.tree.map(jnp.zeros_like, x)
+        if isinstance(now, ZeroOrderHoldArgs):
+            return x  # only the shapes are asked for; the inputs may not be the model's
+        if isinstance(now, RampArgs):
+            now = now.after(t)
+        return self.vector_field(now.params, x, now.inputs)
+
+
+def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> dfx.ODETerm:
+    """The vector field, per second, within one sample; of its parameters as those of
+    `ZeroOrderHoldArgs`.
+
+    diffrax also evaluates it with the solver's own arguments and state, to compare shapes.
+    """
+    return dfx.ODETerm(_Field(model.State, vector_field))
+
+
+# Where a Kalman filter goes through the record, inputs enter as a known drive: multiplied by B
+# for all samples at once they cost one matrix product.
+def held_columns(
+    model: Model,
+    params: Record,
+    inputs: Record,
+    dt: Number,
+    delay: Number | None,
+    linear: tuple[bool, ...] = (),
+) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
+    """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k.
+
+    Args:
+        model: linear, with n states and m inputs.
+        params: the model's Params, SI.
+        inputs: the model's Inputs, arrays (N,).
+        dt: [s].
+        delay: as in `SimulationOptions`.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    options = SimulationOptions(dt=dt, solver="exact", delay=delay)
+    _, args, _ = per_sample(model, params, inputs, options, linear)
+    assert args.discrete is not None
+    B, U = columns(args)
+    n = U.shape[0]
+    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
+    return args.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
+
+
+def split_delay(delay: Number, dt: Number) -> tuple[Array, Array]:
+    """A delay as whole samples and the rest as a fraction of a sample in [0, 1)."""
+    # The whole samples are an index and have no derivative; all of it is in the rest, so that a fit
+    # can find a delay of several samples.
+    samples = jnp.asarray(delay) / dt
+    whole = jnp.floor(jax.lax.stop_gradient(samples))
+    return whole.astype(int), samples - whole
+
+
+def acting_inputs(
+    inputs: Record, dt: Number, delay: Number, n: int, linear: tuple[bool, ...] = ()
+) -> Record:
+    """The inputs that act at the n samples when they come late.
+
+    Args:
+        inputs: arrays (N,).
+        dt: [s].
+        delay: [s], also negative.
+        n: how many samples.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    return delayed(inputs, *split_delay(delay, dt), n, linear)
