@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
@@ -17,7 +17,7 @@ _TAKES_PART = 1e-3
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
     """The slopes, the simulation, and the named unknowns."""
-    at = slopes(layout, data, noise, z)
+    at = residual_and_jacobian(layout, data, noise, z)
     shown = simulated_at(layout, data, z) if at.shown is None else at.shown
     found = jax.device_get((shown, at.innovations, at.r, at.J, *_named(layout, data, z)))
     outputs, *rest = found

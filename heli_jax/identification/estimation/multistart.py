@@ -13,7 +13,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
     optimise,
-    slopes,
+    residual_and_jacobian,
 )
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import predict
@@ -211,7 +211,7 @@ class Search:
         likelihood. What a Gauss-Newton step would gain there is the squared distance to the
         optimum in standard deviations of whichever unknown lies furthest.
         """
-        at = slopes(layout, self.data, noise, z)
+        at = residual_and_jacobian(layout, self.data, noise, z)
         gain = gauss_newton_gain(at.r, at.J)
         return bool(np.isfinite(gain) and gain < _NEAR**2)
 
