@@ -228,18 +228,17 @@ def filtered_flights(
 ) -> tuple[Innovations, ...]:
     """The innovations of every flight."""
     out = []
-    each = zip(data.flights, u.states, u.biases, noise.sd, strict=True)
-    for i, (flight, state, bias, sd) in enumerate(each):
-        params, inputs = driven(layout, data, u, i)
+    for i, (flight, bias, sd) in enumerate(zip(data.flights, u.biases, noise.sd, strict=True)):
+        drive = driven(layout, data, u, i)
         out.append(
             innovations(
                 layout.model,
-                params,
-                inputs,
+                drive.params,
+                drive.inputs,
                 {n: y - bias[n] for n, y in flight.outputs.items()},
                 {n: s * u.scales[n] if n in u.scales else s for n, s in sd.items()},
-                dt=flight.dt,
-                initial_state=state,
+                dt=drive.dt,
+                initial_state=drive.state,
                 delay=u.shift,
                 substeps=layout.substeps,
                 hold=layout.hold(i),
@@ -302,9 +301,9 @@ def _root_mean_square(y: Any) -> float:
 
 def _disturbed(reached: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
     """By name the outputs (runs, N) with a disturbance drawn for each key."""
-    flight, layout = reached.data.flights[i], reached.layout
-    params, inputs = driven(layout, reached.data, u, i)
-    start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
+    layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
+    params = drive.params
+    first = drive.state if drive.state is not None else layout.model.initial_state(params)
     names, random = naming.names(layout.model.State), layout.model.random_states
     sds = initial_sd_of(layout.model, params, reached.z.dtype)
     # Factored without the sds, which may be zero.
@@ -313,19 +312,20 @@ def _disturbed(reached: Reached, u: Any, i: int, keys: Array) -> dict[str, Array
 
     @jax.jit
     def run(key: Array) -> Any:
-        first, second = jax.random.split(key)
-        drawn = jnp.sum(factor * jax.random.normal(first, (1, len(names)), reached.z.dtype), axis=1)
-        values = {n: getattr(start, n) + drawn[names.index(n)] for n in random}
-        begin = naming.replace(start, **values)
+        of_first, of_noise = jax.random.split(key)
+        drawn = jnp.sum(
+            factor * jax.random.normal(of_first, (1, len(names)), reached.z.dtype), axis=1
+        )
+        values = {n: getattr(first, n) + drawn[names.index(n)] for n in random}
         return simulate(
             layout.model,
             params,
-            inputs,
-            dt=flight.dt,
-            initial_state=begin,
+            drive.inputs,
+            dt=drive.dt,
+            initial_state=naming.replace(first, **values),
             solver=layout.solver,
             substeps=layout.substeps,
-            key=second,
+            key=of_noise,
             hold=layout.hold(i),
         ).outputs
 

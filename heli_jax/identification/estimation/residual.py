@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from heli_jax.identification.estimation.estimator import Residuals
 from heli_jax.identification.estimation.jacobian_coloring import seeded, spread_out
 from heli_jax.identification.estimation.kalman import Innovations
-from heli_jax.identification.estimation.simulated_flights import SimulatedOutputs, shown_of
+from heli_jax.identification.estimation.simulated_flights import SimulatedOutputs, outputs_of
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
 
@@ -76,5 +76,5 @@ def differentiate(
         directions = jnp.asarray(seeds.T, z.dtype)
         r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
         J = spread_out(layout, data, J)
-    shown = None if runs is None else shown_of(unpack(layout, data, z), runs)
+    shown = None if runs is None else outputs_of(unpack(layout, data, z), runs)
     return ResidualAndJacobian(r, J, innovations, shown)
