@@ -94,7 +94,7 @@ def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     n = measured_count(data)
     before = float(np.sum(np.square(np.asarray(alone.r, np.float64))))
     after = max(before - gained, 1e-300)
-    gain = 0.5 * float(layout.estimator.log_likelihood_lost(layout, before / n, after / n, n))
+    gain = 0.5 * float(layout.estimator.deviance(layout, before / n, after / n, n))
     without = layout.estimator.log_likelihood(layout, data, noise, alone) + gain
     return bool(layout.estimator.log_likelihood(layout, data, noise, e) - without > n)
 
