@@ -32,7 +32,7 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
     """
     layout, data = search.layout, search.data
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
-    # Asked first what costs one evaluation: the search without a disturbance takes as long as a fit.
+    # First what costs one evaluation: the search without a disturbance takes as long as a fit.
     if _sure(layout, optimum, e) and _far_better(search, optimum, e):
         return optimum
     without = without_disturbance(search, optimum)
@@ -103,7 +103,7 @@ def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     after = max(before - gained, 1e-300)
     gain = 0.5 * float(layout.estimator.deviance(layout, before / n, after / n, n))
     without = layout.estimator.log_likelihood(layout, data, noise, alone) + gain
-    # By one a sample: far past what the linear model of the residuals may be wrong by.
+    # By one a measured number: far past what the linear model of the residuals may be wrong by.
     return bool(layout.estimator.log_likelihood(layout, data, noise, e) - without > n)
 
 
