@@ -5,7 +5,7 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -25,7 +25,7 @@ from heli_jax.identification.estimation.estimator import (
 )
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.kalman import Innovations, innovations
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -252,24 +252,23 @@ def filtered_flights(
         noise: of the measurements, by flight and output.
         u: the unknowns, in the units of the model.
     """
-    by_flight = []
-    for i, (flight, bias, sd) in enumerate(zip(data.flights, u.biases, noise.sd, strict=True)):
-        drive = driven(layout, data, u, i)
-        by_flight.append(
-            innovations(
-                layout.model,
-                drive.params,
-                drive.inputs,
-                {n: y - bias[n] for n, y in flight.outputs.items()},
-                {n: s * u.scales[n] if n in u.scales else s for n, s in sd.items()},
-                dt=drive.dt,
-                initial_state=drive.state,
-                delay=u.shift,
-                substeps=layout.substeps,
-                hold=layout.hold(i),
-            )
-        )
-    return tuple(by_flight)
+    return tuple(_filtered(layout, data, noise, u, i) for i in range(len(data.flights)))
+
+
+def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> Innovations:
+    drive = driven(layout, data, u, i)
+    return innovations(
+        layout.model,
+        drive.params,
+        drive.inputs,
+        {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()},
+        {n: s * u.scales[n] if n in u.scales else s for n, s in noise.sd[i].items()},
+        dt=drive.dt,
+        initial_state=drive.state,
+        delay=u.shift,
+        substeps=layout.substeps,
+        hold=layout.hold(i),
+    )
 
 
 def _likelihood_rows(
@@ -331,27 +330,17 @@ def _root_mean_square(y: Array | np.ndarray) -> float:
 def _disturbed(reached: Reached, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
     """By name the outputs (runs, N) with a disturbance drawn for each key."""
     layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
-    params = drive.params
-    first = drive.state if drive.state is not None else layout.model.initial_state(params)
-    names, random = naming.names(layout.model.State), layout.model.random_states
-    sds = initial_sd_of(layout.model, params, reached.z.dtype)
-    # Factored without the sds, which may be zero.
-    correlation = correlation_of(layout.model, params, reached.z.dtype)
-    factor = sds[:, None] * jnp.linalg.cholesky(correlation)
+    drawn_state = _random_first_state(layout, drive, reached.z.dtype)
 
     @jax.jit
     def run(key: Array) -> Any:
         of_first, of_noise = jax.random.split(key)
-        drawn = jnp.sum(
-            factor * jax.random.normal(of_first, (1, len(names)), reached.z.dtype), axis=1
-        )
-        values = {n: getattr(first, n) + drawn[names.index(n)] for n in random}
         return simulate(
             layout.model,
-            params,
+            drive.params,
             drive.inputs,
             dt=drive.dt,
-            initial_state=naming.replace(first, **values),
+            initial_state=drawn_state(of_first),
             solver=layout.solver,
             substeps=layout.substeps,
             key=of_noise,
@@ -359,6 +348,23 @@ def _disturbed(reached: Reached, u: Unknowns, i: int, keys: Array) -> dict[str, 
         ).outputs
 
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
+
+
+def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
+    """Of a key the State at the first sample, with what is random there drawn."""
+    model, params = layout.model, drive.params
+    first = drive.state if drive.state is not None else model.initial_state(params)
+    names = naming.names(model.State)
+    sds = initial_sd_of(model, params, dtype)
+    # Factored without the sds, which may be zero.
+    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
+
+    def draw(key: Array) -> Any:
+        drawn = jnp.sum(factor * jax.random.normal(key, (1, len(names)), dtype), axis=1)
+        values = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
+        return naming.replace(first, **values)
+
+    return draw
 
 
 ESTIMATOR = FilterError()

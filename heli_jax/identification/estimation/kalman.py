@@ -85,6 +85,7 @@ def innovations(
     x = naming.ravel(x0, dtype)
     sds = initial_sd_of(model, params, dtype)
     P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
+    # Only what is measured: an output more would cost a correction a sample.
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
     y = jnp.stack(list(measured.values()), axis=1)
@@ -150,6 +151,8 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
     once = jax.lax.optimization_barrier
     Ad, Q, C, R = once((system.Ad, system.Q, system.C, R))
 
+    # Rows of P as a list, and the entries of A and C as scalars: products of whole matrices this
+    # small would cost more in calls than in arithmetic.
     def step(carry: tuple[Array, Any], sample: tuple[Any, Array]) -> tuple[Any, Any]:
         x, P = carry
         y, w = sample
@@ -278,6 +281,7 @@ class _Intervals(NamedTuple):
 
 def _intervals(drive: _Drive) -> _Intervals:
     inputs, delay, linear = drive.inputs, drive.options.delay, drive.linear
+    # The linear filter has its drive from `held_columns`; here steps need the inputs themselves.
     first = jax.tree.leaves(inputs)[0]
     n, dt = first.shape[0], jnp.asarray(drive.options.dt, first.dtype)
     acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
@@ -299,6 +303,8 @@ def _local(drive: _Drive) -> _Filter:
     equations, intervals = _equations(drive), _intervals(drive)
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
+        # With the inputs that act at the sample, which no part of an interval begins with when they
+        # are late.
         u = sample[1]
         C = jax.jacfwd(equations.outputs)(x, u)
         return C, equations.outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
@@ -317,6 +323,7 @@ def _local(drive: _Drive) -> _Filter:
 
 def _along(equations: _Equations, estimate: _Estimate, part: Segment, substeps: int) -> _Estimate:
     """The estimate after a part of an interval, linearised anew in each of its substeps."""
+    # With no slope nothing in the loop depends on time, and it needs no counter.
     h = part.length / substeps
     if part.slope is None:
         return jax.lax.scan(
@@ -335,6 +342,7 @@ def _along(equations: _Equations, estimate: _Estimate, part: Segment, substeps: 
 
 def _held_step(equations: _Equations, estimate: _Estimate, h: Array, u: Any) -> _Estimate:
     (x, P), rates = estimate, equations.rates
+    # With J and f at x itself: shift is the whole step of the linearised equation from there.
     step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), equations.intensity, h)
     return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
 

@@ -184,15 +184,7 @@ def _descend(
     """Step until arrived, from `first`, residuals and Jacobian at the start.
 
     The residuals are evaluated by the one program that evaluates them for everything else: it
-    takes longer to compile than to run.
-
-    Args:
-        evaluate: residuals and Jacobian at a point.
-        constants: of this run.
-        first: residuals and Jacobian at the start.
-        count: of measured numbers, by run.
-        max_steps: at which it is given up.
-        compiled: for one run, or for many where all else has a leading axis.
+    takes longer to compile than to run. With `_BATCHED` all has a leading axis, the runs'.
     """
     state, (r, J) = compiled.begin(constants), first
     for k in range(max_steps):
@@ -244,15 +236,19 @@ def _optimise_in_one_program(
         state = _advance(constants, now.state, _compressed(constants, e.r, e.J))
         return _Loop(now.k + 1, scaling, state, e)
 
+    begin = _before_the_loop(layout, data, noise, z0)
+    end = jax.lax.while_loop(more, step, begin)
+    constants = _constants(layout, z0, end.scaling)
+    return _End(_point(constants, end.state.xi), end.scaling.residual_norm, end.state, end.last)
+
+
+def _before_the_loop(layout: Layout, data: Data, noise: Noise, z0: Array) -> _Loop:
     # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere. Evaluated
     # before the loop it would be compiled twice, the residuals being most of the program.
     scaling = _Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
     shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
     last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-    begin = _Loop(jnp.asarray(0), scaling, _begin(_constants(layout, z0, scaling)), last)
-    end = jax.lax.while_loop(more, step, begin)
-    constants = _constants(layout, z0, end.scaling)
-    return _End(_point(constants, end.state.xi), end.scaling.residual_norm, end.state, end.last)
+    return _Loop(jnp.asarray(0), scaling, _begin(_constants(layout, z0, scaling)), last)
 
 
 def residual_and_jacobian(

@@ -19,7 +19,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.unknowns.layout import Layout, Noise, layout_of
 
 FAR_WORSE = 10.0
 """times the misfit of no model at all from which a start is taken for one that diverges"""
@@ -53,20 +53,24 @@ def by_windows(
     if bool(best.converged) or not _applies(problem) or not _diverges(search, noise, e):
         return None
     cut = _cut(problem)
-    if cut is None:
-        return None
-    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
-    # What the flights share stands first in z in either layout; behind it windows have more.
-    z = start_vector(layout, data, cut)
-    z = z.at[: layout.weak].set(z0[: layout.weak])
-    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
-    # Not whether it converged: half a way out of the growth is enough to begin from.
-    if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
+    short = None if cut is None else _fit_of_windows(cut, search.layout, noise, z0)
+    if short is None:
         return None
     # The windows' initial states stay behind: they were free to take up what the parameters missed.
-    begin = z0.at[: layout.weak].set(short.z[: layout.weak])
-    [run] = search.run(noise, begin[None, :])
+    [run] = search.run(noise, z0.at[: short.size].set(short)[None, :])
     return run if starting.rank(run) < starting.rank(best) else None
+
+
+def _fit_of_windows(cut: Problem, whole: Layout, noise: Noise, z0: Array) -> Array | None:
+    """What the flights share, fitted to the windows; None where that is not finite."""
+    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
+    # It stands first in z in either layout; behind it windows have more.
+    z = start_vector(layout, data, cut)
+    z = z.at[: whole.weak].set(z0[: whole.weak])
+    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
+    # Not whether it converged: half a way out of the growth is enough to begin from.
+    finite = np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))
+    return short.z[: whole.weak] if finite else None
 
 
 def _applies(problem: Problem) -> bool:

@@ -29,14 +29,13 @@ class _TrustRegion(optx.ClassicalTrustRegion):
         f_eval_info: Any,
         state: Any,
     ) -> Any:
-        """The next step size, whether the step counts, and what optimistix carries along.
+        """As optimistix: the next step size, whether the step counts, and two records of its own.
 
         Args:
             first_step: whether nothing has been tried yet.
             y: the unknowns at the last point that was accepted.
             y_eval: the unknowns at the point that is judged.
-            f_info: residuals and Jacobian at y.
-            f_eval_info: the same at y_eval.
+            f_info, f_eval_info: residuals and Jacobian at each.
             state: the step size so far.
         """
         size, accept, result, new = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
@@ -72,14 +71,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
             convergence_mask: the unknowns whose changes count.
         """
         self.rtol, self.atol = rtol, atol
-
-        def norm(x: Array) -> Array:
-            # optimistix asks once with the q unknowns and once with the 2 q + 1 rows; their shape
-            # tells which. Of the rows the first is the size of the residuals, see `_compressed`.
-            unknowns = x.shape == convergence_mask.shape
-            return optx.max_norm(jnp.where(convergence_mask, x, 0.0) if unknowns else x[0])
-
-        self.norm = norm
+        self.norm = _norm(convergence_mask)
         # QR of the rows and not Cholesky of J'J, whose condition number is the square of theirs.
         self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
         # A hundred times the region where three quarters of the gain came that was predicted
@@ -88,3 +80,13 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
             high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
         )
         self.verbose = lambda **_: None
+
+
+def _norm(convergence_mask: Bool[Array, " q"]) -> Callable[[Array], Array]:
+    def norm(x: Array) -> Array:
+        # optimistix asks once with the q unknowns and once with the 2 q + 1 rows; their shape
+        # tells which. Of the rows the first is the size of the residuals, see `_compressed`.
+        unknowns = x.shape == convergence_mask.shape
+        return optx.max_norm(jnp.where(convergence_mask, x, 0.0) if unknowns else x[0])
+
+    return norm
