@@ -114,7 +114,6 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
         along: the derivatives of all rows, a column a colour.
     """
     columns, reach = _columns(layout), _reach(layout, data)
-    p = len(layout.free)
     shared = (columns.window < 0) & (columns.bias < 0) & (columns.flight < 0)
     # Numbers below zero never meet: rows have -2 where unknowns have -1.
     felt = (
@@ -127,7 +126,7 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
     # Priors are of the parameters; each weak prior is of its own unknown.
     nuisances = jnp.arange(layout.size - layout.weak)[:, None] + layout.weak
     of_itself = nuisances == jnp.arange(layout.size)[None, :]
-    prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (p, layout.size))
+    prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (len(layout.free), layout.size))
     kept = jnp.concatenate([felt, prior, of_itself])
     assert kept.shape[0] == along.shape[0], (kept.shape, along.shape)
     return jnp.where(kept, along[:, jnp.asarray(columns.colour)], 0.0)

@@ -189,11 +189,13 @@ def _sum(terms: Iterable[Any]) -> Any:
 
 
 def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
+    # Rows written out one by one are a program whose length grows with the square of the states.
     def move(x: Array, P: Array, now: tuple[Array, Array]) -> _Estimate:
         # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
         x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
         return x, product(product(system.Ad, P), system.Ad.T) + system.Q
 
+    # C stays, so that no step differentiates the outputs.
     samples = (system.drive, system.feed)
     return _run(_Filter(samples, lambda x, now: (system.C, now[1]), move), x0, P0, y, R)
 
@@ -232,8 +234,7 @@ def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Arra
         # never take the difference away again.
         return (x, 0.5 * (P + P.T)), innovation
 
-    _, (e, s) = jax.lax.scan(step, (x, P), (y, filter_.samples))
-    return e, s
+    return jax.lax.scan(step, (x, P), (y, filter_.samples))[1]
 
 
 class _Equations(NamedTuple):

@@ -355,9 +355,11 @@ def table(
 
 def rank(run: Optimum) -> tuple[bool, float]:
     """Sorts runs: those that converged first, then by cost."""
+    # False sorts before True.
     return not bool(run.converged), _cost(run)
 
 
 def _cost(run: Optimum) -> float:
+    # NaN would compare as neither better nor worse, and sort at random.
     cost = float(run.cost)
     return cost if np.isfinite(cost) else float("inf")

@@ -157,6 +157,7 @@ def better_of_two_guesses(
     """
     layout = search.layout
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
+    # One output has no weights, and a filter's noise is not relaxed output by output.
     several = sum(len(o) for o in layout.outputs) > 1
     if not layout.estimator.least_squares or not several or _explained(optimum.noise, guesses):
         return optimum

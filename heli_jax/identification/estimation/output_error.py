@@ -68,7 +68,7 @@ def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> 
         # Without continuity each window has an initial state that nothing ties to its neighbours.
         if layout.continuity is None or run.ends is None:
             continue
-        # The scale is ten times what the state does.
+        # The scale is ten times what the state does, and continuity a part of what it does.
         jumps = [
             (getattr(run.ends, n)[:-1] - getattr(begun, n)[1:])
             / (0.1 * layout.continuity * flight.state_scale[n])

@@ -39,6 +39,7 @@ def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
 
 def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Residuals]:
     """All rows: those of the measurements, then the priors'."""
+    # The measurements' rows first: what asks for them alone need not know how many priors follow.
     residuals = layout.estimator.residuals(layout, data, noise, unpack(layout, data, z))
     rows = [residuals.rows, prior_rows(layout, data, z), weak_rows(layout, z)]
     return jnp.concatenate(rows), residuals

@@ -42,6 +42,7 @@ def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
     # The later wins: what was known of this flight alone stands above what is estimated of all.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
+    # The offset in the log's own numbers, so that it does not change with the gain.
     inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
     return Drive(params, layout.model.Inputs(**inputs), flight.dt, u.states[i])
@@ -134,6 +135,7 @@ def _side_by_side(
     x, y = (jnp.stack(jax.tree.leaves(v)) for v in (states, outputs))
     runs, first = {}, 0
     for i in members:
+        # The windows lie flight after flight along the batch.
         count = layout.windows[i][0]
         n = jax.tree.leaves(data.flights[i].inputs)[0].shape[0]
         windows = slice(first, first + count)
@@ -180,8 +182,14 @@ def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
 
 
 @eqx.filter_jit
-def simulated_at(layout: Layout, data: Data, z: Array) -> SimulatedOutputs:
-    """What is simulated at z, without any derivative."""
+def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
+    """What is simulated at z, without any derivative.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
     u = unpack(layout, data, z)
     return outputs_of(u, predict(layout, data, u))
 
@@ -192,6 +200,7 @@ def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, 
     Args:
         simulated: as NumPy arrays.
     """
+    # In the order of `joined_biases`.
     bias = iter(simulated.biases)
     return tuple(
         {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}
