@@ -8,7 +8,7 @@ import pytest
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
@@ -42,11 +42,12 @@ def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     rng = np.random.default_rng(0)
     z = start_vector(layout, data, one)
     z = z + jnp.asarray(0.1 * rng.standard_normal(z.shape))
-    e = slopes(layout, data, noise, z)
+    e = residual_and_jacobian(layout, data, noise, z)
     # By the program that is compiled; test_offsets holds it against rows_of.
     h = 1e-4 * np.eye(z.size)
     high, low = (
-        np.array([slopes(layout, data, noise, z + s * one).r for one in h]) for s in (1.0, -1.0)
+        np.array([residual_and_jacobian(layout, data, noise, z + s * one).r for one in h])
+        for s in (1.0, -1.0)
     )
     wanted = (high - low).T / 2e-4
     np.testing.assert_allclose(e.J, wanted, rtol=1e-5, atol=1e-7 * np.abs(wanted).max())

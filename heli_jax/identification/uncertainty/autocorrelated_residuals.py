@@ -21,7 +21,7 @@ import scipy.special
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 _LENGTH = 6.0
@@ -164,7 +164,7 @@ def residual_curvature(
     enter linearly, or are so near to it that they are left at J'J. Zero where it is not finite.
     """
     step = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
-    at = slopes(layout, data, noise, z)
+    at = residual_and_jacobian(layout, data, noise, z)
     J = np.asarray(at.J, np.float64)
     q, k = J.shape[1], len(layout.of_interest)
     found = np.zeros((q, q))
@@ -172,7 +172,9 @@ def residual_curvature(
         for i in range(k):
             ends = []
             for sign in (1.0, -1.0):
-                near = slopes(layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype)))
+                near = residual_and_jacobian(
+                    layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype))
+                )
                 ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
             found[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
     found[:k, :k] = 0.5 * (found[:k, :k] + found[:k, :k].T)

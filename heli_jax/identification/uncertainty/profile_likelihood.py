@@ -62,7 +62,7 @@ def _profile(at: Solution, name: str, points: int) -> Profile:
         )
         cost = np.where(ends.converged, ends.cost, np.nan)
         n = measured_count(at.data)
-        lost = at.layout.estimator.log_likelihood_lost(at.layout, cost, first, n)
+        lost = at.layout.estimator.deviance(at.layout, cost, first, n)
         deviance = np.maximum(lost - min(0.0, np.nanmin(lost, initial=0.0)), 0.0)
         root = np.sign(t) * np.sqrt(deviance)
         low, high = (_crossing(root, starts[:, i], side * Z95) for side in (-1, 1))
