@@ -32,7 +32,7 @@ class Linearization(NamedTuple):
             import control
         except ImportError as e:
             raise ImportError(
-                "python-control is not installed, wanted is: pip install control"
+                "to_control: python-control is not installed; remedy: pip install control"
             ) from e
         A, B, C, D = (np.asarray(M, np.float64) for M in self.matrices)
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
@@ -140,7 +140,9 @@ def transfer_function(
     lin = linearize(model, params)
     for name, known, what in ((output, lin.outputs, "output"), (input, lin.inputs, "input")):
         if name not in known:
-            raise ValueError(f"model {model.name} has no {what} {name!r}; it has {known}")
+            raise ValueError(
+                f"model {model.name} has no {what} {name!r}: expected one of {', '.join(known)}"
+            )
     A, B, C, D = (np.asarray(M, dtype=np.float64) for M in lin.matrices)
     i, j = lin.outputs.index(output), lin.inputs.index(input)
     return siso_polynomials(A, B[:, j], C[i], float(D[i, j]))

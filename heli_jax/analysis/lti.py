@@ -41,7 +41,7 @@ def d2c(
             does not exist), or, with "zoh", a pole on the negative real axis, which is named.
     """
     if method not in ("zoh", "real-log"):
-        raise ValueError(f"unknown method {method!r}: use 'zoh' or 'real-log'")
+        raise ValueError(f"method: expected 'zoh' or 'real-log', got {method!r}")
     A, B, C, D = _state_space(num, den, dt)
     n = A.shape[0]
     poles = np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
@@ -69,7 +69,7 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
     b: np.ndarray = np.atleast_1d(np.asarray(num, float))
     a: np.ndarray = np.atleast_1d(np.asarray(den, float))
     if not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt is {dt}, wanted is a sample time in seconds above zero")
+        raise ValueError(f"dt must be above zero, a sample time in seconds, got {dt}")
     if b.ndim != 1 or a.ndim != 1 or not (np.isfinite(b).all() and np.isfinite(a).all()):
         raise ValueError("num and den must be lists of finite numbers")
     b, a = np.trim_zeros(b, "f"), np.trim_zeros(a, "f")

@@ -79,14 +79,14 @@ def margins(
     """
     A, B, C, D = (np.asarray(M, np.float64) for M in (A, B, C, D))
     if A.ndim != 3 or A.shape[1] != A.shape[2]:
-        raise ValueError(f"A has shape {A.shape}, wanted is (batch, n, n)")
+        raise ValueError(f"A: expected shape (batch, n, n), got {A.shape}")
     batch, n = A.shape[:2]
     for name, M, shape in (("B", B, (batch, n)), ("C", C, (batch, n)), ("D", D, (batch,))):
         if M.shape != shape:
-            raise ValueError(f"{name} has shape {M.shape}, wanted is {shape}")
+            raise ValueError(f"{name}: expected shape {shape}, got {M.shape}")
     k = np.asarray(gain, np.float64)
     if k.shape not in ((), (batch,)):
-        raise ValueError(f"gain has shape {k.shape}, wanted is a number or {(batch,)}")
+        raise ValueError(f"gain: expected a number or shape {(batch,)}, got shape {k.shape}")
     result = Margins(np.full(batch, np.nan), np.full(batch, np.nan), np.zeros(batch, bool))
     with np.errstate(all="ignore"):
         k = np.broadcast_to(k, (batch,))

@@ -235,7 +235,7 @@ def _check_sticks(
     for name, (low, high) in sticks.items():
         if name not in naming.names(model.Inputs):
             raise ValueError(
-                f"trim: model {model.name} has no stick {name!r}, it has "
+                f"trim: model {model.name} has no stick {name!r}: expected one of "
                 f"{', '.join(naming.names(model.Inputs))}"
             )
         value = float(getattr(found.inputs, name))

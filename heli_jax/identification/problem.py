@@ -182,13 +182,15 @@ def _check_method(problem: Problem) -> None:
             "made with with_disturbance (in a configuration: a `disturbance`)"
         )
     if not all(n in _FIXABLE for n in problem.fixed_noise):
-        raise ValueError(f"fixed_noise is {problem.fixed_noise}, wanted are some of {_FIXABLE}")
+        raise ValueError(
+            f"fixed_noise: expected some of {', '.join(_FIXABLE)}, got {problem.fixed_noise}"
+        )
     for name in ("sigma_w", "tau_w"):
         if name in problem.free:
             raise ValueError(f"free.{name}: {problem.method} estimates it by itself, leave it out")
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
+            raise ValueError(f"disturbance: fixed {name} must be above zero, got {value:g}")
 
 
 def _check_offsets(problem: Problem) -> None:
@@ -205,14 +207,14 @@ def _check_offsets(problem: Problem) -> None:
 def _check_windows(problem: Problem) -> None:
     if problem.window is None:
         if problem.continuity is not None:
-            raise ValueError("continuity is for windows only, wanted is a window")
+            raise ValueError("continuity is for windows only: expected a window as well, got none")
         return
     if not (math.isfinite(problem.window) and problem.window > 0):
-        raise ValueError(f"window is {problem.window:g} s, wanted is above zero")
+        raise ValueError(f"window must be above zero, got {problem.window:g} s")
     if problem.continuity is not None and not (
         math.isfinite(problem.continuity) and problem.continuity > 0
     ):
-        raise ValueError(f"continuity is {problem.continuity:g}, wanted is above zero")
+        raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
     if not estimator_of(problem.method).windows:
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
     if not problem.nuisance.initial_state:
@@ -226,8 +228,8 @@ def _check_windows(problem: Problem) -> None:
         if samples < 4:
             where = f"flight {flight.name!r}" if flight.name else "a flight"
             raise ValueError(
-                f"{where}: a window of {problem.window:g} s holds {samples} samples, wanted are 4 "
-                "at least"
+                f"{where}: a window must hold 4 samples at least, got {samples} in "
+                f"{problem.window:g} s"
             )
 
 
@@ -242,27 +244,27 @@ def _check_free(name: str, one: Free, model: Model) -> None:
         numbers |= {"prior.mean": one.prior.mean, "prior.sd": one.prior.sd}
     for key, value in numbers.items():
         if value is not None and not math.isfinite(value):
-            raise ValueError(f"free.{name}.{key}: found {value}, wanted is a finite number")
+            raise ValueError(f"free.{name}.{key}: expected a finite number, got {value}")
     if one.prior is not None and one.prior.sd <= 0:
-        raise ValueError(f"free.{name}.prior.sd: found {one.prior.sd:g}, wanted is above zero")
+        raise ValueError(f"free.{name}.prior.sd must be above zero, got {one.prior.sd:g}")
     low, high = one.lower, one.upper
     if one.sign == "keep" and low is not None and high is not None and low < 0 < high:
         raise ValueError(
-            f"free.{name}.sign: keep needs bounds of one sign, got {low:g} to {high:g}"
+            f"free.{name}.sign: keep: expected bounds of one sign, got {low:g} to {high:g}"
         )
     if low is not None and high is not None and low >= high:
-        raise ValueError(f"free.{name}: lower {low:g} is not below upper {high:g}")
+        raise ValueError(f"free.{name}: lower must be below upper, got {low:g} and {high:g}")
     if (low is not None and one.start <= low) or (high is not None and one.start >= high):
         shown = (
             f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
         )
-        raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
+        raise ValueError(f"free.{name}.start: expected a value inside {shown}, got {one.start:g}")
     if one.sign not in ("keep", "any"):
         raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {one.sign!r}")
     if one.start == 0 and one.sign == "keep" and (low is None or high is None):
         raise ValueError(
-            f"free.{name}.start: found 0 without two bounds, wanted is a start of the right sign "
-            "and size, or lower and upper, or sign: any"
+            f"free.{name}.start: expected a start of the right sign and size, or lower and upper, "
+            "or sign: any; got 0 without two bounds"
         )
 
 
@@ -305,16 +307,16 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
                 f"{nearest(name, naming.names(model.Params))}"
             )
         if name in problem.free or name in problem.noise:
-            raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
+            raise ValueError(f"{where}, known.{name}: expected known or free, got both")
         if not math.isfinite(value):
-            raise ValueError(f"{where}, known.{name}: found {value}, wanted is a finite number")
+            raise ValueError(f"{where}, known.{name}: expected a finite number, got {value}")
         wrong = impossible({name: value}) if of_helicopter(model.Params) else None
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
     if not flight.hold_out and flight.n_samples < 3 * len(problem.free):
         raise ValueError(
-            f"{where} has {flight.n_samples} samples for {len(problem.free)} free parameters, "
-            f"wanted are {3 * len(problem.free)} at least"
+            f"{where}: expected at least {3 * len(problem.free)} samples for "
+            f"{len(problem.free)} free parameters, got {flight.n_samples}"
         )
 
 
@@ -323,14 +325,14 @@ def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
         missing = float(np.mean(np.isnan(y)))
         if missing > 0.5:
             raise ValueError(
-                f"{where}: output {name!r} is missing in {100 * missing:.0f} % of its samples, "
-                "wanted is at most half"
+                f"{where}, output {name!r}: expected at most half of its samples to be missing, "
+                f"got {100 * missing:.0f} %"
             )
         stated = name in flight.sd or flight.hold_out
         if problem.noise_is_fixed and not stated:
             raise ValueError(
-                f"{where}: the noise of output {name!r} is fixed (sigma_y) but not stated, wanted "
-                "is its sd"
+                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
+                "(sigma_y), got none"
             )
 
 

@@ -87,7 +87,7 @@ def test_coloured_residuals_are_told(white):
 
 
 def test_a_name_that_is_not_free_is_refused(white):
-    with pytest.raises(ValueError, match="profile of mass: wanted is one of Ixx, If, kappa"):
+    with pytest.raises(ValueError, match="profile: expected one of Ixx, If, kappa, got mass"):
         intervals(white, profiles=["mass"])
 
 

@@ -68,8 +68,8 @@ def baseline(
     part = _longest_whole(flight.outputs[output])
     if part.stop - part.start < 10 * order:
         raise ValueError(
-            f"the longest stretch of {output} without a missing sample has {part.stop - part.start}"
-            f", wanted for order {order} are {10 * order}"
+            f"{output}: expected at least {10 * order} samples in a row for order {order}, got "
+            f"{part.stop - part.start}"
         )
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
     u_scale, y_scale = _rms(u), _rms(y)

@@ -127,11 +127,13 @@ def rls(
         ValueError: order below 1, fewer than 2 order + 1 samples, or u and y of unequal length.
     """
     if order < 1:
-        raise ValueError(f"order is {order}, wanted is at least 1")
+        raise ValueError(f"order must be at least 1, got {order}")
     if u.shape != y.shape or u.ndim != 1:
-        raise ValueError(f"u has shape {u.shape} and y {y.shape}, wanted is (N,) for both")
+        raise ValueError(f"u and y: expected shape (N,) for both, got {u.shape} and {y.shape}")
     if u.shape[0] < 2 * order + 1:
-        raise ValueError(f"{u.shape[0]} samples for order {order}, wanted are {2 * order + 1}")
+        raise ValueError(
+            f"expected at least {2 * order + 1} samples for order {order}, got {u.shape[0]}"
+        )
     phi = regressors(u, y, order)
     run = rls_regression(phi[order:], y[order:], forgetting, p0, bound)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
-from heli_jax.identification.uncertainty.nuts import Posterior, nuts
+from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
 from heli_jax.identification.uncertainty.profile_likelihood import Profile, profile
 
 DIFFERENT = 0.15
@@ -53,7 +53,7 @@ def intervals(
     lines, booted, posterior = {}, None, None
     missing = [n for n in profiles or () if n not in fit.estimates]
     if missing:
-        raise ValueError(f"profile of {missing[0]}: wanted is one of {', '.join(fit.estimates)}")
+        raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
     said: list[str] = []
     if fit.status != "converged" and (profiles or runs or draws):
         why = "the fit did not converge"
@@ -114,9 +114,9 @@ def _sentences(
         )
     if posterior is not None and not posterior.trusted:
         said.append(
-            f"The NUTS chains are not to be trusted (R-hat {posterior.rhat:.3f}, "
-            f"{posterior.effective:.0f} effective draws, {posterior.divergent} divergent steps, "
-            "wanted are below 1.01, above 400 and none): take more draws."
+            "The NUTS chains are not to be trusted (R-hat, effective draws, divergent steps: "
+            f"expected below {RHAT}, above {EFFECTIVE} and none, got {posterior.rhat:.3f}, "
+            f"{posterior.effective:.0f} and {posterior.divergent}): take more draws."
         )
     for name, by in found.items():
         others = {m: i for m, i in by.items() if m != "gaussian"}

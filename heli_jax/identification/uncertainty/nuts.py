@@ -12,6 +12,10 @@ from heli_jax.identification.estimation.residual import prior_rows, rows_of, wea
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, value_of
 
+RHAT = 1.01
+"""potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
+EFFECTIVE = 400
+"""effective draws above which an interval may be read off: 100 a chain (Vehtari et al., 2021)"""
 _CHAINS = 4
 _TARGET = 0.8
 
@@ -30,7 +34,7 @@ class Posterior(NamedTuple):
     @property
     def trusted(self) -> bool:
         """Whether the chains agree, and are long enough for an interval."""
-        return self.rhat < 1.01 and self.effective > 400 and self.divergent == 0
+        return self.rhat < RHAT and self.effective > EFFECTIVE and self.divergent == 0
 
     def interval(self, name: str) -> tuple[float, float]:
         """2.5 and 97.5 % of the draws."""
@@ -62,7 +66,7 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
         import blackjax
     except ImportError as e:
         raise ValueError(
-            "nuts: blackjax is not installed, wanted is the extra: pip install 'heli_jax[bayes]'"
+            "nuts: blackjax is not installed, expected the extra: pip install 'heli_jax[bayes]'"
         ) from e
     at = fit.reached
     if fit.lost:

@@ -39,7 +39,7 @@ def profile(
     """
     for name in names or ():
         if name not in fit.estimates:
-            raise ValueError(f"profile of {name}: wanted is one of {', '.join(fit.estimates)}")
+            raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {name}")
         if name in fit.lost:
             raise ValueError(f"profile of {name}: the data do not determine it")
     chosen = names or [n for n in fit.estimates if n not in fit.lost]
