@@ -40,7 +40,7 @@ from heli_jax.identification.uncertainty.estimates import (
     prior_notes,
     stated_noise_notes,
 )
-from heli_jax.identification.unknowns.layout import Layout, Noise, Reached, unpack
+from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, assess
@@ -145,7 +145,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
     nuisance |= flight_nuisances(problem, layout, data, best.z, e, sure.quantiles, sure.wider)
     none = settled.ratio is not None and settled.ratio < NO_DISTURBANCE
     if none:
-        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.noise}
+        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.disturbance}
     held = _held_out(problem, search, settled)
     sds = noise_by_name(problem, layout, noise, unpack(layout, data, best.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
@@ -191,7 +191,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
         steps=sum(s for s, _ in settled.trace),
         trace=settled.trace,
         notes=tuple(notes),
-        reached=Reached(layout, data, noise, best.z),
+        reached=Solution(layout, data, noise, best.z),
         seed=ran.seed,
         timing=ran.timing,
     )
@@ -200,7 +200,7 @@ def assemble(problem: Problem, search: Search, settled: RelaxedOptimum, ran: Ran
 def _unknowns(layout: Layout, *, none: bool) -> int:
     """All that was estimated; a disturbance that does not show is not among it."""
     estimated = layout.determined + layout.estimator.noise_unknowns(layout)
-    return estimated - (len(layout.noise) if none else 0)
+    return estimated - (len(layout.disturbance) if none else 0)
 
 
 def _notes(
@@ -220,7 +220,7 @@ def _notes(
         ill: whether the numbers are rounding.
     """
     layout, data, best = search.layout, search.data, settled.best
-    reached = {k: float(v) for k, v in zip(layout.named, e.named, strict=True)}
+    reached = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
     return [
         *_stopped_notes(layout, best, settled),
         *excitation.sampling(problem, reached),
@@ -238,7 +238,7 @@ def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
     along = np.zeros((len(verdict.combinations), layout.size))
     for k, c in enumerate(verdict.combinations):
         for name, power in c.exponents.items():
-            i = layout.named.index(name)
+            i = layout.of_interest.index(name)
             along[k, i] = power * slopes[i]
     return along
 
@@ -246,8 +246,8 @@ def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
 def _reported(errors: Sandwich, layout: Layout, e: Evaluation, quantiles: np.ndarray) -> np.ndarray:
     """Covariance (k, k) of the named unknowns with autocorrelated residuals, as wide as the
     intervals that are reported."""
-    named = np.eye(layout.size)[: len(layout.named)]
-    factor = quantiles[: len(layout.named)] / Z95
+    named = np.eye(layout.size)[: len(layout.of_interest)]
+    factor = quantiles[: len(layout.of_interest)] / Z95
     return errors.covariance(named) * np.outer(factor, factor)
 
 

@@ -108,9 +108,9 @@ def fit(
     tell = progress or (lambda _: None)
     begin = _begin(problem)
     before = verdict_of(problem, begin.layout, begin.e)
-    tell(f"fitting {', '.join(begin.layout.named)}")
+    tell(f"fitting {', '.join(begin.layout.of_interest)}")
     points = starting.draw(begin.layout, problem, begin.z, starts, seed)
-    asked = "sigma_w" in begin.layout.noise
+    asked = "sigma_w" in begin.layout.disturbance
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     short = min(max_steps, _FIRST_STEPS) if asked else max_steps

@@ -9,7 +9,7 @@ from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS
-from heli_jax.identification.unknowns.layout import Reached
+from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
@@ -110,7 +110,7 @@ class Fit:
     trace: tuple[tuple[int, float], ...]
     """(steps, cost) of every round of the optimiser"""
     notes: tuple[str, ...]
-    reached: Reached
+    reached: Solution
     """the optimum in the optimiser's coordinates, for profile, bootstrap and NUTS"""
     validation_free_run: dict[str, Metrics] = field(default_factory=dict)
     """with windows: the same simulated in one piece, from the initial state of the first window"""

@@ -13,7 +13,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.filter_error import _disturbed
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Reached, layout_of, unpack
+from heli_jax.identification.unknowns.layout import Solution, layout_of, unpack
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
@@ -249,7 +249,7 @@ def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
     problem = Problem(shown, start, [short], FREE, nuisance, method="filter-error")
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     z = start_vector(layout, data, problem)
-    at = Reached(layout, data, first_noise(problem, problem.training), z)
+    at = Solution(layout, data, first_noise(problem, problem.training), z)
     u = unpack(layout, data, z)
     made_ = _disturbed(at, u, 0, jax.random.split(jax.random.key(0), 4000))
     first = np.stack([made_["roll"][:, 0], made_["roll_rate"][:, 0]])

@@ -67,9 +67,9 @@ def test_a_disturbance_has_ends():
     one = problem(1, 200)
     layout, data = layout_of(one, one.training), data_of(one, one.training)
     z = start_vector(layout, data, one)
-    at = layout.noise_at("tau_w")
+    at = layout.disturbance_at("tau_w")
     for far, tau_w, words in ((-900.0, 0.02 / 100, "white"), (900.0, 1e3 * 4.0, "random walk")):
-        out = z.at[at].set(far).at[layout.noise_at("sigma_w")].set(0.0)
+        out = z.at[at].set(far).at[layout.disturbance_at("sigma_w")].set(0.0)
         assert float(unpack(layout, data, out).noise["tau_w"]) == pytest.approx(tau_w, rel=1e-9)
         J = evaluate(layout, data, first_noise(one, one.training), out).J
         assert np.isinf(deviations(J)[at])
@@ -87,8 +87,8 @@ def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
     layout, data = layout_of(one, one.training), data_of(one, one.training)
     noise = first_noise(one, one.training)
     z = start_vector(layout, data, one)
-    z = z.at[0].add(2.0).at[layout.noise_at("sigma_w")].set(-25.0)
-    z = z.at[layout.noise_at("tau_w")].set(-7.0)
+    z = z.at[0].add(2.0).at[layout.disturbance_at("sigma_w")].set(-25.0)
+    z = z.at[layout.disturbance_at("tau_w")].set(-7.0)
     found = RelaxedOptimum(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
     search = Search(one, layout, data, 200)
     settled = disturbance_or_none(search, found)

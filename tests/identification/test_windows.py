@@ -51,7 +51,7 @@ def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     wanted = (high - low).T / 2e-4
     np.testing.assert_allclose(e.J, wanted, rtol=1e-5, atol=1e-7 * np.abs(wanted).max())
     jumps = 0 if continuity is None else 4 * (3 + 4)
-    assert e.r.size == 2 * (200 + 240) + jumps + 2 + (layout.size - layout.weak)
+    assert e.r.size == 2 * (200 + 240) + jumps + 2 + (layout.size - layout.first_nuisance)
 
 
 def test_windows_that_hang_together_are_one_run():

@@ -12,7 +12,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relaxed_from,
 )
-from heli_jax.identification.unknowns.layout import Layout, Noise, noise_limits
+from heli_jax.identification.unknowns.layout import Layout, Noise, disturbance_limits
 
 NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
@@ -55,10 +55,10 @@ def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     a search begun anew with the disturbance at its start: white noise is a local optimum of short
     records."""
     layout, data = search.layout, search.data
-    if "tau_w" not in layout.noise:
+    if "tau_w" not in layout.disturbance:
         return optimum
-    low, high = (float(v) for v in noise_limits(data)["tau_w"])
-    if low < float(optimum.best.z[layout.noise_at("tau_w")]) < high:
+    low, high = (float(v) for v in disturbance_limits(data)["tau_w"])
+    if low < float(optimum.best.z[layout.disturbance_at("tau_w")]) < high:
         return optimum
     z = with_noise_guess(search, optimum)
     at_guess = evaluate(layout, data, optimum.noise, z)
@@ -72,10 +72,10 @@ def _sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     """Whether a disturbance was found and all of it is determined."""
     if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
         return False
-    at = len(layout.named)
+    at = len(layout.of_interest)
     sds = deviations(e.J)
-    known = np.isfinite(sds[at : at + len(layout.noise)]).all()
-    return bool(known and sds[layout.noise_at("sigma_w")] < _SURE)
+    known = np.isfinite(sds[at : at + len(layout.disturbance)]).all()
+    return bool(known and sds[layout.disturbance_at("sigma_w")] < _SURE)
 
 
 def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
@@ -131,8 +131,8 @@ def _from_nested(
 
 def with_noise_guess(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
     """z at the parameters of an optimum, the disturbance from a coarse search."""
-    layout, at = search.layout, len(search.layout.named)
-    starts = [np.log(search.problem.noise[n].start) for n in layout.noise]
+    layout, at = search.layout, len(search.layout.of_interest)
+    starts = [np.log(search.problem.noise[n].start) for n in layout.disturbance]
     z = optimum.best.z
     z = z.at[at : at + len(starts)].set(jnp.asarray(starts, z.dtype))
     return noise_guess_at(layout, search.data, optimum.noise, z)
@@ -156,6 +156,6 @@ def without_disturbance(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
 
 
 def _silenced(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
-    at = search.layout.noise_at("sigma_w")
+    at = search.layout.disturbance_at("sigma_w")
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
     return optimum.best.z.at[at].set(np.log(smallest) - _NONE)

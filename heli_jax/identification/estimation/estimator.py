@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, Unknowns
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
 
 class Evaluation(NamedTuple):
@@ -109,7 +109,7 @@ class Estimator(abc.ABC):
             floor = 1e-12 * np.sqrt(np.mean(np.square(y[np.isfinite(y)]))) + 1e-300
             size = max(np.sqrt(np.mean(np.square(r)) * freedom), floor)
             sd[i][name] = np.asarray(size, np.asarray(y).dtype)
-        return z, Noise(tuple(sd), noise.level)
+        return z, Noise(tuple(sd), noise.log_variance_ratio)
 
     def noise_matters(self, problem: Problem, layout: Layout, fall: float) -> bool:
         """Whether the optimum moves with the noise; `fall` is that of its level."""
@@ -155,7 +155,7 @@ class Estimator(abc.ABC):
         return total
 
     @abc.abstractmethod
-    def records(self, reached: Reached, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
+    def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """By flight and output what is measured but for bias and noise, (N,), or (runs, N) where
         chance moves the machine too."""
 

@@ -31,7 +31,7 @@ from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
     Noise,
-    Reached,
+    Solution,
     Unknowns,
     unpack,
 )
@@ -83,7 +83,7 @@ class FilterError(Estimator):
         """The noise with the level that the innovations show."""
         level = innovation_sums(e, noise)[1] / measured_count(data)
         level = level if np.isfinite(level) else 0.0
-        return noise._replace(level=np.asarray(level, noise.level.dtype))
+        return noise._replace(log_variance_ratio=np.asarray(level, noise.log_variance_ratio.dtype))
 
     def relax(
         self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
@@ -93,12 +93,12 @@ class FilterError(Estimator):
         n = measured_count(data)
         freedom = n / max(n - layout.determined, 1)
         squares, logs = innovation_sums(e, noise)
-        level = np.asarray(logs / n, noise.level.dtype)
+        level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
-            return z, noise._replace(level=level)
+            return z, noise._replace(log_variance_ratio=level)
         factor = np.sqrt(squares / n * freedom)
-        if "sigma_w" in layout.noise:
-            at = layout.noise_at("sigma_w")
+        if "sigma_w" in layout.disturbance:
+            at = layout.disturbance_at("sigma_w")
             z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
         sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
         return z, Noise(sd, level)
@@ -140,7 +140,7 @@ class FilterError(Estimator):
         n = jnp.sum(jnp.concatenate(counted).astype(rows.dtype))
         return -0.5 * n * jnp.log(jnp.sum(rows**2))
 
-    def records(self, reached: Reached, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
+    def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """Each run with a disturbance drawn anew."""
         return [
             _disturbed(
@@ -274,7 +274,7 @@ def _likelihood_rows(
     log_s = jnp.where(seen, jnp.log(s / sd**2), 0.0)
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
-    above = mean - noise.level
+    above = mean - noise.log_variance_ratio
     if layout.concentrated:
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
@@ -300,7 +300,7 @@ def _root_mean_square(y: Any) -> float:
     return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
 
 
-def _disturbed(reached: Reached, u: Any, i: int, keys: Array) -> dict[str, Array]:
+def _disturbed(reached: Solution, u: Any, i: int, keys: Array) -> dict[str, Array]:
     """By name the outputs (runs, N) with a disturbance drawn for each key."""
     flight, layout = reached.data.flights[i], reached.layout
     params, inputs = driven(layout, reached.data, u, i)

@@ -35,7 +35,7 @@ def seeded(layout: Layout) -> np.ndarray | None:
 
 
 def _columns(layout: Layout) -> _Columns:
-    states, shared = len(layout.states), layout.weak
+    states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
     colour = list(range(shared))
     window, bias, flight = [-1] * shared, [-1] * shared, [-1] * shared
@@ -101,7 +101,7 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
         | (jnp.asarray(flights)[:, None] == jnp.asarray(columns.flight)[None, :])
     )
     # Priors are of the parameters; each weak prior is of its own unknown.
-    weak = jnp.arange(layout.size - layout.weak)[:, None] + layout.weak
+    weak = jnp.arange(layout.size - layout.first_nuisance)[:, None] + layout.first_nuisance
     own = weak == jnp.arange(layout.size)[None, :]
     prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (p, layout.size))
     kept = jnp.concatenate([felt, prior, own])

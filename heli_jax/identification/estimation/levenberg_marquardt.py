@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.estimation.estimator import measured_count
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
 
 class Optimum(NamedTuple):
@@ -320,7 +320,7 @@ def _slopes(layout: Layout, data: Data, noise: Noise, z: Float[Array, "b q"]) ->
 
 
 def optimise_many(
-    reached: Reached,
+    reached: Solution,
     data: Callable[[Any], Data],
     starts: Float[Array, "k q"],
     each: Any,
@@ -361,7 +361,7 @@ def _terms(layout: Layout, z0: Array, units: _Scaling) -> _Terms:
     at = np.arange(layout.size)
     anchor = np.where(at < len(layout.free), 1.0 / _ANCHOR, 0.0)
     # The unknowns whose steps say whether the optimiser has arrived.
-    watched = (at < len(layout.named)) | (at >= layout.weak)
+    watched = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
     ties = jnp.asarray(anchor, z0.dtype)
     # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
     linear = np.array([how == "linear" for how in layout.kinds] + [True] * len(layout.gains))

@@ -46,7 +46,7 @@ def first_guess(
 ) -> Float[Array, " q"]:
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
     linear least squares; what is not among the unknowns stays."""
-    z0 = noise_guess_at(layout, data, noise, z0) if layout.noise else z0
+    z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
     if not (layout.shift or len(layout.gains) == 1):
         return z0
     grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
@@ -66,15 +66,15 @@ def first_guess(
 
 def noise_guess_at(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
     """sigma_w and tau_w of the greatest likelihood on a coarse grid about the start."""
-    at = len(layout.named)
+    at = len(layout.of_interest)
     steps = {
         "sigma_w": np.log(10.0) * np.arange(-3.0, 2.5),
         "tau_w": np.log(10.0) * np.arange(-1, 2),
     }
-    grid = np.stack(np.meshgrid(*(steps[n] for n in layout.noise), indexing="ij"), axis=-1)
-    grid = grid.reshape(-1, len(layout.noise))
+    grid = np.stack(np.meshgrid(*(steps[n] for n in layout.disturbance), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(layout.disturbance))
     points = np.tile(np.asarray(z0), (grid.shape[0], 1))
-    points[:, at : at + len(layout.noise)] += grid
+    points[:, at : at + len(layout.disturbance)] += grid
     costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)

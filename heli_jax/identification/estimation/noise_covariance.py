@@ -89,7 +89,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     for _ in range(_ROUNDS):
         e = evaluate(layout, search.data, noise, best.z)
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
-        fall = float(noise.level - new.level)
+        fall = float(noise.log_variance_ratio - new.log_variance_ratio)
         change = abs(fall) + max(
             abs(float(np.log(sd[n] / before[n])))
             for sd, before in zip(new.sd, noise.sd, strict=True)
@@ -143,12 +143,12 @@ def better_of_two_guesses(
     several = sum(len(o) for o in layout.outputs) > 1
     if not layout.estimator.least_squares or not several or _explained(optimum.noise, guesses):
         return optimum
-    dtype = optimum.noise.level.dtype
+    dtype = optimum.noise.log_variance_ratio.dtype
     sd = tuple(
         {n: np.asarray(float(np.nanstd(f.outputs[n])) or guess[n], dtype) for n in sorted(guess)}
         for f, guess in zip(flights, guesses, strict=True)
     )
-    other = relaxed_from(search, Noise(sd, optimum.noise.level), points[0])
+    other = relaxed_from(search, Noise(sd, optimum.noise.log_variance_ratio), points[0])
     first, second = (_log_posterior(layout, search.data, one) for one in (optimum, other))
     worse = bool(optimum.best.converged) and not bool(other.best.converged)
     if worse or not second > first + _WORTH_TELLING:

@@ -17,7 +17,7 @@ from heli_jax.identification.estimation.estimator import (
     signal_numbers,
 )
 from heli_jax.identification.estimation.simulated_flights import Run, joined_biases, predict
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, Unknowns
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
 
 class OutputError(Estimator):
@@ -35,7 +35,7 @@ class OutputError(Estimator):
         rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd
         return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
 
-    def records(self, reached: Reached, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
+    def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: with no disturbance all runs are the same."""
         layout = reached.layout
         simulated = predict(layout, reached.data, u)

@@ -27,7 +27,7 @@ def prior_rows(layout: Layout, data: Data, z: Float[Array, " q"]) -> Float[Array
 
 def weak_rows(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " r"]:
     """Weak priors of initial states, biases, offsets: coordinates are in units of its sd."""
-    return z[layout.weak :]
+    return z[layout.first_nuisance :]
 
 
 def _all_rows(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, Residuals]:

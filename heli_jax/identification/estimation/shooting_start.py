@@ -51,11 +51,11 @@ def by_windows(
         return None
     layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
     z = start_vector(layout, data, cut)
-    z = z.at[: layout.weak].set(z0[: layout.weak])
+    z = z.at[: layout.first_nuisance].set(z0[: layout.first_nuisance])
     [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
     if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
         return None
-    begin = z0.at[: layout.weak].set(short.z[: layout.weak])
+    begin = z0.at[: layout.first_nuisance].set(short.z[: layout.first_nuisance])
     [run] = search.run(noise, begin[None, :])
     return run if starting.rank(run) < starting.rank(best) else None
 

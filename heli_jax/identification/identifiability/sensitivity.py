@@ -20,7 +20,7 @@ _NEAR_ZERO = 1e-2
 def unknowns_of(problem: Problem, layout: Layout, e: Evaluation) -> tuple[Unknown, ...]:
     """The named unknowns for the verdict, with their size and prior in relative coordinates."""
     found = []
-    for i, name in enumerate(layout.named):
+    for i, name in enumerate(layout.of_interest):
         value = float(e.named[i])
         free = problem.free.get(name)
         if name == "time_shift":
@@ -84,10 +84,10 @@ class _Rows(NamedTuple):
 
 def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> _Rows:
     J = np.asarray(e.J, dtype=np.float64)
-    q, p = len(layout.named), len(layout.free)
-    count = layout.size - layout.weak
-    # Last come the weak priors (all that stands in z from `layout.weak` on), before them the
-    # parameters' own; the jumps between windows count as data.
+    q, p = len(layout.of_interest), len(layout.free)
+    count = layout.size - layout.first_nuisance
+    # Last come the weak priors (all that stands in z from `layout.first_nuisance` on), before them
+    # the parameters' own; the defects between windows count as data.
     data = J[: J.shape[0] - count - p]
     slopes = np.asarray(e.slopes, dtype=np.float64)
     factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)

@@ -166,7 +166,7 @@ def residual_curvature(
     step = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
     at = slopes(layout, data, noise, z)
     J = np.asarray(at.J, np.float64)
-    q, k = J.shape[1], len(layout.named)
+    q, k = J.shape[1], len(layout.of_interest)
     found = np.zeros((q, q))
     with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
         for i in range(k):

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from heli_jax.identification.estimation.levenberg_marquardt import optimise_many
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
-from heli_jax.identification.unknowns.layout import Data, Reached, unpack, value_of
+from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of
 
 _BATCH = 8
 
@@ -67,7 +67,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
 
 
 def _records(
-    fit: Fit, at: Reached, runs: int, seed: int, rng: np.random.Generator
+    fit: Fit, at: Solution, runs: int, seed: int, rng: np.random.Generator
 ) -> tuple[dict[str, Array], ...]:
     """By flight and output (runs, N); NaN where the record has it."""
     u = unpack(at.layout, at.data, at.z)

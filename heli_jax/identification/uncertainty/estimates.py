@@ -9,7 +9,7 @@ from heli_jax.identification.identifiability.sensitivity import references_of, u
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.unknowns.layout import Data, Layout, noise_limits, unpack
+from heli_jax.identification.unknowns.layout import Data, Layout, disturbance_limits, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 
 _SAYS_NOTHING = 1e3
@@ -120,9 +120,9 @@ def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
 def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
     """Where a parameter of the disturbance ran to the end of what a record can show."""
     notes = []
-    limits = noise_limits(data)
-    for i, name in enumerate(layout.noise):
-        at = float(z[len(layout.named) + i])
+    limits = disturbance_limits(data)
+    for i, name in enumerate(layout.disturbance):
+        at = float(z[len(layout.of_interest) + i])
         low, high = (float(v) for v in limits[name])
         if low < at < high:
             continue
@@ -160,21 +160,21 @@ def flight_nuisances(
     wider: np.ndarray,
 ) -> dict[str, Estimate]:
     """The disturbance, then initial states, biases and input offsets with their weak priors."""
-    q = len(layout.named)
+    q = len(layout.of_interest)
     if layout.size == q:
         return {}
     whites = deviations(e.J)
     sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
     out, starts = {}, problem.noise
     disturbance = unpack(layout, data, z).noise
-    for i, name in enumerate(layout.noise):
+    for i, name in enumerate(layout.disturbance):
         value, relative = float(disturbance[name]), float(sds[q + i])
         reach = float(np.exp(min(float(quantiles[q + i]) * relative, 700.0)))
         unit = naming.unit(layout.model.Params, name) or ""
         limits = (value / reach, value * reach)
         said = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
         out[name] = Estimate(value, *said, unit, starts[name].start, 0.0, False)
-    at = layout.weak
+    at = layout.first_nuisance
     for label, flight, outputs, (count, _) in zip(
         labels(problem.training), data.flights, layout.outputs, layout.windows, strict=True
     ):

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Reached, value_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, value_of
 
 RHAT = 1.01
 """potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
@@ -101,7 +101,7 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
 
 
 def _sample(
-    blackjax: Any, density: Any, at: Reached, draws: int, warmup: int, seed: int
+    blackjax: Any, density: Any, at: Solution, draws: int, warmup: int, seed: int
 ) -> tuple[Array, Array]:
     """Positions (chains, draws, q) and whether each step diverged (chains, draws)."""
     q = at.layout.size
@@ -130,7 +130,7 @@ def _sample(
     return jax.jit(jax.vmap(chain))(jax.random.split(keys[2], _CHAINS))
 
 
-def _posterior(at: Reached, z: np.ndarray, divergent: int) -> Posterior:
+def _posterior(at: Solution, z: np.ndarray, divergent: int) -> Posterior:
     from blackjax import diagnostics
 
     named = jnp.asarray(z[:, :, : len(at.layout.free)])

@@ -10,7 +10,7 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import measured_count, optimise_many
 from heli_jax.identification.identifiability.verdict import Z95
 from heli_jax.identification.result import Fit
-from heli_jax.identification.unknowns.layout import Reached, value_of
+from heli_jax.identification.unknowns.layout import Solution, value_of
 
 _WIDER = (3.0, 9.0)
 
@@ -46,7 +46,7 @@ def profile(
     return {name: _profile(fit.reached, name, points) for name in chosen}
 
 
-def _profile(at: Reached, name: str, points: int) -> Profile:
+def _profile(at: Solution, name: str, points: int) -> Profile:
     i = at.layout.free.index(name)
     e = evaluate(at.layout, at.data, at.noise, at.z)
     inverse = np.linalg.pinv(np.asarray(e.J, np.float64), rcond=1e-10)

@@ -24,7 +24,7 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
     ]
     one, zero = jnp.ones((), data.low.dtype), jnp.zeros((), data.low.dtype)
     z += [one] * len(layout.gains) + [zero] * layout.shift
-    z += [jnp.asarray(np.log(problem.noise[n].start), data.low.dtype) for n in layout.noise]
+    z += [jnp.asarray(np.log(problem.noise[n].start), data.low.dtype) for n in layout.disturbance]
     z = jnp.stack([*z, *[zero] * (layout.size - len(z))])
     if layout.initial_state:
         z = _initial_states(layout, data, problem, z)
@@ -34,7 +34,7 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
     """The model's own initial state, or for one that is not linear the nearest that shows the
     measured outputs at the first sample of the window."""
-    at = layout.weak
+    at = layout.first_nuisance
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for flight, outputs, (count, m) in zip(
         data.flights, layout.outputs, layout.windows, strict=True

@@ -73,7 +73,7 @@ class Layout(eqx.Module):
     """inputs with an offset of their own in each flight"""
     outputs: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """by flight, sorted by name: the order of the residuals"""
-    noise: tuple[str, ...] = eqx.field(static=True)
+    disturbance: tuple[str, ...] = eqx.field(static=True)
     """parameters of the disturbance, estimated beside the others by filter error"""
     scaled: tuple[str, ...] = eqx.field(static=True)
     """filter error: outputs whose noise has an unknown factor of its own"""
@@ -93,7 +93,7 @@ class Layout(eqx.Module):
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def of_interest(self) -> tuple[str, ...]:
         """The unknowns that the verdict speaks of: parameters, gains, the shift."""
         gains = tuple(f"gain {name}" for name in self.gains)
         return (*self.free, *gains, *(("time_shift",) if self.shift else ()))
@@ -107,18 +107,18 @@ class Layout(eqx.Module):
         return tuple(n for n in naming.names(self.model.State) if n not in random)
 
     @property
-    def weak(self) -> int:
+    def first_nuisance(self) -> int:
         """Where in z the initial states, biases and input offsets begin."""
-        return len(self.named) + len(self.noise) + len(self.scaled)
+        return len(self.of_interest) + len(self.disturbance) + len(self.scaled)
 
-    def noise_at(self, name: str) -> int:
+    def disturbance_at(self, name: str) -> int:
         """Where in z a parameter of the disturbance stands."""
-        return len(self.named) + self.noise.index(name)
+        return len(self.of_interest) + self.disturbance.index(name)
 
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        return self.weak + sum(
+        return self.first_nuisance + sum(
             count * len(self.states) + self.constants(outputs)
             for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
         )
@@ -144,12 +144,12 @@ class Noise(NamedTuple):
 
     sd: tuple[dict[str, Any], ...]
     """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
-    level: Any
+    log_variance_ratio: Any
     """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
     the likelihood is laid out in rows, so that they have variance 1"""
 
 
-class Reached(NamedTuple):
+class Solution(NamedTuple):
     """Where a fit ended, for what goes on from there."""
 
     layout: Layout
@@ -195,7 +195,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         bias=nuisance.bias,
         offsets=offset_inputs(problem),
         outputs=tuple(tuple(sorted(f.outputs)) for f in flights),
-        noise=tuple(problem.noise),
+        disturbance=tuple(problem.noise),
         scaled=scaled,
         estimator=estimator,
         concentrated=concentrated,
@@ -227,7 +227,7 @@ def value_of(layout: Layout, data: Data, i: int, z: Any) -> Any:
     return coordinates.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 
-def noise_limits(data: Data) -> dict[str, tuple[Any, Any]]:
+def disturbance_limits(data: Data) -> dict[str, tuple[Any, Any]]:
     """Lowest and highest logarithm of each parameter of the disturbance.
 
     A correlation time below a hundredth of a sample is white noise to any record, one above a
@@ -261,16 +261,17 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
     if layout.shift:
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
-    limits = noise_limits(data)
+    limits = disturbance_limits(data)
     noise = {
-        name: jnp.exp(jnp.clip(z[at + i], *limits[name])) for i, name in enumerate(layout.noise)
+        name: jnp.exp(jnp.clip(z[at + i], *limits[name]))
+        for i, name in enumerate(layout.disturbance)
     }
-    at += len(layout.noise)
+    at += len(layout.disturbance)
     scales = {
         name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
         for i, name in enumerate(layout.scaled)
     }
-    at = layout.weak
+    at = layout.first_nuisance
     states, biases, offsets = [], [], []
     for flight, outputs, (count, _) in zip(
         data.flights, layout.outputs, layout.windows, strict=True

@@ -19,7 +19,7 @@ class WeakUnknown(NamedTuple):
 
 
 def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
-    """The unknowns from `layout.weak` on, in their order."""
+    """The unknowns from `layout.first_nuisance` on, in their order."""
     found = []
     for label, outputs, (count, _) in zip(
         labels(problem.training), layout.outputs, layout.windows, strict=True
@@ -36,7 +36,7 @@ def weak_unknowns(problem: Problem, layout: Layout) -> tuple[WeakUnknown, ...]:
             WeakUnknown(f"{label}/offset {n}", "input_offset", f"the offset of {n}")
             for n in layout.offsets
         ]
-    size = layout.size - layout.weak
+    size = layout.size - layout.first_nuisance
     # One that is not listed here is left without a name, not taken for another.
     if len(found) != size:
         found = [WeakUnknown(f"nuisance {i + 1}", "", "a nuisance") for i in range(size)]

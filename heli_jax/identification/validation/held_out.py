@@ -43,17 +43,17 @@ def validate(
         noise: that of the fitted flights.
     """
     other, data = layout_of(problem, held), data_of(problem, held)
-    begin = jnp.zeros(other.size - layout.weak, z.dtype)
+    begin = jnp.zeros(other.size - layout.first_nuisance, z.dtype)
     if not problem.model.linear:
-        begin = start_vector(other, data, problem)[layout.weak :]
-    full = jnp.concatenate([z[: layout.weak], begin])
+        begin = start_vector(other, data, problem)[layout.first_nuisance :]
+    full = jnp.concatenate([z[: layout.first_nuisance], begin])
     theirs = first_noise(problem, held)
     if layout.estimator.shared_noise:
         known = {n: s for one in noise.sd for n, s in one.items()}
         sd = tuple({n: known.get(n, s) for n, s in one.items()} for one in theirs.sd)
         theirs = theirs._replace(sd=sd)
     arrived = True
-    if other.size > layout.weak:
+    if other.size > layout.first_nuisance:
         adjust = _linear if problem.model.linear else _damped
         full, arrived = adjust(other, data, theirs, full)
     e = evaluate(other, data, theirs, full)
@@ -67,16 +67,16 @@ def validate(
 def _linear(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
     """A model that is linear in its states: one least-squares solution."""
     e = evaluate(layout, data, noise, z)
-    columns, r = np.asarray(e.J)[:, layout.weak :], np.asarray(e.r)
+    columns, r = np.asarray(e.J)[:, layout.first_nuisance :], np.asarray(e.r)
     if not (np.isfinite(columns).all() and np.isfinite(r).all()):
         return z, False
     step, *_ = np.linalg.lstsq(columns, -r, rcond=1e-10)
-    return z.at[layout.weak :].add(jnp.asarray(step, z.dtype)), True
+    return z.at[layout.first_nuisance :].add(jnp.asarray(step, z.dtype)), True
 
 
 def _damped(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, bool]:
     """The fit's own Levenberg-Marquardt, with all that the flights share held."""
-    held = np.arange(layout.size) < layout.weak
+    held = np.arange(layout.size) < layout.first_nuisance
     best = optimise(layout, data, noise, z, _STEPS, held=held)
     if not (np.isfinite(best.cost) and bool(jnp.all(jnp.isfinite(best.z)))):
         return z, False
@@ -85,7 +85,7 @@ def _damped(layout: Layout, data: Data, noise: Noise, z: Array) -> tuple[Array, 
 
 def _in_one_piece(layout: Layout, z: Array) -> tuple[Layout, Array]:
     """The same without windows: each flight from the initial state of its first."""
-    kept, at, k = [np.arange(layout.weak)], layout.weak, len(layout.states)
+    kept, at, k = [np.arange(layout.first_nuisance)], layout.first_nuisance, len(layout.states)
     for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
         constants = layout.constants(outputs)
         kept += [at + np.arange(k), at + count * k + np.arange(constants)]

@@ -67,16 +67,16 @@ def other_hold(
         return []
     if not (np.all(np.isfinite(other.J)) and np.all(np.isfinite(other.r))):
         return []
-    q = len(layout.named)
+    q = len(layout.of_interest)
     change = _pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
     change = change * np.asarray(e.slopes)
     if sd is None:
         rows = _pseudoinverse(np.asarray(e.J))[:q]
         expected = np.linalg.norm(rows, axis=1) * np.abs(e.slopes)
-        sd = dict(zip(layout.named, expected.tolist(), strict=True))
+        sd = dict(zip(layout.of_interest, expected.tolist(), strict=True))
     sizes = {
         n: (float(c), abs(float(c)) / sd[n])
-        for n, c in zip(layout.named, change, strict=True)
+        for n, c in zip(layout.of_interest, change, strict=True)
         if n not in skip and sd.get(n, 0.0) > 0
     }
     return _sentence(problem.training, moving, layout, e, sizes)
@@ -143,7 +143,7 @@ def _sentence(
         for n in f.inputs
         if n in names
     )
-    values = dict(zip(layout.named, np.asarray(e.named).tolist(), strict=True))
+    values = dict(zip(layout.of_interest, np.asarray(e.named).tolist(), strict=True))
     said = [_changed(n, values[n], *sizes[n]) for n in large[:_MOST]]
     return [
         f"Between samples {', '.join(taken)}: with the other hold {', '.join(said)}. An input that "
