@@ -52,7 +52,7 @@ def test_hover_stays_and_sticks_are_added_to_the_trim(made):
 
 def test_start_wind_pilot_and_ground(made):
     found = made(
-        start={"ahead": 4.0, "climb": -1.0, "heading": 0.5},
+        start={"forward_speed": 4.0, "climb": -1.0, "heading": 0.5},
         wind=[2.0, 0.0, 0.0],
         hold_attitude=True,
         ground=-1.0,

@@ -1,5 +1,6 @@
 """Trim: the state and the sticks at which a helicopter stays in a steady flight."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -23,15 +24,64 @@ _POLISH = 3
 _TRIES = 12
 
 
-class Condition(NamedTuple):
-    """A steady flight; speeds over the ground in m/s, along the heading and across it."""
-
-    ahead: Any = 0.0
-    aside: Any = 0.0
-    """to the right"""
+class _Condition(NamedTuple):
+    forward_speed: Any = 0.0
+    """over the ground along the heading [m/s]"""
+    lateral_speed: Any = 0.0
+    """to the right of it [m/s]"""
     climb: Any = 0.0
+    """[m/s]"""
     heading: Any = 0.0
     """psi [rad]"""
+
+
+class Condition(_Condition):
+    """A steady flight; speeds over the ground in m/s, along the heading and across it.
+
+    The keywords `ahead` and `aside` are deprecated: `forward_speed` and `lateral_speed`.
+    """
+
+    # A named tuple takes no keyword beside its fields: the old ones need a subclass with a __new__.
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        forward_speed: Any = 0.0,
+        lateral_speed: Any = 0.0,
+        climb: Any = 0.0,
+        heading: Any = 0.0,
+        **deprecated: Any,
+    ) -> "Condition":
+        speeds = {"forward_speed": forward_speed, "lateral_speed": lateral_speed}
+        for old, value in deprecated.items():
+            if old not in _RENAMED:
+                raise TypeError(f"Condition: expected {', '.join(cls._fields)}, got {old!r}")
+            _warn_renamed(old)
+            speeds[_RENAMED[old]] = value
+        return super().__new__(cls, **speeds, climb=climb, heading=heading)
+
+    @property
+    def ahead(self) -> Any:
+        """Deprecated: the name that `forward_speed` had."""
+        _warn_renamed("ahead")
+        return self.forward_speed
+
+    @property
+    def aside(self) -> Any:
+        """Deprecated: the name that `lateral_speed` had."""
+        _warn_renamed("aside")
+        return self.lateral_speed
+
+
+_RENAMED = {"ahead": "forward_speed", "aside": "lateral_speed"}
+
+
+def _warn_renamed(old: str) -> None:
+    warnings.warn(
+        f"Condition: {old} is deprecated, expected {_RENAMED[old]}",
+        DeprecationWarning,
+        stacklevel=3,
+    )
 
 
 class Trim(NamedTuple):
@@ -123,8 +173,8 @@ def _equilibrium(
         values = dict(zip(names, z, strict=True))
         fixed = {
             "psi": condition.heading,
-            "dx": condition.ahead * cpsi - condition.aside * spsi,
-            "dy": condition.ahead * spsi + condition.aside * cpsi,
+            "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,
+            "dy": condition.forward_speed * spsi + condition.lateral_speed * cpsi,
             "dz": condition.climb,
         }
         state = naming.replace(
@@ -264,9 +314,10 @@ def _check_range(model: Model, params: Any, found: Trim, condition: Condition) -
 
 
 def _words(condition: Condition) -> str:
-    speeds = {
-        f"{float(v):g} m/s {n}"
-        for n, v in condition._asdict().items()
-        if n != "heading" and float(v) != 0.0
-    }
+    named = (
+        ("forward", condition.forward_speed),
+        ("to the right", condition.lateral_speed),
+        ("climb", condition.climb),
+    )
+    speeds = {f"{float(v):g} m/s {n}" for n, v in named if float(v) != 0.0}
     return " and ".join(sorted(speeds)) or "hover"

@@ -1,5 +1,6 @@
 """What may stand in a configuration: its sections, their keys and their bounds."""
 
+import warnings
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
@@ -166,14 +167,30 @@ class NoiseConfig(_Strict):
 class StartConfig(_Strict):
     """The steady flight in which a run of the whole helicopter begins."""
 
-    ahead: Finite = 0.0
+    forward_speed: Finite = 0.0
     """speed over the ground along the heading [m/s]"""
-    aside: Finite = 0.0
+    lateral_speed: Finite = 0.0
     """to the right of it [m/s]"""
     climb: Finite = 0.0
     """[m/s]"""
     heading: Finite = 0.0
     """psi [rad]"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, content: Any) -> Any:
+        """The keys under which the speeds stood before, accepted with a warning."""
+        if not isinstance(content, dict):
+            return content
+        content = dict(content)
+        for old, new in (("ahead", "forward_speed"), ("aside", "lateral_speed")):
+            if old not in content:
+                continue
+            if new in content:
+                raise ValueError(f"expected {new} alone, got {old} and {new}, which mean the same")
+            warnings.warn(f"{old} is deprecated, expected {new}", DeprecationWarning, stacklevel=2)
+            content[new] = content.pop(old)
+        return content
 
 
 class SimulateConfig(_Strict):

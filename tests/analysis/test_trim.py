@@ -9,6 +9,7 @@ import pytest
 from heli_jax import linearize, load_vehicle, models, naming, trim
 from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.analysis.trim import Condition, equilibrium
+from heli_jax.config.schema import StartConfig
 from heli_jax.dynamics import helicopter as whole
 from tests.dynamics import whole_helicopter as oracle
 
@@ -101,10 +102,10 @@ def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
     [
         Condition(climb=2.0),
         Condition(climb=-1.5),
-        Condition(ahead=12.0),
-        Condition(ahead=-5.0),
-        Condition(aside=6.0),
-        Condition(ahead=8.0, aside=-3.0, climb=1.0, heading=2.0),
+        Condition(forward_speed=12.0),
+        Condition(forward_speed=-5.0),
+        Condition(lateral_speed=6.0),
+        Condition(forward_speed=8.0, lateral_speed=-3.0, climb=1.0, heading=2.0),
     ],
 )
 def test_steady_flights_are_steady(condition, xcell):
@@ -118,15 +119,31 @@ def test_steady_flights_are_steady(condition, xcell):
     moving = {"x", "y", "z"}
     assert max(abs(r) for n, r in rates.items() if n not in moving) < 1e-9
     c, d = np.cos(condition.heading), np.sin(condition.heading)
-    assert rates["x"] == pytest.approx(condition.ahead * c - condition.aside * d)
+    assert rates["x"] == pytest.approx(condition.forward_speed * c - condition.lateral_speed * d)
     assert rates["z"] == condition.climb
-    if condition.ahead > 5:
+    if condition.forward_speed > 5:
         assert s["theta"] < 0  # nose down against the drag
+
+
+def test_the_old_names_of_the_speeds_are_accepted_with_a_warning():
+    new = Condition(forward_speed=8.0, lateral_speed=-3.0)
+    with pytest.warns(DeprecationWarning, match="expected forward_speed"):
+        assert Condition(ahead=8.0, lateral_speed=-3.0) == new
+    with pytest.warns(DeprecationWarning, match="expected lateral_speed"):
+        assert Condition(8.0, aside=-3.0) == new
+    with pytest.warns(DeprecationWarning, match="expected lateral_speed"):
+        assert new.aside == -3.0
+    with pytest.warns(DeprecationWarning, match="expected forward_speed"):
+        assert StartConfig.model_validate({"ahead": 8.0}).forward_speed == 8.0
+    with pytest.raises(TypeError, match="expected forward_speed, lateral_speed"):
+        Condition(sideways=1.0)
+    with pytest.raises(ValueError, match="expected forward_speed alone, got ahead and"):
+        StartConfig.model_validate({"ahead": 8.0, "forward_speed": 8.0})
 
 
 def test_hover_in_a_wind_is_flight_the_other_way(xcell):
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
-    still = trim(models.helicopter(), p, Condition(ahead=6.0))
+    still = trim(models.helicopter(), p, Condition(forward_speed=6.0))
     blown = trim(models.helicopter(wind=True), p, wind=(-6.0, 0.0, 0.0))
     assert float(blown.state.theta) == pytest.approx(float(still.state.theta), abs=1e-12)
     assert float(blown.inputs.x_throttle) == pytest.approx(float(still.inputs.x_throttle))

@@ -227,7 +227,7 @@ WRONG = {
         lambda c: c["sweep"].update(solver="Kvaerno5"), ["unknown solver 'Kvaerno5'", "Dopri5"],
     ),
     "trim of a roll model": (
-        lambda c: c["sweep"].update(start={"ahead": 1.0}), ["sweep.start"],
+        lambda c: c["sweep"].update(start={"forward_speed": 1.0}), ["sweep.start"],
     ),
     "chunks of nothing": (lambda c: c["sweep"].update(chunk=0), ["chunk is 0"]),
     "margins without input": (

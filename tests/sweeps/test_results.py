@@ -344,7 +344,7 @@ STILL = Flight(
     dt=0.02, inputs={n: np.zeros(51) for n in naming.names(HELICOPTER.Inputs)}, outputs={},
     name="still",
 )  # fmt: skip
-AHEAD = Condition(ahead=10.0)
+AHEAD = Condition(forward_speed=10.0)
 
 
 def test_helicopters_begin_in_a_trim_of_their_own(xcell):

@@ -87,9 +87,9 @@ def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
     dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
     heading = outputs.get("yaw")
     psi = float(np.nanmean(heading)) if heading is not None else 0.0
-    ahead, aside = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
-    dx, dy, dz = (float(v) if abs(v) >= _SLOW else 0.0 for v in (ahead, aside, dz))
-    return Condition(dx, dy, dz, psi) if dx or dy or dz else HOVER
+    forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
+    speeds = [float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz)]
+    return Condition(*speeds, psi) if any(speeds) else HOVER
 
 
 def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
@@ -105,7 +105,11 @@ def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float
 
 
 def _words(condition: Condition) -> str:
-    named = ("ahead", condition.ahead), ("to the right", condition.aside), ("up", condition.climb)
+    named = (
+        ("ahead", condition.forward_speed),
+        ("to the right", condition.lateral_speed),
+        ("up", condition.climb),
+    )
     parts = [f"{v:.2g} m/s {n}" for n, v in named if v]
     return f"at {', '.join(parts)}" if parts else "in hover"
 
