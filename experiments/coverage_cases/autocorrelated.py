@@ -58,7 +58,7 @@ def fitted(vehicle: Any, u: np.ndarray, y: np.ndarray, free: dict[str, Free]) ->
     flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
     found = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
     run = intervals(found, {n: float(getattr(vehicle, n)) for n in free})
-    flags = {"taken for white": not found.coloured, "not determined": bool(found.lost)}
+    flags = {"taken for white": not found.coloured, "not determined": bool(found.not_identifiable)}
     return dataclasses.replace(run, flags=flags)
 
 

@@ -19,6 +19,7 @@ class Method(NamedTuple):
     """as reports call it"""
 
 
+# By name: estimators import the problem, and a problem asks here which methods there are.
 _ESTIMATION = "heli_jax.identification.estimation"
 
 METHODS = {
@@ -36,6 +37,7 @@ def estimator_of(method: str) -> Any:
         ValueError: there is no such method.
     """
     if method not in METHODS:
+        # Cut: a configuration may hold anything in this place.
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}, got {method!r:.60}"
             f"{nearest(str(method)[:60], METHODS)}"

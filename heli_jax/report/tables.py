@@ -72,7 +72,7 @@ def _determined(fit: Fit) -> Headline:
     who = "the data and the priors together" if resting else "the data"
     text = f"{who} determine {listed(names)}"
     doubts = [
-        ("the intervals are too narrow", fit.narrow),
+        ("the intervals are too narrow", fit.overconfident),
         ("the residuals are not white", fit.coloured and not fit.white),
         ("residuals of outputs are correlated", fit.coloured and fit.white),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),

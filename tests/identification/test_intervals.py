@@ -91,6 +91,12 @@ def test_a_name_that_is_not_free_is_refused(white):
         intervals(white, profiles=["mass"])
 
 
+def test_the_old_names_of_a_fits_properties_warn(white):
+    for old, new in (("lost", "not_identifiable"), ("narrow", "overconfident")):
+        with pytest.warns(DeprecationWarning, match=f"Fit: {old} is deprecated, expected {new}"):
+            assert getattr(white, old) == getattr(white, new)
+
+
 def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):
     open_ = {n: e._replace(sd=None) if n == "If" else e for n, e in white.estimates.items()}
     poor = dataclasses.replace(white, estimates=open_, status="not-identifiable")

@@ -40,8 +40,8 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     at = fit.reached
     if at.layout.shift:
         raise ValueError("bootstrap: not available with a free time shift")
-    if fit.lost:
-        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.lost)}")
+    if fit.not_identifiable:
+        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
     rng = np.random.default_rng(seed)
     outputs = _records(fit, at, runs, seed, rng)
     values = np.array([fit.estimates[n].value for n in at.layout.free])

@@ -57,8 +57,8 @@ def intervals(
     said: list[str] = []
     if fit.status != "converged" and (profiles or runs or draws):
         why = "the fit did not converge"
-        if fit.lost:
-            why = f"the data do not determine {', '.join(fit.lost)}"
+        if fit.not_identifiable:
+            why = f"the data do not determine {', '.join(fit.not_identifiable)}"
         said = [f"No further intervals: {why}."]
         profiles, runs, draws = None, 0, 0
     if profiles:

@@ -69,8 +69,8 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
             "nuts: blackjax is not installed, expected the extra: pip install 'heli_jax[bayes]'"
         ) from e
     at = fit.reached
-    if fit.lost:
-        raise ValueError(f"nuts: the data do not determine {', '.join(fit.lost)}")
+    if fit.not_identifiable:
+        raise ValueError(f"nuts: the data do not determine {', '.join(fit.not_identifiable)}")
     e = evaluate(at.layout, at.data, at.noise, at.z)
     # Whitened by the Gaussian approximation, so that all directions have size one.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")

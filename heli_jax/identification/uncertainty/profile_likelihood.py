@@ -40,9 +40,9 @@ def profile(
     for name in names or ():
         if name not in fit.estimates:
             raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {name}")
-        if name in fit.lost:
+        if name in fit.not_identifiable:
             raise ValueError(f"profile of {name}: the data do not determine it")
-    chosen = names or [n for n in fit.estimates if n not in fit.lost]
+    chosen = names or [n for n in fit.estimates if n not in fit.not_identifiable]
     return {name: _profile(fit.reached, name, points) for name in chosen}
 
 
