@@ -108,20 +108,17 @@ class _Numbers(NamedTuple):
 
 
 def _numbers(
-    problem: Problem,
-    search: Search,
-    optimum: RelaxedOptimum,
-    e: Evaluation,
-    errors: StandardErrors,
+    problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors, *, none: bool
 ) -> _Numbers:
-    layout, data, z = search.layout, search.data, optimum.best.z
+    """The estimates; `none`: a disturbance was looked for and does not show."""
+    layout = at.layout
     verdict, wider, quantiles, _ = errors
     of_interest = estimates_of(problem, layout, e, verdict, quantiles, wider)
     nuisance = {k: v for k, v in of_interest.items() if k not in layout.free}
-    nuisance |= flight_nuisances(problem, layout, data, z, e, quantiles, wider)
-    if _no_disturbance(optimum):
+    nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
+    if none:
         nuisance |= {name: _absent(name, nuisance[name]) for name in layout.disturbance}
-    sds = noise_by_name(problem, optimum.noise, unpack(layout, data, z).scales)
+    sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
     return _Numbers(of_interest, nuisance, sds, ill)
 
@@ -144,7 +141,7 @@ def assemble(
     all_white = not correlated and all(w.white for w in white.values())
     solution = Solution(layout, data, noise, best.z)
     errors = standard_errors(problem, solution, e, run.before, white=all_white)
-    numbers = _numbers(problem, search, optimum, e, errors)
+    numbers = _numbers(problem, solution, e, errors, none=none)
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)

@@ -99,8 +99,8 @@ def _disturbed(problem: Problem, model: Model, axis: str, poles: int) -> Problem
     known = {n: vehicle[n] for n in naming.names(disturbed.Params) if n in vehicle}
     fixed = tuple(n for n in problem.fixed_noise if poles)
     if not poles:
-        # So little that it is none, by the same estimator: a likelihood of output error counts its
-        # noise otherwise, and could not be compared.
+        # So little that it is none, and by filter error too: the measurement noise is then laid out
+        # as in the others, and the likelihoods can be compared.
         known |= {"sigma_w": jnp.asarray(1e-9 * problem.motion), "tau_w": jnp.asarray(1.0)}
         fixed = ("sigma_w", "tau_w", *(n for n in problem.fixed_noise if n == "sigma_y"))
     return replace(
