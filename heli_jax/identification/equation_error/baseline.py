@@ -94,8 +94,7 @@ def baseline(
     theta = history[-1]
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
     poles = np.roots(den)
-    with np.errstate(all="ignore"):  # an unstable Hd overflows, which its sentences say
-        simulated = _simulate(num, den, u, y)
+    simulated = _simulate(num, den, u, y)
     continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     agreement = _metrics(y, simulated)
@@ -201,7 +200,8 @@ def _simulate(
     forced[:n] -= past[: forced.size]
     # den(q) y = num(q) u row by row is a triangular banded system: solved in compiled code, where
     # a recursion in Python would take longer than RLS, and scipy.signal's lfilter imports it all.
-    rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
+    with np.errstate(all="ignore"):  # an unstable Hd overflows, which its sentences say
+        rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
     return np.concatenate([y[:n], np.ravel(rest)])
 
 
