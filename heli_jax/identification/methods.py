@@ -33,6 +33,9 @@ def estimator_of(method: str) -> Any:
 
     Typed Any since its class stands above this module in the order of imports.
 
+    Args:
+        method: its name in `METHODS`.
+
     Raises:
         ValueError: there is no such method.
     """

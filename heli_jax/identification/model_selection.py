@@ -186,7 +186,7 @@ def _none_below_its_part(
 ) -> list[str]:
     """Fit again, from the better optimum, what ended below a model that is nested in it, or far
     below one that has the same parameters; `fits` is changed, and the words are returned."""
-    said = []
+    sentences = []
     # At the parameters of the nested model the larger one has its likelihood: an optimum below it
     # is a local one, and a ratio of the two would be negative.
     for (a, b), least in [*((p, _BELOW) for p in nested), *((p, _FAR) for p in _alike(problems))]:
@@ -207,16 +207,16 @@ def _none_below_its_part(
             else f"far below {a}, which has the same parameters"
         )
         if reached > before:
-            said.append(
+            sentences.append(
                 f"{b} first ended {where} (log-likelihood {before:.1f} for {other:.1f}): begun "
                 f"anew from that optimum it reaches {reached:.1f}."
             )
         if part and reached < other - least:
-            said.append(
+            sentences.append(
                 f"{b} ends {where} (log-likelihood {reached:.1f} for {other:.1f}), also when it "
                 "begins there: its own optimum was not found, and its test means nothing."
             )
-    return said
+    return sentences
 
 
 def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
@@ -284,29 +284,33 @@ def _test(small: Candidate, large: Candidate) -> Nested:
 
 def _sentences(ranked: tuple[Candidate, ...], tests: list[Nested]) -> list[str]:
     converged = [c for c in ranked if c.status != "not-converged"]
-    said = []
+    sentences = []
     if converged:
         first, by_bic = converged[0], min(converged, key=lambda c: c.bic)
         if first.name == by_bic.name:
-            said.append(f"AIC and BIC prefer: {first.name}.")
+            sentences.append(f"AIC and BIC prefer: {first.name}.")
         else:
-            said.append(f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}.")
+            sentences.append(
+                f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}."
+            )
         # Burnham and Anderson (2002): within 2 of the best there is substantial support.
         close = [c.name for c in converged[1:] if c.aic - first.aic < 2.0]
         if close:
-            said.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
+            sentences.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
         if not first.white:
-            said.append("Not even the preferred one leaves white residuals: something is missing.")
+            sentences.append(
+                "Not even the preferred one leaves white residuals: something is missing."
+            )
     failed = [c.name for c in ranked if c.status == "not-converged"]
     if failed:
-        said.append(f"Did not converge, so not compared: {', '.join(failed)}.")
-    said += [
+        sentences.append(f"Did not converge, so not compared: {', '.join(failed)}.")
+    sentences += [
         f"{t.small} within {t.large}: twice the log-likelihood gained is {t.ratio:.3g} for "
         f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {_shown(t.p_value)})."
         for t in tests
         if not {t.small, t.large} & set(failed)
     ]
-    return said
+    return sentences
 
 
 def _shown(p: float) -> str:

@@ -300,24 +300,24 @@ def _bias(
         y: as measured.
         agreement: of the simulation with y.
     """
-    said = []
+    sentences = []
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
-        return said  # no noise at all: what is left is rounding
+        return sentences  # no noise at all: what is left is rounding
     if math.isnan(agreement.rmse):
-        said.append("Its simulation diverges from the measured output; no metrics are given.")
+        sentences.append("Its simulation diverges from the measured output; no metrics are given.")
     # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
-        said.append(
+        sentences.append(
             f"It predicts one sample ahead to {one_step:.2g} but simulates to {agreement.rmse:.2g} "
             "only: least squares on past measured outputs is biased by their noise."
         )
     if not whiteness(errors).white:
-        said.append(
+        sentences.append(
             "Its one-step errors are not white: noise on the measured output or disturbances bias "
             "its coefficients."
         )
-    return said
+    return sentences

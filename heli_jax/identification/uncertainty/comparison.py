@@ -56,12 +56,12 @@ def intervals(
     missing = [n for n in profiles or () if n not in fit.estimates]
     if missing:
         raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
-    said: list[str] = []
+    sentences: list[str] = []
     if fit.status != "converged" and (profiles or runs or draws):
         why = "the fit did not converge"
         if fit.not_identifiable:
             why = f"the data do not determine {', '.join(fit.not_identifiable)}"
-        said = [f"No further intervals: {why}."]
+        sentences = [f"No further intervals: {why}."]
         profiles, runs, draws = None, 0, 0
     # From the quickest to the slowest, so that a mistake shows early.
     if profiles:
@@ -74,8 +74,8 @@ def intervals(
         report(f"NUTS, 4 chains of {draws} draws")
         posterior = nuts(fit, draws, seed=seed)
     by_parameter = _by_parameter(fit, profiled, booted, posterior)
-    said += _sentences(fit, by_parameter, booted, posterior)
-    return Intervals(by_parameter, profiled, booted, posterior, tuple(said))
+    sentences += _sentences(fit, by_parameter, booted, posterior)
+    return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))
 
 
 def _by_parameter(
@@ -112,23 +112,23 @@ def _sentences(
     booted: Bootstrap | None,
     posterior: Posterior | None,
 ) -> list[str]:
-    said = []
+    sentences = []
     if fit.coloured and any({"profile", "nuts"} & set(by) for by in by_parameter.values()):
         # Only what can be had: no bootstrap with a free time shift, no filter without an axis.
         bootstrap_too = booted is not None or not fit.reached.layout.shift
-        said.append(
+        sentences.append(
             "The residuals are coloured: profile and NUTS take them for white and are too narrow. "
             "Believe the Gaussian interval, which allows for their autocorrelation"
             + (", or the bootstrap, which draws noise of their spectrum" if bootstrap_too else "")
             + ("; or fit by filter error." if fit.disturbable else ".")
         )
     if booted is not None and booted.failures:
-        said.append(
+        sentences.append(
             f"{booted.failures} of the bootstrap's records could not be fitted and are left out: "
             "its intervals are too narrow by what those would have said."
         )
     if posterior is not None and not posterior.trusted:
-        said.append(
+        sentences.append(
             "The NUTS chains are not to be trusted (R-hat, effective draws, divergent steps: "
             f"expected below {RHAT}, above {EFFECTIVE} and none, got {posterior.rhat:.3f}, "
             f"{posterior.effective:.0f} and {posterior.divergent}): take more draws."
@@ -138,8 +138,8 @@ def _sentences(
         far = [m for m, i in others.items() if apart(by["gaussian"], i) > DIFFERENT]
         # With coloured residuals they differ for the reason that was given above.
         if far and not fit.coloured:
-            said.append(f"{name}: {_which(far, others, booted, posterior)}")
-    return said
+            sentences.append(f"{name}: {_which(far, others, booted, posterior)}")
+    return sentences
 
 
 def _which(

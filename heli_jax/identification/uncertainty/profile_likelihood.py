@@ -13,7 +13,7 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Solution, value_of
 
 _REACHES = (3.0, 9.0)
-"""standard deviations to either side; the second only where the first has no end of the interval"""
+"""standard deviations to either side; the second only where the first holds no whole interval"""
 
 
 class Profile(NamedTuple):
@@ -70,9 +70,9 @@ def _profile(at: Solution, name: str, points: int) -> Profile:
         cost = np.where(ends.converged, ends.cost, np.nan)
         n = measured_count(at.data)
         # Filter error has the noise at its best too, output error keeps it: the method says which.
-        lost = at.layout.estimator.log_likelihood_lost(at.layout, cost, first, n)
+        drop = at.layout.estimator.log_likelihood_lost(at.layout, cost, first, n)
         # A point may lie below the optimum, which converged to its own tolerance only.
-        deviance = np.maximum(lost - min(0.0, np.nanmin(lost, initial=0.0)), 0.0)
+        deviance = np.maximum(drop - min(0.0, np.nanmin(drop, initial=0.0)), 0.0)
         root = np.sign(t) * np.sqrt(deviance)
         low, high = (_crossing(root, starts[:, i], side * Z95) for side in (-1, 1))
         z = jnp.asarray([low, high, *starts[:, i]], at.z.dtype)
