@@ -113,6 +113,7 @@ def eigenmodes(
     """
     A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
     values, left, right = scipy.linalg.eig(A, left=True)
+    # At least 1/s: of a model that does not move at all every eigenvalue is zero.
     largest = max(float(np.max(np.abs(values), initial=0.0)), 1.0)
     names, motions, result = naming.names(model.State), _motions(model), []
     for i in np.argsort(np.abs(values), kind="stable"):

@@ -71,6 +71,7 @@ def d2c(
         )
     M = np.eye(n + 1)
     M[:n, :n], M[:n, n:] = A, B
+    # [[Ad, Bd], [0, 1]] is the exponential of [[A, B], [0, 0]] dt.
     # logm warns where eigenvalues are negative; that case was named above.
     L = np.asarray(scipy.linalg.logm(M.astype(complex))).real / dt
     if not np.isfinite(L).all():
@@ -135,6 +136,7 @@ def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     n = A.shape[0]
     den = np.real(np.poly(A))
     num = np.zeros(n + 1)
+    # The coefficient of s^(n-1-k) is c (A^k + den_1 A^(k-1) + ... + den_k) b.
     v = b.astype(float)
     for k in range(n):
         num[k + 1] = c @ v

@@ -75,6 +75,7 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     x = naming.ravel(trimmed.state, only=states)
     u = naming.ravel(trimmed.inputs, only=sticks)
     A, B = (np.asarray(m) for m in jax.jit(jax.jacfwd(rates, argnums=(0, 1)))(x, u))
+    # A stick that moves nothing has no gain: the regulator would divide by it.
     size = np.linalg.norm(B, axis=0)
     if not np.all(size > 0):
         raise ValueError(f"the sticks of {model.name} do not move all of its attitude")

@@ -195,6 +195,7 @@ def _equilibrium(
 
     def point(z: Array) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
+        # Speeds are along the heading, the states along the axes of the ground.
         fixed = {
             "psi": condition.heading,
             "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,

@@ -89,6 +89,7 @@ def _held_out(problem: Problem, search: Search, optimum: RelaxedOptimum) -> _Hel
     flights = tuple(f for f in problem.flights if f.hold_out)
     if not flights:
         return _HeldOut()
+    # With their own initial states and biases: those of the fitted flights belong to these.
     checked = validate(problem, search.layout, optimum.best.z, optimum.noise, flights)
     free_run = free_runs(flights, checked.free_run)
     return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
@@ -135,9 +136,11 @@ def assemble(
         run: how it came there.
     """
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
+    # The optimiser keeps only what it minimises; signals and Jacobian are those of its last point.
     e = evaluate(layout, data, noise, best.z)
     signals, none = signals_of(e, problem.training), _no_disturbance(optimum)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
+    # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
     solution = Solution(layout, data, noise, best.z)
     errors = standard_errors(problem, solution, e, run.before, white=all_white)
@@ -145,7 +148,7 @@ def assemble(
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
-    # Without a disturbance the simulation has to explain the record by itself.
+    # A perfect model's simulation would leave what the disturbance makes; without one it would not.
     against = None if none else layout.estimator.against_expected(layout, data, noise, e, best.z)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
@@ -194,6 +197,7 @@ def _params(problem: Problem, estimates: dict[str, Estimate]) -> Any:
 
 def _unknowns(layout: Layout, *, none: bool) -> int:
     """All that was estimated; a disturbance that does not show is not among it."""
+    # AIC and BIC count them: with sigma_w = 0 the correlation time has no meaning either.
     estimated = layout.determined + layout.estimator.noise_unknowns(layout)
     return estimated - (len(layout.disturbance) if none else 0)
 
@@ -213,6 +217,7 @@ def _notes(
         correlated: by pair of outputs the correlations that the intervals allow for.
     """
     layout, data, best = search.layout, search.data, optimum.best
+    # Whether the sample time is short enough is a question to the estimated machine.
     values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
     none = _no_disturbance(optimum)
     # An optimiser that has not arrived comes first: it makes all else doubtful.
@@ -232,6 +237,7 @@ def _notes(
 
 
 def _status(best: Optimum, e: Evaluation, numbers: _Numbers, verdict: Verdict) -> Status:
+    # A point whose numbers are rounding is no optimum, however small the last step to it was.
     usable = bool(np.all(np.isfinite(e.J))) and not numbers.ill
     if not bool(best.converged) or not usable:
         return "not-converged"
@@ -254,6 +260,7 @@ def _hold_notes(
     estimates: dict[str, Estimate],
 ) -> list[str]:
     """Where the log let inputs be taken as linear between samples, and it matters."""
+    # Elsewhere a step of Gauss and Newton tells how far the optimum is, not what the hold does.
     if not bool(optimum.best.converged):
         return []
     sd = {n: estimate.sd for n, estimate in estimates.items() if estimate.sd is not None}

@@ -69,6 +69,7 @@ def check(problem: Problem) -> Check:
     """
     guess = _first_guess(problem)
     verdict = verdict_of(problem, guess.layout, guess.e)
+    # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
     notes = excitation.notes(problem, runs, guess.noise.sd)
     # A parameter that is not identifiable moves by any amount, with another hold too.
@@ -114,6 +115,7 @@ def fit(
     report = progress or (lambda _: None)
     guess = _first_guess(problem)
     layout, data, noise = guess.layout, guess.data, guess.noise
+    # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
     before = verdict_of(problem, layout, guess.e)
     report(f"fitting {', '.join(layout.of_interest)}")
     points = starting.draw(layout, problem, guess.z, starts, seed)
@@ -131,6 +133,7 @@ def fit(
         best, notes = shooting, (SAID,)
     optimum = relax_noise_covariance(search, noise, best)
     optimum = optimum._replace(notes=(*notes, *optimum.notes))
+    # Relaxation ends where its first weights of the outputs lead: tried from others too.
     optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
     if disturbed:

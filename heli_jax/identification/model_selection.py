@@ -87,6 +87,7 @@ def alternatives(
             # One pole is no special case of two: both of these have the same time constant.
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
+            # Free flight is the stand without stiffness and damping, where these may go to zero.
             if ending and _stand_may_vanish(problem):
                 nested.append((words + ending, words))
     return Alternatives(problems, tuple(nested))
@@ -196,6 +197,7 @@ def _none_below_its_part(
         report(f"comparing models: {b} again, from {a}")
         try:
             again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
+        # Another model may diverge at parameters that suit this one.
         except ValueError:  # the model is unstable there
             again = fits[b]
         if again.log_likelihood > before + least:
@@ -222,6 +224,7 @@ def _none_below_its_part(
 def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
     """Pairs of models with the same parameters, each with a disturbance of its own."""
     with_noise = [name for name, problem in problems.items() if problem.noise]
+    # Neither is nested in the other, but a disturbance seldom moves parameters far.
     return [
         (a, b)
         for a in with_noise

@@ -224,8 +224,10 @@ def _check_windows(problem: Problem) -> None:
         math.isfinite(problem.continuity) and problem.continuity > 0
     ):
         raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
+    # A filter corrects its state at every sample, which is what windows are for.
     if not estimator_of(problem.method).windows:
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
+    # Nothing measured says where a window begins.
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
     # A shifted input reaches across the ends of windows, which are simulated each by itself.
@@ -311,6 +313,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     missing = [n for n in naming.names(model.Inputs) if n not in flight.inputs]
     if missing:
         raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
+    # An output of the model need not be measured; what is measured has to be one of them.
     unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
     if unknown:
         raise ValueError(
@@ -331,6 +334,7 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
 
 def _check_known(flight: Flight, problem: Problem, where: str) -> None:
     model = problem.model
+    # What one flight knows cannot be estimated over all of them.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
             raise ValueError(

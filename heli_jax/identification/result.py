@@ -17,6 +17,7 @@ from heli_jax.identification.validation.metrics import Metrics, Whiteness
 if TYPE_CHECKING:
     import pandas as pd
 
+# Of a fit that converged too: numbers that the data do not determine are no estimates.
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
 
@@ -77,6 +78,9 @@ class Check:
     notes: tuple[str, ...]
     guessed: tuple[str, ...] = ()
     """flights and outputs whose noise nobody stated"""
+
+
+# Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +153,7 @@ class Fit:
     @property
     def disturbable(self) -> bool:
         """Whether filter error could be tried: its model has an axis to disturb and none yet."""
+        # A disturbance on one axis already: its model has all that filter error asks for.
         model = self.reached.layout.model
         return model.noise_intensity is None and bool(disturbable(model))
 

@@ -113,6 +113,7 @@ def regressors(
     return jnp.stack(past + [delayed(u, j) for j in range(order + 1)], axis=1)
 
 
+# Forgetting, p0 and bound as arrays share one compiled program; as numbers each value has its own.
 @eqx.filter_jit
 def rls(
     u: Float[Array, " N"],

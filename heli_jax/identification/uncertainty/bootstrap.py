@@ -62,6 +62,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
         )
         return at.data._replace(flights=flights, prior_mean=record[1])
 
+    # Every refit from the optimum, which is where the record was simulated.
     starts = jnp.tile(at.z[None, :], (runs, 1))
     records = (outputs, jnp.asarray(means, at.z.dtype))
     optima = optimise_many(at, data, starts, records, batch=_BATCH)
@@ -93,6 +94,7 @@ def _records(
             if fit.coloured:
                 noise = coloured[:, at.layout.outputs[i].index(n)]
             record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
+            # The same gaps: they are part of what the data can tell.
             record = np.where(np.isnan(np.asarray(y)), np.nan, record)
             by_output[n] = jnp.asarray(record, at.z.dtype)
         records.append(by_output)

@@ -57,6 +57,7 @@ def intervals(
     if missing:
         raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
     sentences: list[str] = []
+    # Without an optimum profiles and chains would wander off from where the optimiser stopped.
     if fit.status != "converged" and (profiles or runs or draws):
         why = "the fit did not converge"
         if fit.not_identifiable:
@@ -127,6 +128,7 @@ def _sentences(
             f"{booted.failures} of the bootstrap's records could not be fitted and are left out: "
             "its intervals are too narrow by what those would have said."
         )
+    # The numbers with their limits: a reader can see whether a few more draws will do.
     if posterior is not None and not posterior.trusted:
         sentences.append(
             "The NUTS chains are not to be trusted (R-hat, effective draws, divergent steps: "

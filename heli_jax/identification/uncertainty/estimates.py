@@ -49,6 +49,7 @@ def estimates_of(
     estimates = {}
     for i, u in enumerate(unknowns):
         free = problem.free.get(u.name)
+        # Relative to its reference: the size of the value, or a sample for the time shift.
         white = float(np.sqrt(verdict.covariance[i, i]))
         relative = white * float(wider[i])
         sd, low, high = _interval95(u, relative, references[i], float(quantiles[i]))

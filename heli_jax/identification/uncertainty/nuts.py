@@ -81,7 +81,8 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     if fit.not_identifiable:
         raise ValueError(f"nuts: the data do not determine {', '.join(fit.not_identifiable)}")
     e = evaluate(at.layout, at.data, at.noise, at.z)
-    # Whitened by the Gaussian approximation, so that all directions have size one.
+    # Whitened by the Gaussian approximation, so that all directions have size one: J = QR, and with
+    # z = z0 + R^-1 xi the precision J'J = R'R becomes the unit matrix.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
 

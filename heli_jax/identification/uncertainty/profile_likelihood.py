@@ -63,6 +63,7 @@ def _profile(at: Solution, name: str, points: int) -> Profile:
     result = Profile(np.array([]), np.array([]), np.nan, np.nan)
     for reach in _REACHES:
         t = np.linspace(-reach, reach, points)
+        # Where the quadratic approximation has them, so that few steps are left.
         starts = np.asarray(at.z) + t[:, None] * along[None, :] / sd
         ends = optimise_many(
             at, lambda _: at.data, jnp.asarray(starts, at.z.dtype), jnp.zeros(points), hold=i
@@ -87,6 +88,7 @@ def _profile(at: Solution, name: str, points: int) -> Profile:
 
 def _crossing(root: np.ndarray, z: np.ndarray, limit: float) -> float:
     """z where the signed root of the deviance, nearly a straight line, passes the limit."""
+    # Of a quadratic likelihood it is a straight line, and interpolation between points is exact.
     seen = np.isfinite(root)
     root, z = root[seen], z[seen]
     order = np.argsort(root)
