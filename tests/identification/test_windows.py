@@ -85,10 +85,10 @@ def test_a_flight_held_out_is_cut_as_well():
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"window": -1.0}, "window is -1 s, wanted is above zero"),
+        ({"window": -1.0}, "window must be above zero, got -1 s"),
         ({"continuity": 0.1}, "continuity is for windows only"),
-        ({"window": 1.0, "continuity": 0.0}, "continuity is 0, wanted is above zero"),
-        ({"window": 0.05}, "a window of 0.05 s holds 2 samples, wanted are 4"),
+        ({"window": 1.0, "continuity": 0.0}, "continuity must be above zero, got 0"),
+        ({"window": 0.05}, "must hold 4 samples at least, got 2 in 0.05 s"),
         ({"window": 1.0, "nuisance": Nuisance(initial_state=False)}, "windows need"),
         ({"window": 1.0, "nuisance": Nuisance(time_shift=True)}, "expected one of the two"),
     ],
