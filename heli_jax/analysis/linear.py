@@ -159,6 +159,7 @@ def transfer_function(
     """Numerator and denominator in s, highest power first, from the linearisation about zero.
 
     The denominator has n + 1 numbers and begins with 1; leading zeros of the numerator are cut.
+    A delay of the input (`Model.delays`) is no ratio of polynomials and is left out.
 
     Args:
         model: any.
@@ -185,6 +186,8 @@ def frequency_response(
 ) -> Complex[Array, "k p m"]:
     """H(i omega) = C (i omega - A)^-1 B + D of the linearisation about zero.
 
+    An input that acts late by d [s] (`Model.delays`) has the factor exp(-i omega d).
+
     Args:
         model: any, with p outputs and m inputs.
         params: its constants.
@@ -200,4 +203,10 @@ def frequency_response(
         inner = jnp.linalg.solve(s_ * eye - A.astype(s.dtype), B.astype(s.dtype))
         return C.astype(s.dtype) @ inner + D.astype(s.dtype)
 
-    return jax.vmap(at)(s)
+    late = dict(model.delays)
+    if not late:
+        return jax.vmap(at)(s)
+    names = naming.names(model.Inputs)
+    d = [getattr(params, late[n]) if n in late else 0.0 for n in names]
+    factors = jnp.exp(-s[:, None] * jnp.stack([jnp.asarray(v, A.dtype) for v in d])[None, :])
+    return jax.vmap(at)(s) * factors[:, None, :]

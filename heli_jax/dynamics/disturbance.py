@@ -59,6 +59,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         correlation=None if poles == 1 else disturbed.correlation,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
+        delays=model.delays,
     )
 
 

@@ -49,7 +49,7 @@ def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, White
         # Their variance falls while the filter learns the initial state: only over it are they one
         # sequence of equal variance.
         errors = {
-            f"{s.flight}/{n}": error / np.sqrt(innovations.variance[n])
+            f"{s.flight}/{n}": np.asarray(error) / np.sqrt(np.asarray(innovations.variance[n]))
             for s, innovations in zip(signals, e.innovations, strict=True)
             for n, error in innovations.error.items()
         }
@@ -61,7 +61,10 @@ def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, White
 
 def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
     """Measured and simulated signals; what is simulated carries the bias."""
-    errors = [innovations.error for innovations in e.innovations] or [None] * len(flights)
+    errors = [
+        {n: np.asarray(error) for n, error in innovations.error.items()}
+        for innovations in e.innovations
+    ] or [None] * len(flights)
     return tuple(
         Signals(
             label,

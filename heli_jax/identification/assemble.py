@@ -70,7 +70,7 @@ def noise_by_name(
         scales: factors on it by output that are unknowns themselves (filter error); 1 unless named.
     """
     return {
-        f"{label}/{n}": float(sd) * float(scales.get(n, 1.0))
+        f"{label}/{n}": float(np.asarray(sd)) * float(np.asarray(scales.get(n, 1.0)))
         for label, by_name in zip(labels(problem.training), noise.sd, strict=True)
         for n, sd in by_name.items()
     }

@@ -230,11 +230,6 @@ def _check_windows(problem: Problem) -> None:
     # Nothing measured says where a window begins.
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
-    # A shifted input reaches across the ends of windows, which are simulated each by itself.
-    if problem.nuisance.time_shift:
-        raise ValueError(
-            "shooting.window and nuisance.time_shift: expected one of the two, got both"
-        )
     for flight in problem.flights:
         samples = round(problem.window / flight.dt)
         if samples < _FEWEST:

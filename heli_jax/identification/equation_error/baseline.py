@@ -1,7 +1,6 @@
 """The paper's way on the same data: RLS, d2c, and from H(s) to a/Ixx and a/If."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from heli_jax.identification.validation.metrics import NO_METRICS, Metrics, metr
 from heli_jax.vehicle import of_helicopter
 
 # scipy.linalg.solve_banded knows no triangular case and would factorise; this one only substitutes.
-_solve_banded: Callable[..., tuple[np.ndarray, int]] = get_lapack_funcs("tbtrs")
+_solve_banded: Any = get_lapack_funcs("tbtrs")
 
 _P0 = 1e12
 """initial variance of every coefficient, of signals scaled to unit rms: nothing is known of it"""

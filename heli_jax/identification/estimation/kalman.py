@@ -22,10 +22,11 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.naming import Scalar
 from heli_jax.numerics.matrix_exponential import product, van_loan
+from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import process_noise
-from heli_jax.simulation.hold import Segment, at, linear_inputs, segments
+from heli_jax.simulation.hold import Segment, delayed, linear_inputs, segments
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
-from heli_jax.simulation.stepping import acting_inputs, held_columns, split_delay
+from heli_jax.simulation.stepping import held_columns
 
 # Params, Inputs and State are a model's own classes: they are annotated Any.
 
@@ -281,22 +282,15 @@ class _Intervals(NamedTuple):
 
 
 def _intervals(drive: _Drive) -> _Intervals:
-    inputs, delay, linear = drive.inputs, drive.options.delay, drive.linear
+    inputs, linear = drive.inputs, drive.linear
     # The linear filter has its drive from `held_columns`; here steps need the inputs themselves.
     first = jax.tree.leaves(inputs)[0]
-    n, dt = first.shape[0], jnp.asarray(drive.options.dt, first.dtype)
-    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
-    if linear:
-        split = None if delay is None else split_delay(delay, dt)
-        parts = segments(inputs, dt, split, jnp.arange(n), linear)
-        return _Intervals(*zip(*parts, strict=True), acting)
-    if delay is None:
-        return _Intervals((dt,), (inputs,), None, acting)
-    # A late sample arrives within an interval: before it the one before it still holds.
-    whole, late = split_delay(delay, dt)
-    k = jnp.arange(n) - whole
-    lengths, held = (late * dt, (1.0 - late) * dt), (at(inputs, k - 1), at(inputs, k))
-    return _Intervals(lengths, held, None, acting)
+    k, dt = jnp.arange(first.shape[0]), jnp.asarray(drive.options.dt, first.dtype)
+    delays = delays_of(drive.model, drive.params, drive.options.delay, dt)
+    acting = inputs if delays is None else delayed(inputs, delays, k, linear)
+    # A late sample arrives within an interval: before it the one before it still acts.
+    lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
+    return _Intervals(lengths, held, slopes if linear else None, acting)
 
 
 def _local(drive: _Drive) -> _Filter:

@@ -66,20 +66,19 @@ def _fit_of_windows(cut: Problem, whole: Layout, noise: Noise, z0: Array) -> Arr
     layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
     # It stands first in z in either layout; behind it windows have more.
     z = start_vector(layout, data, cut)
-    z = z.at[: whole.weak].set(z0[: whole.weak])
+    z = z.at[: whole.first_nuisance].set(z0[: whole.first_nuisance])
     [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
     # Not whether it converged: half a way out of the growth is enough to begin from.
     finite = np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))
-    return short.z[: whole.weak] if finite else None
+    return short.z[: whole.first_nuisance] if finite else None
 
 
 def _applies(problem: Problem) -> bool:
-    # What `Problem` accepts with windows (a time shift excludes them), and has none yet.
+    # What `Problem` accepts with windows, and has none yet.
     return (
         estimator_of(problem.method).windows
         and problem.window is None
         and problem.nuisance.initial_state
-        and not problem.nuisance.time_shift
     )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
+from heli_jax.simulation.delays import Delays, at, delays_of
 from heli_jax.simulation.simulate import Trajectory, simulate
 
 # Params, State and Inputs are a model's own classes: they are annotated Any.
@@ -126,8 +127,12 @@ def _side_by_side(
     def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
         # Any member's number will do: the inputs of all of them move alike between samples.
-        run = _simulated(layout, members[0], Drive(params, inputs, dt, state), u.shift)
-        return run.states, run.outputs
+        late = delays_of(layout.model, params, u.shift, dt)
+        if late is not None:
+            # The whole samples were taken off when the windows were cut, but for the one before.
+            late = Delays(late.groups, tuple(-1 for _ in late.whole), late.rest)
+        run = _simulated(layout, members[0], Drive(params, inputs, dt, state), late)
+        return jax.tree.map(lambda v: v[: m + chained], (run.states, run.outputs))
 
     states, outputs = jax.vmap(window)(*stacked)
     names = naming.names(layout.model.Outputs)
@@ -158,16 +163,38 @@ def _cut(
 ) -> tuple[Any, dict[str, Array], Array, Any]:
     """Inputs (windows, samples), known parameters, sample time and initial states (windows,)."""
     flight, (count, m) = data.flights[i], layout.windows[i]
-    inputs = driven(layout, data, u, i).inputs
-    n = jax.tree.leaves(inputs)[0].shape[0]
+    drive = driven(layout, data, u, i)
+    late = delays_of(layout.model, drive.params, u.shift, flight.dt)
     # The last window may reach past the record: it is filled up with the last sample.
-    at = np.minimum(m * np.arange(count)[:, None] + np.arange(samples)[None, :], n - 1)
+    of_window = m * np.arange(count)[:, None] + np.arange(samples)[None, :]
     state = u.states[i]
     if state is not None:
         state = jax.tree.map(lambda v: jnp.broadcast_to(v, (count,)), state)
     known = {k: jnp.broadcast_to(v, (count,)) for k, v in flight.known.items()}
-    cut = jax.tree.map(lambda v: v[at], inputs)
+    cut = _with_lead(drive.inputs, of_window, late)
     return cut, known, jnp.broadcast_to(flight.dt, (count,)), state
+
+
+def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
+    """The inputs (windows, m) of windows, read as late as they act.
+
+    Where inputs are late each window has the sample before its first in front, which acts there
+    until the first one does: (windows, m + 1).
+
+    Args:
+        inputs: arrays (N,).
+        samples: those of each window (windows, m).
+        late: None where no input is.
+    """
+    if late is None:
+        return at(inputs, samples)
+    lead = np.concatenate([samples[:, :1] - 1, samples], axis=1)
+    leaves, structure = jax.tree.flatten(at(inputs, lead, late))
+    for i, v in enumerate(jax.tree.leaves(inputs)):
+        # One that acts at once is read without a shift, and needs nothing in front.
+        if late.group(i) is None:
+            leaves[i] = at(v, np.concatenate([samples, samples[:, -1:] + 1], axis=1))
+    return jax.tree.unflatten(structure, leaves)
 
 
 def joined_biases(u: Unknowns) -> Array:
