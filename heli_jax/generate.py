@@ -268,7 +268,7 @@ def _notes(experiment: Experiment, run: Trajectory) -> tuple[str, ...]:
             "is written after that"
         )
     # After an event the state stands still; what it does there says nothing of the flight.
-    flown = run.times <= float(run.ended)
+    flown = np.asarray(run.times <= float(run.ended))
     for name, out in run.outside.items():
         left = np.asarray(out) & flown
         if left.any():

@@ -12,13 +12,14 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, ArrayLike, Float, Real
+from jaxtyping import Array, Float, Real
 
 type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
 
-type Number = Real[ArrayLike, ""]
+type Number = Real[Array, ""] | Real[np.ndarray, ""] | np.number | int | float
 """As Scalar, or whatever else JAX takes for one number: an int, a NumPy scalar."""
 
 # Models are anyone's own, and so are the classes of their parameters, states, inputs and outputs:

@@ -58,7 +58,7 @@ def _sine_past(x: Scalar, right_angles: Scalar) -> Scalar:
 @sincos.defjvp
 def _sincos_jvp(
     primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
     # The derivative is there already; that of the rounding would be zero almost everywhere.
     s, c = sincos(*primals)
     return (s, c), (c * tangents[0], -s * tangents[0])

@@ -277,8 +277,8 @@ def _in_blocks(
 def _outputs_in_block(
     reducer: _Reducer,
     block: _Block,
-    structure: jax.tree_util.PyTreeDef,
-    inputs: jax.tree_util.PyTreeDef,
+    structure: Any,  # tree structures, of which JAX exports no type
+    inputs: Any,
     x: list[Array],
     u: list[list[Array]],
     j: int,

@@ -15,7 +15,9 @@ from heli_jax.simulation.hold import Hold
 class SimulationOptions(NamedTuple):
     """How `simulate` and `accumulate` carry out a run; each field is also a keyword of theirs."""
 
-    dt: Number | None = None
+    # Any, as a number that is never None once a run has begun: the Flight has one, or it is
+    # refused.
+    dt: Any = None
     """sample time [s]; that of the Flight unless given"""
     initial_state: Record | None = None
     """the model's State at the first sample; `model.initial_state` unless given"""

@@ -12,12 +12,16 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from heli_jax.errors import nearest
-from heli_jax.naming import Number, Record, Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.hold import at, segments
+
+type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
+"""as diffrax takes it, which has no NumPy scalars among its types"""
 
 
 class ZeroOrderHoldArgs(NamedTuple):
@@ -30,7 +34,7 @@ class ZeroOrderHoldArgs(NamedTuple):
 
     params: Record
     inputs: Record
-    dt: Number
+    dt: Array
     delay: tuple[Array, Array] | None
     discrete: Discrete | None
 
@@ -56,13 +60,13 @@ class RampArgs(NamedTuple):
     inputs: Record
     slope: Record
 
-    def after(self, t: Number) -> "RampArgs":
+    def after(self, t: Time) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
 
-def sample_index(t: Number) -> Int[Array, ""]:
+def sample_index(t: Time) -> Int[Array, ""]:
     """The sample that an interval begins with, from its time in samples."""
     # Time is counted in samples: a rounding error short of a whole number is that number.
     return jnp.floor(t + 1e-3).astype(int)
@@ -81,9 +85,7 @@ class _Stateless(dfx.AbstractSolver):
         dfx.LocalLinearInterpolation
     )
 
-    def init(
-        self, terms: dfx.AbstractTerm, t0: Number, t1: Number, y0: PyTree, args: PyTree
-    ) -> None:
+    def init(self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree) -> None:
         return None
 
 
@@ -95,7 +97,7 @@ class SolverWrapper(_Stateless):
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return y0
 
 
@@ -106,14 +108,14 @@ class Exact(_Stateless):
         # No error to have an order: diffrax takes None where nobody asks for one.
         return None
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -152,8 +154,10 @@ def advance(
     # XLA fuses into one loop. A product of many 4x4 matrices calls a routine for each of them.
     new = [dot(a, x) + dot(b, u) for a, b in zip(discrete.Ad, discrete.Bd, strict=True)]
     if discrete.Bp is not None:
+        assert before is not None
         new = [v + dot(b, before) for v, b in zip(new, discrete.Bp, strict=True)]
     if discrete.Bn is not None:
+        assert after is not None
         new = [v + dot(b, after) for v, b in zip(new, discrete.Bn, strict=True)]
     return new
 
@@ -178,29 +182,29 @@ class RK4(_Stateless):
     def order(self, terms: dfx.AbstractTerm) -> int:
         return 4
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: PyTree,
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
-        h = t1 - t0
+        h: Any = t1 - t0
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
         # which XLA does not fuse into one loop over a batch of vehicles.
-        def f(t: Number, y: PyTree) -> Any:
+        def f(t: Time, y: PyTree) -> Any:
             # Behind a barrier each slope is computed once: without it XLA computes all of them
             # again for every state variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
-        def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
+        def along(y: PyTree, slope: PyTree, step: Time) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
         # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
@@ -218,7 +222,7 @@ class RK4(_Stateless):
 
     @staticmethod
     def _rolled(
-        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Number, y0: PyTree
+        f: Callable[..., Any], along: Callable[..., Any], t0: Time, h: Array, y0: PyTree
     ) -> PyTree:
         # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
         # reach of zero, and any slope will do.
@@ -235,7 +239,7 @@ class RK4(_Stateless):
         return y1
 
 
-type _Part = tuple[Number, IntervalArgs | RampArgs]
+type _Part = tuple[Any, IntervalArgs | RampArgs]
 
 
 class PerSample(SolverWrapper):
@@ -249,7 +253,7 @@ class PerSample(SolverWrapper):
     linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
     """of each input whether it is linear between samples; () holds all"""
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(
             terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
@@ -257,8 +261,8 @@ class PerSample(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -288,7 +292,7 @@ class PerSample(SolverWrapper):
         ]
 
     def _steps(
-        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
     ) -> Any:
         """`substeps` steps of h [s]. Nothing depends on time while the input is held, and where it
         moves it is counted from the step's begin, so each begins at 0: a step length that is the
@@ -296,7 +300,7 @@ class PerSample(SolverWrapper):
         """
         begin = jnp.zeros_like(h)
 
-        def body(carry: PyTree, j: Array | None) -> tuple[PyTree, None]:
+        def body(carry: PyTree, j: Any) -> tuple[PyTree, None]:
             y, result = carry
             here = now.after(j * h) if isinstance(now, RampArgs) else now
             state = self.solver.init(terms, begin, h, y, here)
@@ -317,7 +321,7 @@ class Adaptive(PerSample):
     max_steps: int = eqx.field(static=True)
 
     def _steps(
-        self, terms: dfx.AbstractTerm, h: Number, y0: PyTree, now: IntervalArgs | RampArgs
+        self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs
     ) -> Any:
         sol = dfx.diffeqsolve(
             terms,

@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from heli_jax.naming import Number
 from heli_jax.simulation.hold import at, at_end
-from heli_jax.simulation.solvers import SolverWrapper, ZeroOrderHoldArgs, sample_index
+from heli_jax.simulation.solvers import SolverWrapper, Time, ZeroOrderHoldArgs, sample_index
 
 # The arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, the state at its
 # begin, and what is known beside it; none of the solvers here keeps a state between steps.
@@ -32,8 +31,8 @@ class StateFeedback(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -57,8 +56,8 @@ class Stopping(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -87,8 +86,8 @@ class WithProcessNoise(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -115,8 +114,8 @@ class Accumulating(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: PyTree,
         solver_state: PyTree,

@@ -88,8 +88,8 @@ def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
     heading = outputs.get("yaw")
     psi = float(np.nanmean(heading)) if heading is not None else 0.0
     forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
-    speeds = [float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz)]
-    return Condition(*speeds, psi) if any(speeds) else HOVER
+    forward, lateral, up = (float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz))
+    return Condition(forward, lateral, up, psi) if forward or lateral or up else HOVER
 
 
 def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
