@@ -12,16 +12,17 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from heli_jax.errors import nearest
-from heli_jax.naming import Number, Record, Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.discretize import Discrete
 from heli_jax.simulation.hold import delayed, segments
 
-# diffrax's own type of a time is private to it.
-Time = Any
+type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
+"""as diffrax takes it, which has no NumPy scalars among its types"""
 
 
 class ZeroOrderHoldArgs(NamedTuple):
@@ -72,13 +73,13 @@ class RampArgs(NamedTuple):
     inputs: Record
     slope: Record
 
-    def after(self, t: Number) -> "RampArgs":
+    def after(self, t: Time) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
 
-def sample_index(t: Number) -> Int[Array, ""]:
+def sample_index(t: Time) -> Int[Array, ""]:
     """The sample that an interval begins with, from its time in samples."""
     # Time is counted in samples: a rounding error short of a whole number is that number.
     return jnp.floor(t + 1e-3).astype(int)
@@ -215,7 +216,7 @@ class RK4(_Stateless):
             # again for every state variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
-        def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
+        def along(y: PyTree, slope: PyTree, step: Time) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
         # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.

@@ -17,7 +17,15 @@ from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import discretize
 from heli_jax.simulation.hold import FlightOrInputs, delayed
 from heli_jax.simulation.options import SimulationOptions
-from heli_jax.simulation.solvers import RK4, Adaptive, Exact, PerSample, RampArgs, ZeroOrderHoldArgs
+from heli_jax.simulation.solvers import (
+    RK4,
+    Adaptive,
+    Exact,
+    PerSample,
+    RampArgs,
+    Time,
+    ZeroOrderHoldArgs,
+)
 
 
 def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tuple[Record, Number]:
@@ -141,7 +149,7 @@ class _Field(eqx.Module):
     State: type = eqx.field(static=True)
     vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
 
-    def __call__(self, t: Number, x: PyTree, now: PyTree) -> PyTree:
+    def __call__(self, t: Time, x: PyTree, now: PyTree) -> PyTree:
         # What is beside the state (a running value, whether it goes on) does not change with time.
         if not isinstance(x, self.State):
             return jax.tree.map(jnp.zeros_like, x)
