@@ -36,6 +36,7 @@ ALLOWED = {
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
     "flights": {"errors", "regular_file", "units", "summaries"},
     "dynamics": {"vehicle", "naming", "numerics"},
+    "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", *BASE},
     "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},

@@ -86,6 +86,10 @@ class Model(eqx.Module):
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
     """of a machine on a stand, the same machine in free flight"""
+    delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    """inputs that act late, each with the parameter that is its delay [s]"""
+    positive: tuple[str, ...] = eqx.field(static=True, default=())
+    """the parameters that are above zero whatever else may change its sign"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(

@@ -33,8 +33,8 @@ class Free(NamedTuple):
 
     `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
     logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
-    Helicopter's parameters keep theirs and those of a model of one's own may have any. Bounds that
-    lie on one side of zero keep it in either case.
+    Helicopter's parameters keep theirs, and so do those that `Model.positive` names; others of a
+    model of one's own may have any. Bounds that lie on one side of zero keep it in either case.
     """
 
     start: float
@@ -108,7 +108,9 @@ class Problem:
         object.__setattr__(self, "flights", tuple(self.flights))
         ours = of_helicopter(self.model.Params)
         free = {
-            n: f if f.sign is not None else f._replace(sign="keep" if ours else "any")
+            n: f
+            if f.sign is not None
+            else f._replace(sign="keep" if ours or n in self.model.positive else "any")
             for n, f in self.free.items()
         }
         object.__setattr__(self, "free", free)
@@ -257,12 +259,28 @@ def _check_free(name: str, one: Free, model: Model) -> None:
             f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
         )
         raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
+    if name in model.positive:
+        _check_positive(name, one)
     if one.sign not in ("keep", "any"):
         raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {one.sign!r}")
     if one.start == 0 and one.sign == "keep" and (low is None or high is None):
         raise ValueError(
             f"free.{name}.start: found 0 without two bounds, wanted is a start of the right sign "
             "and size, or lower and upper, or sign: any"
+        )
+
+
+def _check_positive(name: str, one: Free) -> None:
+    """Refuse what would let a parameter be zero or less that the model says is positive."""
+    for key, value in (("start", one.start), ("lower", one.lower)):
+        if value is not None and (value < 0 or (key == "start" and value == 0)):
+            raise ValueError(
+                f"free.{name}.{key}: expected more than zero, since the model says that it is "
+                f"positive, got {value:g}"
+            )
+    if one.sign == "any":
+        raise ValueError(
+            f"free.{name}.sign: expected keep, since the model says that it is positive"
         )
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.errors import nearest
+from heli_jax.errors import InputError, nearest
 
 HOLDS = ("zero-order", "linear")
 """The names of what an input may do between samples."""
@@ -128,3 +128,17 @@ def _by_hold(linear: tuple[bool, ...], moving: Callable[..., Any], first: Any, s
 def _chosen(linear: tuple[bool, ...], moving: Any, held: Any) -> Any:
     leaves = zip(linear, jax.tree.leaves(moving), jax.tree.leaves(held), strict=True)
     return jax.tree.unflatten(jax.tree.structure(held), [a if is_ else b for is_, a, b in leaves])
+
+
+def refuse_delays(model: Model) -> None:
+    """Refuse a model whose inputs act late: nothing here delays one input by itself.
+
+    Raises:
+        InputError: the model has `delays`.
+    """
+    if model.delays:
+        late = ", ".join(f"{name} by {parameter}" for name, parameter in model.delays)
+        raise InputError(
+            f"model {model.name} delays {late}, which no simulation does yet; expected a model "
+            "without delays"
+        )

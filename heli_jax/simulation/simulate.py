@@ -18,7 +18,7 @@ from heli_jax.numerics.matrix_exponential import van_loan
 from heli_jax.simulation.blocks import blockwise, columns
 from heli_jax.simulation.discretize import discretize, process_noise, square_root
 from heli_jax.simulation.events import NO_END, any_over, stopped
-from heli_jax.simulation.hold import delayed, linear_inputs
+from heli_jax.simulation.hold import delayed, linear_inputs, refuse_delays
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import (
     RK4,
@@ -232,6 +232,7 @@ def per_sample(
         options: of which dt, solver, substeps, delay, controller, adjoint and max_steps count.
         linear: of each input whether it is linear between samples; () holds all.
     """
+    refuse_delays(model)
     controller, solver = options.controller, options.solver
     method = _method(model, dfx.Dopri8() if controller is not None and solver is None else solver)
     if controller is not None and isinstance(method, Exact | RK4):
