@@ -132,6 +132,6 @@ def test_a_delay_is_refused_where_it_would_be_left_out(written, tmp_path, capsys
     simulate = {"duration": 2, "rate": 10}
     path = written(model={"linear": "r50-hover"}, flights=[], fit=None, sweep=sweep)
     path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "simulate": simulate}))
-    assert main([command, str(path), "--out", str(tmp_path / "out")]) == 2
+    assert main([command, str(path), "--out", str(tmp_path / "out.csv")]) == 2
     said = capsys.readouterr().err
     assert "r50-hover delays ped by tau_ped, which no simulation does yet" in said

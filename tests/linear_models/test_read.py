@@ -239,6 +239,23 @@ def test_what_is_no_file_ends_in_a_sentence(tmp_path):
         linear_model("none.yaml", tmp_path)
 
 
+def test_the_example_of_the_page_reads(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "linear-models.md").read_text(encoding="utf-8")
+    example = next(t for t in page.split("```yaml\n")[1:] if t.startswith("name:"))
+    (tmp_path / "my-roll.yaml").write_text(example.split("```")[0])
+    found = linear_model("my-roll.yaml", tmp_path)
+    A, B, C, _ = matrices(found)
+    expected = [[0, 1, 0], [0, 0, 166.1], [0, -1, -1 / 0.046]]
+    np.testing.assert_allclose(A, expected, rtol=1e-14)
+    np.testing.assert_allclose(B, [[0], [0], [0.14 / 0.046]], rtol=1e-14)
+    np.testing.assert_allclose(C, [[1, 0, 0], [0, 0, 9.81]], rtol=1e-14)
+
+
+def test_the_page_names_every_shipped_model():
+    page = (Path(__file__).parents[2] / "docs" / "linear-models.md").read_text(encoding="utf-8")
+    assert [name for name in shipped() if f"`{name}`" not in page] == []
+
+
 def test_si_units_are_made_of_any():
     for unit, si in (("rad/s/ft", "rad/m/s"), ("N", "kg m/s^2"), ("1", "1"), ("1/min", "1/s")):
         found = units.as_text(units.base_of(unit))
