@@ -91,6 +91,20 @@ def test_it_is_simulated_checked_and_swept(written, tmp_path):
     assert 0 < peaks[0] < peaks[1]
 
 
+def test_an_element_whose_time_constant_is_no_time_is_out_of_range(written):
+    sweep = {
+        "design": "grid",
+        "inputs": "simulate",
+        "axes": {"tau_nu": {"values": [-0.1, 0.0, 0.1]}},
+        "reduce": {"peak": {"signal": "w", "how": "peak"}},
+    }
+    signals = {**HEAVE["flights"][0], "log": "none.csv"}
+    path = written(model={"linear": "heave-inflow"}, flights=[signals], fit=None, sweep=sweep)
+    found = run_sweep(path)
+    assert np.isnan(found["peak"].values[:2]).all()
+    assert np.isfinite(found["peak"].values[2])
+
+
 def test_heave_can_be_disturbed(written):
     found = configuration.load(written(disturbance={"axis": "heave", "sigma_w": 0.5, "tau_w": 1.0}))
     quiet = generate.generate(configuration.load(written())).runs["heave"]
