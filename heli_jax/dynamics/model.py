@@ -91,6 +91,8 @@ class Model(eqx.Module):
     """of a machine on a stand, the same machine in free flight"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
+    positive: tuple[str, ...] = eqx.field(static=True, default=())
+    """the parameters that are above zero whatever else may change its sign"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,35 +14,9 @@ from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.vehicle import impossible, of_helicopter
-
-
-class Prior(NamedTuple):
-    """What is known of a parameter beforehand: a normal distribution, in the parameter's unit."""
-
-    mean: float
-    sd: float
-
-
-Sign = Literal["keep", "any"]
-
-
-class Free(NamedTuple):
-    """A parameter to be estimated: where to start, between what bounds, with what prior.
-
-    `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
-    logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
-    Helicopter's parameters keep theirs and those of a model of one's own may have any. Bounds that
-    lie on one side of zero keep it in either case.
-    """
-
-    start: float
-    """the initial guess"""
-    lower: float | None = None
-    upper: float | None = None
-    prior: Prior | None = None
-    sign: Sign | None = None
 
 
 class Nuisance(NamedTuple):
@@ -65,6 +39,8 @@ class Nuisance(NamedTuple):
 
 
 # `Any` stands for Params, a class of the user's, here and below.
+__all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
+
 _FIXABLE = ("sigma_w", "tau_w", "sigma_y")
 _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
@@ -116,15 +92,20 @@ class Problem:
         check_model(self.model)
         object.__setattr__(self, "flights", tuple(self.flights))
         # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
-        sign = "keep" if of_helicopter(self.model.Params) else "any"
-        free = {n: f if f.sign is not None else f._replace(sign=sign) for n, f in self.free.items()}
+        ours, positive = of_helicopter(self.model.Params), self.model.positive
+        free = {
+            n: f
+            if f.sign is not None
+            else f._replace(sign="keep" if ours or n in positive else "any")
+            for n, f in self.free.items()
+        }
         # Frozen: what was accepted in another form is put right once, here.
         object.__setattr__(self, "free", free)
         _check_method(self)
         if not self.free:
             raise ValueError("nothing is free: name at least one parameter to estimate")
         for name, free in self.free.items():
-            _check_free(name, free, self.model)
+            check_free(name, free, self.model)
         _check_possible(self)
         _check_windows(self)
         _check_offsets(self)
@@ -241,47 +222,6 @@ def _check_windows(problem: Problem) -> None:
 
 def _of(flight: Flight) -> str:
     return f"flight {flight.name!r}" if flight.name else "a flight"
-
-
-def _check_free(name: str, free: Free, model: Model) -> None:
-    if name not in naming.names(model.Params):
-        known = naming.names(model.Params)
-        raise ValueError(
-            f"free.{name}: model {model.name} has no such parameter{nearest(name, known)}"
-        )
-    numbers = {"start": free.start, "lower": free.lower, "upper": free.upper}
-    if free.prior is not None:
-        numbers |= {"prior.mean": free.prior.mean, "prior.sd": free.prior.sd}
-    for key, value in numbers.items():
-        if value is not None and not math.isfinite(value):
-            raise ValueError(f"free.{name}.{key}: expected a finite number, got {value}")
-    if free.prior is not None and free.prior.sd <= 0:
-        raise ValueError(f"free.{name}.prior.sd must be above zero, got {free.prior.sd:g}")
-    if free.sign not in ("keep", "any"):
-        raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {free.sign!r}")
-    _check_bounds(name, free)
-
-
-def _check_bounds(name: str, free: Free) -> None:
-    low, high = free.lower, free.upper
-    if free.sign == "keep" and low is not None and high is not None and low < 0 < high:
-        raise ValueError(
-            f"free.{name}.sign: keep: expected bounds of one sign, got {low:g} to {high:g}"
-        )
-    if low is not None and high is not None and low >= high:
-        raise ValueError(f"free.{name}: lower must be below upper, got {low:g} and {high:g}")
-    # Not on a bound either: in the coordinates of a bounded parameter its ends are at infinity.
-    if (low is not None and free.start <= low) or (high is not None and free.start >= high):
-        shown = (
-            f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
-        )
-        raise ValueError(f"free.{name}.start: expected a value inside {shown}, got {free.start:g}")
-    # Zero has no logarithm; between two bounds the search is in another coordinate.
-    if free.start == 0 and free.sign == "keep" and (low is None or high is None):
-        raise ValueError(
-            f"free.{name}.start: expected a start of the right sign and size, or lower and upper, "
-            "or sign: any; got 0 without two bounds"
-        )
 
 
 def _check_possible(problem: Problem) -> None:
