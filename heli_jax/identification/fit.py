@@ -51,7 +51,8 @@ class _FirstGuess(NamedTuple):
 
 
 def _first_guess(problem: Problem) -> _FirstGuess:
-    layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
+    layout = layout_of(problem, problem.training)
+    data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
     z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)

@@ -18,8 +18,14 @@ from heli_jax.identification.unknowns.layout import (
 )
 
 
-def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
-    """The numbers of a problem over the given flights."""
+def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None = None) -> Data:
+    """The numbers of a problem over the given flights.
+
+    Args:
+        problem: model, vehicle and what is free.
+        flights: those of the layout, in its order.
+        layout: of the problem over these flights, where it is at hand already.
+    """
     dtype = np.dtype(jnp.result_type(float))
     nuisance, frees = problem.nuisance, list(problem.free.values())
     bounds = [coordinates.limits(f) for f in frees]
@@ -40,7 +46,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
     numbers = jax.device_put(numbers)
     if not nuisance.initial_state:
         return numbers
-    return _with_state_scales(problem, layout_of(problem, flights), numbers)
+    return _with_state_scales(problem, layout or layout_of(problem, flights), numbers)
 
 
 def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:

@@ -19,7 +19,7 @@ from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of, unpack
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack, within_bounds
 
 Progress = Callable[[str], None]
 
@@ -205,7 +205,7 @@ class Search:
     def __init__(self, problem: Problem, layout: Layout, data: Data, max_steps: int) -> None:
         self.problem, self.layout, self.data = problem, layout, data
         self.max_steps = max_steps
-        self.bounded = layout_of(problem, problem.training, bounded=True)
+        self.bounded = within_bounds(layout, problem)
 
     def run(
         self, noise: Noise, points: Float[Array, "s q"], progress: Progress | None = None

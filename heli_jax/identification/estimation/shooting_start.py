@@ -63,7 +63,8 @@ def by_windows(
 
 def _fit_of_windows(cut: Problem, whole: Layout, noise: Noise, z0: Array) -> Array | None:
     """What the flights share, fitted to the windows; None where that is not finite."""
-    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
+    layout = layout_of(cut, cut.training)
+    data = data_of(cut, cut.training, layout)
     # It stands first in z in either layout; behind it windows have more.
     z = start_vector(layout, data, cut)
     z = z.at[: whole.first_nuisance].set(z0[: whole.first_nuisance])

@@ -110,11 +110,12 @@ def _responses(model: Model, params: Any, flight: Flight) -> np.ndarray:
     augmented[:n, :n], augmented[:n, n:] = A, B
     step = max(flight.duration, flight.dt) / _POINTS
     with np.errstate(all="ignore"):  # an unstable model overflows, which the caller looks at
-        E, state, rows = scipy.linalg.expm(augmented * step), np.eye(n + m), []
-        for _ in range(_POINTS + 1):
-            rows.append(C @ state[:n])
-            state = E @ state
-        return np.concatenate(rows)
+        E = scipy.linalg.expm(augmented * step)
+        rows = np.hstack([C, np.zeros((len(C), m))])
+        # By doubling: the responses so far, moved on by their own length, are the next ones.
+        while len(rows) < (_POINTS + 1) * len(C):
+            rows, E = np.concatenate([rows, rows @ E]), E @ E
+        return rows[: (_POINTS + 1) * len(C)]
 
 
 def _has_constant_term(model: Model, params: Any, free: tuple[str, ...]) -> bool:

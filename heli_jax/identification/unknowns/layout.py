@@ -4,6 +4,7 @@ z holds coordinates of the free parameters, then input gains, the time shift, th
 for each flight the initial state, the biases and the offsets of the inputs.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -189,23 +190,21 @@ class Unknowns(NamedTuple):
     """of the inputs, by flight"""
 
 
-def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = False) -> Layout:
+def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
     """The static side of a problem over the given flights.
 
     Args:
         problem: what is free, and which nuisances.
         flights: those whose initial states, biases and offsets stand in z, in this order.
-        bounded: keeps the free parameters within their bounds by logit coordinates.
     """
     # All of it is hashable and static: two problems of one layout share their compiled programs.
     estimator = estimator_of(problem.method)
     scaled, concentrated = estimator.scaled_outputs(problem)
-    kind_of = transforms.kind if bounded else transforms.plain_kind
     nuisance = problem.nuisance
     return Layout(
         model=problem.model,
         free=tuple(problem.free),
-        kinds=tuple(kind_of(f) for f in problem.free.values()),
+        kinds=tuple(transforms.plain_kind(f) for f in problem.free.values()),
         gains=naming.names(problem.model.Inputs) if nuisance.input_gain else (),
         shift=nuisance.time_shift,
         initial_state=nuisance.initial_state,
@@ -223,6 +222,18 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...], *, bounded: bool = 
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
+    )
+
+
+def within_bounds(layout: Layout, problem: Problem) -> Layout:
+    """The layout whose free parameters are kept within their bounds by logit coordinates.
+
+    Args:
+        layout: of the problem.
+        problem: has the bounds.
+    """
+    return dataclasses.replace(
+        layout, kinds=tuple(transforms.kind(f) for f in problem.free.values())
     )
 
 

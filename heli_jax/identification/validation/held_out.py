@@ -47,7 +47,8 @@ def validate(
         held: the flights held out.
     """
     # What is shared stands first in z and in the same order, whichever flights there are.
-    other, data = layout_of(problem, held), data_of(problem, held)
+    other = layout_of(problem, held)
+    data = data_of(problem, held, other)
     begin = jnp.zeros(other.size - layout.first_nuisance, z.dtype)
     if not problem.model.linear:
         begin = start_vector(other, data, problem)[layout.first_nuisance :]
