@@ -243,7 +243,14 @@ def _holds(flight: Flight) -> dict[str, dict[str, str]]:
 def _source(flight: Flight) -> dict[str, Any]:
     # A flight that was given in memory: `null`, so that nobody looks for a file.
     if flight.source is None:
-        return {"path": None, "sha256": None, "flight": flight.name}
+        return {
+            "path": None,
+            "sha256": None,
+            "flight": flight.name,
+            "hold_out": flight.hold_out,
+            "n_samples": flight.n_samples,
+            "dt": flight.dt,
+        }
     return {
         "path": flight.source.path,
         "sha256": flight.source.sha256,

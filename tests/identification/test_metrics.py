@@ -74,3 +74,11 @@ def test_a_whole_record_is_judged_as_by_ljung_and_box():
     assert found.p_value == pytest.approx(min(1.0, wanted), rel=1e-9)
     assert found.lag1 == pytest.approx(r[0], rel=1e-9)
     assert found.outside == np.mean(np.abs(r) > 2.5758 / np.sqrt(400))
+
+
+def test_a_constant_signal_has_no_motion_to_explain():
+    # 0.1 has no exact binary form: its mean differs by rounding, which is no motion.
+    m = metrics(np.full(1000, 0.1), np.full(1000, 0.2))
+    assert np.isnan(m.vaf)
+    assert np.isnan(m.nrmse_fit_percent)
+    assert m.rmse == pytest.approx(0.1)

@@ -186,3 +186,10 @@ def test_a_fast_mode_that_is_there_in_flight_only_is_seen():
     fast = 50.0 * np.sqrt(flight.inputs["throttle"].mean())
     assert f"a mode at {fast:.4g} rad/s (linearised about the record's mean)" in said
     assert "Nyquist" in said
+
+
+def test_headings_on_either_side_of_south_are_one_heading(xcell):
+    psi = np.where(np.arange(N) % 2, np.pi - 0.01, 0.01 - np.pi)
+    outputs = {"dx": np.full(N, -8.0), "dy": np.zeros(N), "yaw": psi}
+    at = operating_point(models.helicopter("consistent"), xcell, STILL, outputs, DT)
+    assert at.words == "the trim at 8 m/s ahead"

@@ -162,7 +162,7 @@ def _not_determined(group: Inseparable, facts: Facts) -> str:
     if group.nuisances:
         what = f"{listed([*names, *group.nuisances])} are exchangeable, so {what}"
     # Not capitalize(): that would lower the names' capitals.
-    what = what[0].upper() + what[1:] if what.startswith("the") else what
+    what = what[0].upper() + what[1:] if what.startswith("the ") else what
     return f"{what}: {way_out(names, facts, group.count, group.switches)}."
 
 

@@ -45,6 +45,8 @@ def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     measured, simulated = measured[seen], simulated[seen]
     residual = measured - simulated
     motion = np.linalg.norm(measured - measured.mean())
+    # What rounding leaves of a constant is no motion that a simulation could explain.
+    motion = motion if motion > 1e-9 * np.linalg.norm(measured) else 0.0
     rms = np.sqrt(np.mean(measured**2)) + np.sqrt(np.mean(simulated**2))
     mse = float(np.mean(residual**2))
     rmse = mse**0.5

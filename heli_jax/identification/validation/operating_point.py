@@ -109,7 +109,8 @@ def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
     """The mean motion of a record; hover where it is slow or nothing tells."""
     dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
     heading = outputs.get("yaw")
-    psi = float(np.nanmean(heading)) if heading is not None else 0.0
+    # A circular mean: headings on either side of south are near one another, and far in numbers.
+    psi = float(np.angle(np.nanmean(np.exp(1j * heading)))) if heading is not None else 0.0
     # From the axes of the ground to those of the heading, which a trim speaks of.
     forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
     # Records of hover drift: their trim would be called one of forward flight.

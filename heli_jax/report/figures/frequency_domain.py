@@ -166,6 +166,8 @@ def _draw_record(
 def _bode_unit(model: Model, output: str, input: str) -> str:
     """`dB re rad/m`; plain dB where a unit is missing, or is a quotient and would need brackets."""
     out, into = naming.unit(model.Outputs, output), naming.unit(model.Inputs, input)
+    if into == "1":
+        return f"dB re {out}" if out and out != "1" else "dB"
     return f"dB re {out}/{into}" if out and into and "/" not in into else "dB"
 
 
