@@ -9,6 +9,7 @@ the lateral doublets (18 to 32 s) and then fly the whole record.
 """
 
 import sys
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -21,17 +22,19 @@ from heli_jax import (
     Problem,
     Signal,
     fit,
-    linear_model,
+    load_config,
     models,
     naming,
     read_flight,
     simulate,
 )
+from heli_jax import config as configuration
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Scalar
 
 jax.config.update("jax_enable_x64", True)
 WINDOW = (18.0, 32.0)
+CONFIG = Path(__file__).parents[1] / "configs" / "trex550-roll.yaml"
 
 
 class Lag(NamedTuple):
@@ -63,28 +66,11 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
     return model, start, {"K": Free(1.0), "tau": Free(0.1), "delay_lat": Free(-0.05)}
 
 
-def flybarless() -> tuple[Model, Any, dict[str, Free]]:
-    """Rotor, servo, rate loop, delay. Rotor and servo are no part of what this log shows (it was
-    low-passed near 2 Hz): theirs are numbers of the size class, the loop's are estimated."""
-    rotor = linear_model("roll-flybarless")
-    model = models.with_servos(rotor.model, ["lat"])
-    model = models.with_rate_loop(model, ["lat"], feedforward=False)
-    model = models.with_delays(model, inputs=["lat"])
-    values = {
-        **naming.asdict(rotor.vehicle().params),
-        # The flapping of ArduPilot's 600 class, roll mode -7.3 +- 59.5j.
-        **{"tau_f": 0.0682, "Lb": 3593.0, "Blat": 0.14},
-        **{"omega_servo": 2.0 * np.pi * 10.0, "zeta_servo": 0.7},
-        **{"Kc_lat": 2.0, "Kp_lat": 0.1, "Ki_lat": 4.0, "delay_lat": 0.0},
-    }
-    # Feedback that damps: a gain of the other sign would fit the log, and be no rate loop.
-    free = {
-        "Kc_lat": Free(2.0, sign="keep"),
-        "Kp_lat": Free(0.1, sign="keep"),
-        "Ki_lat": Free(4.0, sign="keep"),
-        "delay_lat": Free(-0.05),
-    }
-    return model, model.Params(**values), free
+def flybarless(path: str) -> tuple[Model, Any, dict[str, Free]]:
+    """Rotor, servo, rate loop, delay: that of the configuration."""
+    logs = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
+    problem = configuration.problem(load_config(CONFIG, logs))
+    return problem.model, problem.vehicle, dict(problem.free)
 
 
 def vaf(measured: np.ndarray, simulated: np.ndarray) -> float:
@@ -120,7 +106,7 @@ def main(path: str) -> None:
     window, whole = read(path, window=WINDOW), read(path)
     print("| model | VAF 18-32 s | whole record | rest | estimates |")
     print("|---|---|---|---|---|")
-    for model, params, free in (first_order(), flybarless()):
+    for model, params, free in (first_order(), flybarless(path)):
         estimate = fit(Problem(model, params, [window], free))
         seen = agreement(model, params, estimate, whole)
         numbers = ", ".join(

@@ -78,6 +78,9 @@ def test_devices_stand_around_a_linear_model(written, tmp_path):
 
 def test_they_are_simulated_checked_and_swept(written, tmp_path):
     path = written(
+        onboard={"servos": {"on": ["lat"]}},
+        vehicle={"omega_servo": 50.0, "zeta_servo": 0.7},
+        fit={"free": {"omega_servo": {"start": 40.0}}},
         sweep={
             "design": "grid",
             "axes": {"omega_servo": {"values": [4.0, 8.0], "unit": "Hz"}},
