@@ -66,10 +66,14 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
     return model, start, {"K": Free(1.0), "tau": Free(0.1), "delay_lat": Free(-0.05)}
 
 
-def flybarless(path: str) -> tuple[Model, Any, dict[str, Free]]:
-    """Rotor, servo, rate loop, delay: that of the configuration."""
-    logs = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
-    problem = configuration.problem(load_config(CONFIG, logs))
+def flybarless(path: str, *, limited: bool) -> tuple[Model, Any, dict[str, Free]]:
+    """Rotor, servo, rate loop, delay: that of the configuration; with a limit of the servo's rate
+    where asked."""
+    changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
+    if limited:
+        changes["onboard.servos.rate_limit"] = True
+        changes["fit.free.rate_servo"] = {"start": 3.0}
+    problem = configuration.problem(load_config(CONFIG, changes))
     return problem.model, problem.vehicle, dict(problem.free)
 
 
@@ -106,14 +110,19 @@ def main(path: str) -> None:
     window, whole = read(path, window=WINDOW), read(path)
     print("| model | VAF 18-32 s | whole record | rest | estimates |")
     print("|---|---|---|---|---|")
-    for model, params, free in (first_order(), flybarless(path)):
+    candidates = (
+        first_order(),
+        flybarless(path, limited=False),
+        flybarless(path, limited=True),
+    )
+    for model, params, free in candidates:
         estimate = fit(Problem(model, params, [window], free))
         seen = agreement(model, params, estimate, whole)
         numbers = ", ".join(
             f"{n} {e.value:.3g} +- {e.sd:.1g}" for n, e in estimate.estimates.items()
         )
         print(
-            f"| {model.name} | {' | '.join(f'{v:.4f}' for v in seen.values())} | "
+            f"| {model.name}{'' if model.linear else ', limited'} | {' | '.join(f'{v:.4f}' for v in seen.values())} | "
             f"{estimate.status}: {numbers} |"
         )
 

@@ -86,7 +86,7 @@ def test_they_are_simulated_checked_and_swept(written, tmp_path):
             "axes": {"omega_servo": {"values": [4.0, 8.0], "unit": "Hz"}},
             "reduce": {"p": {"how": "rms", "signal": "p"}},
             "inputs": "simulate",
-        }
+        },
     )
     assert main(["simulate", str(path), "--out", str(tmp_path / "roll.csv")]) == 0
     check = run_check(path)

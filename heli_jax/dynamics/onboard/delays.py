@@ -13,7 +13,7 @@ from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, require
 from heli_jax.naming import Record
 
 ORDER = 4
-"""states of a delay line: at a frequency of 2/delay rad/s its error is 2e-4, at 4/delay 5 %"""
+"""states of a delay line: at 2/delay rad/s its error is 2e-4, at 4/delay 3 %"""
 _HIGHEST = 8
 
 type Late = Sequence[str] | Mapping[str, str]

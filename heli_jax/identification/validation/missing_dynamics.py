@@ -5,13 +5,12 @@ are missing leave a residual that is a filtered input (Ljung, 1999, section 16.6
 does not.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.special
-
-from heli_jax.identification.result import Signals
 
 _SECONDS = 0.4
 """lags of an input that are looked at"""
@@ -26,6 +25,17 @@ _FEWEST = 10
 """samples for each regressor"""
 
 
+class Left(NamedTuple):
+    """What a fit leaves of one flight."""
+
+    dt: float
+    """[s]"""
+    residuals: Mapping[str, np.ndarray]
+    """by output (N,), NaN where nothing is measured; innovations with filter error"""
+    inputs: Mapping[str, np.ndarray]
+    """(N,)"""
+
+
 class Explained(NamedTuple):
     """How much of a residual an input explains."""
 
@@ -37,17 +47,16 @@ class Explained(NamedTuple):
     """where the response to the input is largest [s]"""
 
 
-def missing_dynamics(signals: tuple[Signals, ...]) -> list[str]:
-    """Sentences on what inputs still explain of the residuals (innovations).
+def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
+    """Sentences on what inputs still explain of the residuals.
 
     Args:
-        signals: of the fitted flights.
+        flights: those that were fitted.
     """
-    pairs = [(s, y, u) for s in signals for y in s.measured for u in s.inputs]
+    pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
     found: dict[tuple[str, str], Explained] = {}
-    for s, output, name in pairs:
-        dt = float(s.times[1] - s.times[0])
-        one = explained_by(s.error(output), s.inputs[name], dt)
+    for flight, output, name in pairs:
+        one = explained_by(flight.residuals[output], flight.inputs[name], flight.dt)
         if one is None or one.p_value * len(pairs) > _BY_CHANCE or one.share < _WORTH_IT:
             continue
         known = found.get((output, name))
