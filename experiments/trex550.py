@@ -121,10 +121,9 @@ def main(path: str) -> None:
         numbers = ", ".join(
             f"{n} {e.value:.3g} +- {e.sd:.1g}" for n, e in estimate.estimates.items()
         )
-        print(
-            f"| {model.name}{'' if model.linear else ', limited'} | {' | '.join(f'{v:.4f}' for v in seen.values())} | "
-            f"{estimate.status}: {numbers} |"
-        )
+        name = model.name if model.linear else f"{model.name}, rate limited"
+        shares = " | ".join(f"{v:.4f}" for v in seen.values())
+        print(f"| {name} | {shares} | {estimate.status}: {numbers} |")
 
 
 if __name__ == "__main__":
