@@ -72,7 +72,7 @@ def flybarless(path: str, *, limited: bool) -> tuple[Model, Any, dict[str, Free]
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if limited:
         changes["onboard.servos.rate_limit"] = True
-        changes["fit.free.rate_servo"] = {"start": 3.0}
+        changes["fit.free.rate_servo"] = {"start": 1.0}
     problem = configuration.problem(load_config(CONFIG, changes))
     return problem.model, problem.vehicle, dict(problem.free)
 
@@ -119,7 +119,8 @@ def main(path: str) -> None:
         estimate = fit(Problem(model, params, [window], free))
         seen = agreement(model, params, estimate, whole)
         numbers = ", ".join(
-            f"{n} {e.value:.3g} +- {e.sd:.1g}" for n, e in estimate.estimates.items()
+            f"{n} {e.value:.3g}" + ("" if e.sd is None else f" +- {e.sd:.1g}")
+            for n, e in estimate.estimates.items()
         )
         name = model.name if model.linear else f"{model.name}, rate limited"
         shares = " | ".join(f"{v:.4f}" for v in seen.values())

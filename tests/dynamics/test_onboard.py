@@ -1,7 +1,7 @@
 """Devices around a model against transfer functions and simulations written out by hand."""
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,10 @@ from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.naming import Scalar
 
 ROLL = linear_model("roll-flybarless")
-SERVO = {"omega_servo": 2 * math.pi * 8, "zeta_servo": 0.7}
+SERVO: dict[str, Any] = {"omega_servo": 2 * math.pi * 8, "zeta_servo": 0.7}
 
 
-def params(model, base=ROLL, **more):
+def params(model, base=ROLL, **more: Any):
     return model.Params(**{**naming.asdict(base.vehicle().params), **more})
 
 
@@ -148,7 +148,7 @@ def test_a_damper_on_the_tail_is_the_published_yaw_gyro():
     model = models.with_gyro(bare.model, {"col": "w"}, heading_hold=False)
     p = params(model, bare, Kp_col=2.163 / 8.258, tau_gyro_col=1 / 8.258)
     p = p._replace(Zw=-4.129, Zcol=33.07)
-    poles = np.linalg.eigvals(np.asarray(jacobians(model, p).A))
+    poles = np.roots(np.poly(np.asarray(jacobians(model, p).A)))
     # Without the couplings to the rest of the machine, which move the fourth digit.
     np.testing.assert_allclose(sorted(poles.imag), [-8.1990, 8.1990], atol=5e-3)
     np.testing.assert_allclose(poles.real, -6.1966, atol=5e-3)
@@ -265,6 +265,7 @@ def test_devices_keep_what_a_model_knows():
     onboard = models.with_servos(with_disturbance(ROLL.model, "roll"), ["lat"])
     p = params(onboard, sigma_w=0.5, tau_w=2.0, **SERVO)
     assert onboard.random_states == ("w1_roll",)
+    assert onboard.noise_intensity is not None
     intensity = onboard.noise_intensity(p)
     assert float(intensity.w1_roll) == pytest.approx(0.5)
     assert float(intensity.lat_servo) == 0.0
