@@ -187,6 +187,8 @@ def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
         "line",
         lambda bare: with_delay_line(bare, name, order),
         delays=rest,
+        # A log can be read ahead, for a stick that it has late; a line has the past alone.
+        positive=(*model.positive, device.parameter),
         delay_lines=(*model.delay_lines, (name, device.parameter)),
     )
 

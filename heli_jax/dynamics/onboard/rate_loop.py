@@ -123,7 +123,6 @@ def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suff
     for stick, _ in loops:
         if stick in dict(model.delays):
             model = with_delay_line(model, stick)
-    # A delay line is called around the model without a stand too: it is put there by `model` above.
     return _RateLoop(model, loops, law).made(
         suffix, lambda bare: _with_loops(bare, loops, law, suffix)
     )
