@@ -66,13 +66,12 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
     return model, start, {"K": Free(1.0), "tau": Free(0.1), "delay_lat": Free(-0.05)}
 
 
-def flybarless(path: str, *, limited: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Rotor, servo, rate loop, delay: that of the configuration; with a limit of the servo's rate
-    where asked."""
+def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
+    """Rotor, servo, rate loop, delay: that of the configuration; with a feed-forward where asked."""
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
-    if limited:
-        changes["onboard.servos.rate_limit"] = True
-        changes["fit.free.rate_servo"] = {"start": 1.0}
+    if feedforward:
+        changes["onboard.rate_loop.feedforward"] = True
+        changes["fit.free.Kff_lat"] = {"start": 0.1}
     problem = configuration.problem(load_config(CONFIG, changes))
     return problem.model, problem.vehicle, dict(problem.free)
 
@@ -112,8 +111,8 @@ def main(path: str) -> None:
     print("|---|---|---|---|---|")
     candidates = (
         first_order(),
-        flybarless(path, limited=False),
-        flybarless(path, limited=True),
+        flybarless(path, feedforward=False),
+        flybarless(path, feedforward=True),
     )
     for model, params, free in candidates:
         estimate = fit(Problem(model, params, [window], free))
@@ -122,7 +121,7 @@ def main(path: str) -> None:
             f"{n} {e.value:.3g}" + ("" if e.sd is None else f" +- {e.sd:.1g}")
             for n, e in estimate.estimates.items()
         )
-        name = model.name if model.linear else f"{model.name}, rate limited"
+        name = model.name + (", feed-forward" if "Kff_lat" in free else "")
         shares = " | ".join(f"{v:.4f}" for v in seen.values())
         print(f"| {name} | {shares} | {estimate.status}: {numbers} |")
 

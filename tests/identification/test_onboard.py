@@ -62,6 +62,8 @@ def test_a_servo_and_two_delays_are_recovered():
     truth = {"Lb": LB, "omega_servo": OMEGA, "delay_lat": DELAY_LAT, "delay_phi": DELAY_PHI}
     for name, value in truth.items():
         estimate = found.estimates[name]
+        assert estimate.lower95 is not None
+        assert estimate.upper95 is not None
         assert estimate.lower95 < value < estimate.upper95, name
     # Well enough to tell it from a servo twice as fast.
     assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
