@@ -67,7 +67,7 @@ def first_order() -> tuple[Model, Any, dict[str, Free]]:
 
 
 def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, Free]]:
-    """Rotor, servo, rate loop, delay: that of the configuration; with a feed-forward where asked."""
+    """Rotor, servo, rate loop, delay: the configuration; with a feed-forward where asked."""
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True
