@@ -71,7 +71,7 @@ def flybarless(path: str, *, feedforward: bool) -> tuple[Model, Any, dict[str, F
     changes: dict[str, Any] = {f"flights.{i}.log": str(Path(path).resolve()) for i in range(3)}
     if feedforward:
         changes["onboard.rate_loop.feedforward"] = True
-        changes["fit.free.Kff_lat"] = {"start": 0.1}
+        changes["fit.free.Kff_lat"] = {"start": 0.1, "sign": "keep"}
     problem = configuration.problem(load_config(CONFIG, changes))
     return problem.model, problem.vehicle, dict(problem.free)
 
