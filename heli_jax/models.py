@@ -7,6 +7,10 @@ from typing import Literal
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.onboard.delays import with_delays
+from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
+from heli_jax.dynamics.onboard.sensors import with_sensors
+from heli_jax.dynamics.onboard.servos import with_servos
 from heli_jax.dynamics.roll import on_stand, pitch, roll
 from heli_jax.errors import InputError, nearest
 from heli_jax.import_path import by_path, is_path
@@ -14,7 +18,20 @@ from heli_jax.import_path import by_path, is_path
 roll_on_stand = on_stand(roll)
 pitch_on_stand = on_stand(pitch)
 
-__all__ = ["by_name", "helicopter", "on_stand", "pitch", "pitch_on_stand", "roll", "roll_on_stand"]
+__all__ = [
+    "by_name",
+    "helicopter",
+    "on_stand",
+    "pitch",
+    "pitch_on_stand",
+    "roll",
+    "roll_on_stand",
+    "with_delays",
+    "with_gyro",
+    "with_rate_loop",
+    "with_sensors",
+    "with_servos",
+]
 
 # By the names that a configuration, fit.json and the report use; in Python the names are
 # attributes.

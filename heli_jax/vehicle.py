@@ -218,11 +218,13 @@ def vehicle_from_mapping(
     if missing:
         raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
     # Of a class of one's own nobody knows what is possible.
-    if params is Helicopter:
+    if of_helicopter(params):
         wrong = impossible({n: c.value for n, c in constants.items()})
         if wrong:
             raise InputError(f"{where}: {wrong}")
-    values = {n: _scalar(c.value) for n, c in constants.items()}
+    # Defaults too: a class that devices extend has them as plain numbers.
+    values = {n: _scalar(v) for n, v in naming.defaults(params).items()}
+    values |= {n: _scalar(c.value) for n, c in constants.items()}
     return Vehicle(params(**values), constants, where)
 
 

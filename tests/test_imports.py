@@ -35,7 +35,7 @@ ALLOWED = {
     "exports": {"naming"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
     "flights": {"errors", "regular_file", "units", "summaries"},
-    "dynamics": {"vehicle", "naming", "numerics"},
+    "dynamics": {"vehicle", "naming", "numerics", "units", "errors"},
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", *BASE},

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
@@ -77,7 +78,8 @@ def _linear(model: LinearConfig, path: Path) -> LinearModel:
 
 
 def _started(config: Config, path: Path, model: Model) -> Model:
-    """The model with the configuration's initial state."""
+    """The model with the configuration's devices around it, and its initial state."""
+    model = with_onboard(model, config.onboard, path)
     if not config.initial_state:
         return model
     for name in config.initial_state:
@@ -217,24 +219,46 @@ def _section(annotation: Any) -> Any:
 
 def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
     if isinstance(config.model, LinearConfig):
-        return _of_linear(config, config.model, path)
-    if config.vehicle is None:
+        vehicle = _of_linear(config, config.model, path, model)
+    elif config.vehicle is None:
         raise InputError(f"{path}: vehicle: missing")
     # The model's Params say which constants there can be, and in which units.
-    if isinstance(config.vehicle, str):
-        return read_vehicle(path.parent / config.vehicle, model.Params)
-    return vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
+    elif isinstance(config.vehicle, str):
+        vehicle = read_vehicle(path.parent / config.vehicle, model.Params)
+    else:
+        vehicle = vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
+    for name in model.positive:
+        constant = vehicle.constants.get(name)
+        if constant is not None and constant.value <= 0:
+            raise InputError(
+                f"{vehicle.path}: {name} must be more than zero, got {constant.value:g}"
+            )
+    return vehicle
 
 
-def _of_linear(config: Config, model: LinearConfig, path: Path) -> Vehicle:
+def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) -> Vehicle:
     """The values of a linear model's file, with those of the configuration in their place."""
     read = _linear(model, path)
-    if config.vehicle is None:
-        return read.vehicle()
-    if isinstance(config.vehicle, str):
-        file = path.parent / config.vehicle
-        return read.vehicle(read_mapping(file), str(file))
-    return read.vehicle(config.vehicle, f"{path}: vehicle")
+    given, where = config.vehicle, f"{path}: vehicle"
+    if isinstance(given, str):
+        where = str(path.parent / given)
+        given = read_mapping(path.parent / given)
+    if given is None:
+        own = read.vehicle()
+        given, where = {}, own.path
+    else:
+        known = naming.names(built.Params)
+        for name in given:
+            if name not in known:
+                raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
+        own = read.vehicle(
+            {n: v for n, v in given.items() if n in naming.names(read.model.Params)}, where
+        )
+    if built.Params is read.model.Params:
+        return own
+    # Devices around the model have parameters of their own, which the file does not know.
+    entries = {n: c._asdict() for n, c in own.constants.items()}
+    return vehicle_from_mapping({**given, **entries}, where, built.Params)
 
 
 def resolved(experiment: Experiment) -> dict[str, Any]:

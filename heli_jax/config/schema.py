@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
+from heli_jax.config.onboard import OnboardConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
@@ -142,7 +143,8 @@ class FitConfig(_Strict):
     free: dict[str, FreeConfig]
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
-    starts: Annotated[int, Field(ge=1, le=10_000)] = 1
+    starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """points to start from; one unless given, five where a delay is free"""
     seed: Annotated[int, Field(ge=0)] = 0
     max_steps: Annotated[int, Field(ge=1)] = 200
     compare: bool = False
@@ -338,6 +340,8 @@ class Config(_Strict):
     corrections: dict[str, StrictBool] | None = None
     """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
     off in place of what the model has; for the whole helicopter only"""
+    onboard: OnboardConfig | None = None
+    """servos, rate loops, gyro, sensors and delays around the model (docs/onboard.md)"""
     initial_state: dict[str, Finite] = {}
     """values of states at the first sample in SI, in place of the model's own: for models that
     cannot begin at zero"""

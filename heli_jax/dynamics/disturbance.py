@@ -60,6 +60,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
         delays=model.delays,
+        delay_lines=model.delay_lines,
         positive=model.positive,
     )
 

@@ -91,6 +91,9 @@ class Model(eqx.Module):
     """of a machine on a stand, the same machine in free flight"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
+    delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    """inputs and outputs that are late by states of the model (`with_delays`), each with the
+    parameter that is its delay [s]"""
     positive: tuple[str, ...] = eqx.field(static=True, default=())
     """the parameters that are above zero whatever else may change its sign"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
@@ -111,6 +114,11 @@ class Model(eqx.Module):
                 )
                 setattr(self, new, function)
                 setattr(self, old, None)
+
+    @property
+    def delay_parameters(self) -> tuple[str, ...]:
+        """The parameters that are delays of inputs or outputs."""
+        return tuple(dict.fromkeys(name for _, name in (*self.delays, *self.delay_lines)))
 
     @property
     def random_states(self) -> tuple[str, ...]:

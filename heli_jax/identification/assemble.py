@@ -40,6 +40,7 @@ from heli_jax.identification.validation.adequacy import Adequacy, Evidence, asse
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
+from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.other_hold import other_hold
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
@@ -152,6 +153,8 @@ def assemble(
     against = None if none else layout.estimator.against_expected(layout, data, noise, e, best.z)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
+    # Where the model is inadequate its own sentences say more.
+    missing = _missing(problem, signals) if adequacy.adequate and not all_white else []
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -177,10 +180,20 @@ def assemble(
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(*notes, *adequacy.sentences, *held.notes),
+        notes=(*notes, *adequacy.sentences, *missing, *held.notes),
         reached=solution,
         seed=run.seed,
         timing=run.timing,
+    )
+
+
+def _missing(problem: Problem, signals: tuple[Signals, ...]) -> list[str]:
+    """What inputs still explain of the residuals (innovations)."""
+    return missing_dynamics(
+        tuple(
+            Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
+            for s, flight in zip(signals, problem.training, strict=True)
+        )
     )
 
 

@@ -9,6 +9,7 @@ from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.multistart import StartRow
@@ -90,7 +91,7 @@ def check(problem: Problem) -> Check:
 def fit(
     problem: Problem,
     *,
-    starts: int = 1,
+    starts: int | None = None,
     seed: int = 0,
     max_steps: int = 200,
     progress: starting.Progress | None = None,
@@ -100,7 +101,8 @@ def fit(
     Args:
         problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
-            within the bounds, or about a factor of three around the start.
+            within the bounds, or about a factor of three around the start. None: one, or where a
+            delay is free five that differ in the delays.
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
@@ -120,7 +122,10 @@ def fit(
     # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
     before = verdict_of(problem, layout, guess.e)
     report(f"fitting {', '.join(layout.of_interest)}")
-    points = starting.draw(layout, problem, guess.z, starts, seed)
+    if starts is None:
+        points = delay_starts(layout, problem, guess.z, seed)
+    else:
+        points = starting.draw(layout, problem, guess.z, starts, seed)
     disturbed = "sigma_w" in layout.disturbance
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.

@@ -16,7 +16,7 @@ from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
-from heli_jax.vehicle import impossible, of_helicopter
+from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
 
 class Nuisance(NamedTuple):
@@ -92,11 +92,12 @@ class Problem:
         check_model(self.model)
         object.__setattr__(self, "flights", tuple(self.flights))
         # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
-        ours, positive = of_helicopter(self.model.Params), self.model.positive
+        # So is what the model says is positive; delays and gains of devices around it are not.
+        positive = set(self.model.positive)
+        if of_helicopter(self.model.Params):
+            positive |= set(naming.names(Helicopter))
         free = {
-            n: f
-            if f.sign is not None
-            else f._replace(sign="keep" if ours or n in positive else "any")
+            n: f if f.sign is not None else f._replace(sign="keep" if n in positive else "any")
             for n, f in self.free.items()
         }
         # Frozen: what was accepted in another form is put right once, here.

@@ -1,0 +1,138 @@
+"""The section `onboard`: devices around a model, from the swashplate outwards."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
+
+from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.onboard.delays import ORDER, with_delays
+from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
+from heli_jax.dynamics.onboard.sensors import with_sensors
+from heli_jax.dynamics.onboard.servos import with_servos
+from heli_jax.errors import InputError
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _names(value: object) -> object:
+    if isinstance(value, list) and all(isinstance(v, str) for v in value):
+        return value
+    raise ValueError(f"expected a list of names such as [lat, lon], got {value!r:.60}")
+
+
+def _names_or_pairs(value: object) -> object:
+    # By hand: of a union pydantic would report every member.
+    pairs = isinstance(value, dict) and all(
+        isinstance(k, str) and isinstance(v, str) for k, v in value.items()
+    )
+    if pairs or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
+        return value
+    raise ValueError(
+        f"expected a list of names such as [lat] or pairs such as {{lat: p}}, got {value!r:.60}"
+    )
+
+
+def _one_or_several(value: object) -> object:
+    return [value] if isinstance(value, dict) else value
+
+
+# Any, since the validator before it has said what it may be.
+Names = Annotated[Any, BeforeValidator(_names)]
+NamesOrPairs = Annotated[Any, BeforeValidator(_names_or_pairs)]
+Order = Annotated[int, Field(ge=1, le=8)]
+
+
+class ServosConfig(_Strict):
+    """Equal servos on some inputs (`with_servos`)."""
+
+    on: Names
+    rate_limit: StrictBool = False
+    delay: StrictBool = False
+    name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9_]*$")] = "servo"
+    """ends the names of its parameters: omega_servo, ..."""
+
+
+class RateLoopConfig(_Strict):
+    """A flybarless unit (`with_rate_loop`)."""
+
+    on: NamesOrPairs = None
+    """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
+    integral: StrictBool = True
+    feedforward: StrictBool = True
+    lag: StrictBool = False
+
+
+class GyroConfig(_Strict):
+    """A gyro on the tail (`with_gyro`)."""
+
+    on: NamesOrPairs = None
+    """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
+    heading_hold: StrictBool = True
+    lag: StrictBool = True
+
+
+class SensorsConfig(_Strict):
+    """What the log's sensors do (`with_sensors`)."""
+
+    imu: StrictBool = False
+    lowpass: Names = []
+    delay: NamesOrPairs = []
+    order: Order = ORDER
+
+
+class DelaysConfig(_Strict):
+    """Delays of inputs and outputs (`with_delays`)."""
+
+    inputs: NamesOrPairs = []
+    """names, or by name the parameter"""
+    outputs: NamesOrPairs = []
+    order: Order = ORDER
+
+
+class OnboardConfig(_Strict):
+    """What stands between stick and blade, motion and log; each on what stands before it."""
+
+    servos: Annotated[list[ServosConfig], BeforeValidator(_one_or_several)] = []
+    rate_loop: RateLoopConfig | None = None
+    gyro: GyroConfig | None = None
+    sensors: SensorsConfig | None = None
+    delays: DelaysConfig | None = None
+
+
+def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Model:
+    """The model with the devices of a configuration around it.
+
+    Args:
+        model: bare.
+        config: the section, or None.
+        path: the configuration, for errors.
+
+    Raises:
+        InputError: a device that the model cannot have.
+    """
+    if config is None:
+        return model
+    steps: list[tuple[str, Callable[..., Model], BaseModel]] = [
+        *(("servos", with_servos, servos) for servos in config.servos),
+        *(
+            (key, function, section)
+            for key, function, section in (
+                ("rate_loop", with_rate_loop, config.rate_loop),
+                ("gyro", with_gyro, config.gyro),
+                ("sensors", with_sensors, config.sensors),
+                ("delays", with_delays, config.delays),
+            )
+            if section is not None
+        ),
+    ]
+    for key, function, section in steps:
+        try:
+            # By name: a key that the function lacks, or the reverse, is an error here.
+            model = function(model, **dict(section))
+        except ValueError as e:
+            raise InputError(f"{path}: onboard.{key}: {e}") from e
+    return model

@@ -1,0 +1,195 @@
+"""Rate loops that fly along: the flybarless unit about roll and pitch, the gyro of the tail."""
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.onboard.delays import with_delay_line
+from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
+from heli_jax.errors import nearest
+from heli_jax.naming import Record
+
+type Loops = Sequence[str] | Mapping[str, str] | None
+"""sticks; or by stick the state that is the rate it commands; None: those of the model's axes"""
+
+
+class Law(NamedTuple):
+    """What a rate loop has."""
+
+    command: bool
+    """whether the stick commands a rate; else it goes to the swashplate, less the feedback"""
+    integral: bool
+    """of the rate error: the heading or attitude is held"""
+    feedforward: bool
+    lag: bool
+    """of the gyro, first order"""
+
+
+def with_rate_loop(
+    model: Model,
+    on: Loops = None,
+    *,
+    integral: bool = True,
+    feedforward: bool = True,
+    lag: bool = False,
+) -> Model:
+    r"""The model with a flybarless unit: sticks command rates, which PI loops and a feed-forward
+    make.
+
+    $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with the command
+    $r_c = K_c u$, u the stick and r the rate. The stick keeps the unit of the input in whose
+    place it stands.
+
+    New parameters, with `STICK` the input's name: `Kc_STICK` [the rate's unit per unit of stick],
+    `Kp_STICK`, `Ki_STICK`, `Kff_STICK`, with a lag `tau_gyro_STICK` [s]. New states: the integral
+    of the rate error, `STICK_integral`, and the lagged rate, `STICK_gyro`. An input that is late in
+    the model is late within the loop: by a delay line (`with_delays`).
+
+    Args:
+        model: with servos already, where it has them (`with_servos`): they are in the loop.
+        on: the sticks; by stick the state that is its rate where the model's axes do not say it;
+            None for those of the model's roll and pitch axes.
+        integral: whether there is K_i.
+        feedforward: whether there is K_ff.
+        lag: whether the unit's gyro is low-passed, tau dr_m/dt = r - r_m.
+
+    Raises:
+        ValueError: no such stick, no rate known for it, or a name that is taken.
+    """
+    check_model(model)
+    loops = _loops(model, on, ("roll", "pitch"))
+    return _with_loops(model, loops, Law(True, integral, feedforward, lag), "rate-loop")
+
+
+def with_gyro(
+    model: Model, on: Loops = None, *, heading_hold: bool = True, lag: bool = True
+) -> Model:
+    r"""The model with a gyro on the tail: the pedal is a rate command, the heading is held.
+
+    $\delta = K_p (r_c - r_m) + K_i \int (r_c - r_m)\,dt$, $r_c = K_c u$,
+    $\tau\,\dot r_m = r - r_m$; without heading hold a damper, $\delta = u - K_p r_m$. The names
+    are those of `with_rate_loop`.
+
+    Args:
+        model: with the tail's servo already, where it has one.
+        on: the pedal, as the sticks of `with_rate_loop`; None for that of the yaw axis.
+        heading_hold: whether the pedal commands a rate, with an integral of its error.
+        lag: whether the gyro is low-passed.
+
+    Raises:
+        ValueError: no such pedal, no rate known for it, or a name that is taken.
+    """
+    check_model(model)
+    law = Law(heading_hold, heading_hold, False, lag)
+    return _with_loops(model, _loops(model, on, ("yaw",)), law, "gyro")
+
+
+def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    """Sticks with the states that are their rates."""
+    known = {a.stick: a.rate for a in axes_of(model) if a.stick is not None}
+    if on is None:
+        own = [a for a in axes_of(model) if a.name in axes and a.stick in known]
+        own = [a for a in own if a.stick in naming.names(model.Inputs)]
+        if not own:
+            raise ValueError(
+                f"model {model.name} says no stick of its {' or '.join(axes)} axis, expected "
+                "on: {STICK: RATE} with an input and a state"
+            )
+        return tuple((str(a.stick), a.rate) for a in own)
+    require(on, model.Inputs, "input", model)
+    if isinstance(on, Mapping):
+        for stick, rate in on.items():
+            states = naming.names(model.State)
+            if rate not in states:
+                raise ValueError(
+                    f"{stick}: model {model.name} has no state {rate!r}{nearest(str(rate), states)}"
+                )
+        return tuple(on.items())
+    for stick in on:
+        if stick not in known:
+            raise ValueError(
+                f"model {model.name} does not say which rate {stick!r} commands, expected "
+                f"on: {{{stick}: RATE}} with one of its states"
+            )
+    return tuple((stick, known[stick]) for stick in on)
+
+
+@functools.cache
+def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suffix: str) -> Model:
+    for stick, _ in loops:
+        if stick in dict(model.delays):
+            model = with_delay_line(model, stick)
+    return _RateLoop(model, loops, law).made(
+        suffix, lambda bare: _with_loops(bare, loops, law, suffix)
+    )
+
+
+class _RateLoop(Device):
+    """PI loops about some rates, with a feed-forward."""
+
+    def __init__(self, model: Model, loops: tuple[tuple[str, str], ...], law: Law) -> None:
+        params: dict[str, Quantity] = {}
+        states: dict[str, Quantity] = {}
+        for stick, rate in loops:
+            unit = naming.unit(model.Inputs, stick), naming.unit(model.State, rate)
+            params |= _gains(stick, *unit, law)
+            if law.integral:
+                angle = quotient(unit[1], "1/s")
+                states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
+            if law.lag:
+                states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as the gyro has it")
+        super().__init__(model, Parts(params, states))
+        self.loops, self.law = loops, law
+
+    def seen(self, s: Record, stick: str, rate: str) -> Any:
+        """The rate as the loop has it."""
+        return getattr(s, f"{stick}_gyro" if self.law.lag else rate)
+
+    def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        driven = {}
+        for stick, rate in self.loops:
+            measured, gain = self.seen(s, stick, rate), getattr(p, f"Kp_{stick}")
+            if not self.law.command:
+                driven[stick] = getattr(u, stick) - gain * measured
+                continue
+            command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
+            driven[stick] = gain * (command - measured)
+            if self.law.feedforward:
+                driven[stick] = driven[stick] + getattr(p, f"Kff_{stick}") * command
+            if self.law.integral:
+                held = getattr(p, f"Ki_{stick}") * getattr(s, f"{stick}_integral")
+                driven[stick] = driven[stick] + held
+        return naming.replace(u, **driven)
+
+    def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        rates = {}
+        for stick, rate in self.loops:
+            measured = self.seen(s, stick, rate)
+            if self.law.integral:
+                command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
+                rates[f"{stick}_integral"] = command - measured
+            if self.law.lag:
+                lag = getattr(p, f"tau_gyro_{stick}")
+                rates[f"{stick}_gyro"] = (getattr(s, rate) - measured) / lag
+        return rates
+
+
+def _gains(stick: str, of_stick: str | None, of_rate: str | None, law: Law) -> dict[str, Quantity]:
+    """The parameters of one loop; the stick's unit is that of the input that it drives."""
+    per_rate = quotient(of_stick, of_rate)
+    gains = {f"Kp_{stick}": Quantity(per_rate, f"rate loop of {stick}, proportional", math.nan)}
+    if law.command:
+        command = quotient(of_rate, of_stick)
+        gains[f"Kc_{stick}"] = Quantity(command, f"rate commanded by {stick}", math.nan)
+    if law.integral:
+        unit = quotient(per_rate, "s")
+        gains[f"Ki_{stick}"] = Quantity(unit, f"rate loop of {stick}, integral", math.nan)
+    if law.feedforward:
+        gains[f"Kff_{stick}"] = Quantity(per_rate, f"feed-forward of {stick}", math.nan)
+    if law.lag:
+        gains[f"tau_gyro_{stick}"] = Quantity("s", f"lag of the gyro of {stick}", math.nan, True)
+    return gains

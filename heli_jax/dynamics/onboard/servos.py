@@ -1,0 +1,114 @@
+"""Servos between stick and swashplate."""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.onboard.delays import on_time, with_input_delays
+from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
+from heli_jax.naming import Record
+
+
+def with_servos(
+    model: Model,
+    on: Sequence[str],
+    *,
+    rate_limit: bool = False,
+    delay: bool = False,
+    name: str = "servo",
+) -> Model:
+    r"""The model with equal servos on some of its inputs.
+
+    $\ddot\delta = \omega^2(u - \delta) - 2\zeta\omega\dot\delta$. With a rate limit the servo's
+    motor is asked for no more than that speed,
+    $\ddot\delta = 2\zeta\omega\,(\mathrm{sat}(\omega (u - \delta)/(2\zeta)) - \dot\delta)$: the
+    same equation below the limit, and $|\dot\delta|$ never exceeds it.
+
+    New parameters: `omega_NAME` [rad/s], the natural frequency (the bandwidth where zeta is 0.707),
+    `zeta_NAME`, with a limit `rate_NAME` [the input's unit per second], with a delay `delay_NAME`
+    [s]. New states: the servo's position and speed, `INPUT_NAME` and `INPUT_NAME_rate`.
+
+    Args:
+        model: whose inputs are moved by servos.
+        on: those inputs.
+        rate_limit: whether they are limited in rate; the model is then no longer linear.
+        delay: whether they act late by a pure delay, exact (`Model.delays`).
+        name: ends the names of parameters and states, for a second kind of servo.
+
+    Raises:
+        ValueError: no such input, one that is late already, or a name that is taken.
+    """
+    check_model(model)
+    return _with_servos(model, tuple(on), rate_limit, delay, name)
+
+
+@functools.cache
+def _with_servos(
+    model: Model, on: tuple[str, ...], rate_limit: bool, delay: bool, name: str
+) -> Model:
+    require(on, model.Inputs, "input", model)
+    if not name.isidentifier():
+        raise ValueError(f"name: expected letters, digits and _, got {name!r:.40}")
+    if delay:
+        on_time(model, on)
+    device = _Servos(model, on, rate_limit, name)
+
+    def again(bare: Model) -> Model:
+        return _with_servos(bare, on, rate_limit, delay, name)
+
+    made = device.made(f"{name}s", again)
+    return with_input_delays(made, dict.fromkeys(on, f"delay_{name}")) if delay else made
+
+
+class _Servos(Device):
+    """Second order, one on each of some inputs."""
+
+    def __init__(self, model: Model, on: tuple[str, ...], rate_limit: bool, name: str) -> None:
+        params = {
+            f"omega_{name}": Quantity("rad/s", "servo's natural frequency", math.nan, True),
+            f"zeta_{name}": Quantity("1", "servo's damping ratio", math.nan, True),
+        }
+        if rate_limit:
+            unit = quotient(_one_unit(model, on), "s")
+            params[f"rate_{name}"] = Quantity(unit, "servo's greatest speed", math.nan, True)
+        states = {}
+        for n in on:
+            unit = naming.unit(model.Inputs, n)
+            states[f"{n}_{name}"] = Quantity(unit, f"position of the servo of {n}")
+            states[f"{n}_{name}_rate"] = Quantity(quotient(unit, "s"), f"speed of the servo of {n}")
+        super().__init__(model, Parts(params, states, linear=not rate_limit))
+        self.on, self.rate_limit, self.name = on, rate_limit, name
+
+    def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
+
+    def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        omega, zeta = (getattr(p, f"{k}_{self.name}") for k in ("omega", "zeta"))
+        rates = {}
+        for n in self.on:
+            position, speed = f"{n}_{self.name}", f"{n}_{self.name}_rate"
+            asked = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
+            # The speed that is asked for is limited, not the speed itself: a state that is clipped
+            # would wind up behind its limit, and come off it late.
+            if self.rate_limit:
+                most = getattr(p, f"rate_{self.name}")
+                asked = jnp.clip(asked, -most, most)
+            rates[position] = getattr(s, speed)
+            rates[speed] = 2.0 * zeta * omega * (asked - getattr(s, speed))
+        return rates
+
+
+def _one_unit(model: Model, on: tuple[str, ...]) -> str | None:
+    units = {naming.unit(model.Inputs, n) for n in on}
+    if len(units) > 1:
+        raise ValueError(
+            f"rate_limit: expected inputs of one unit, since they share the limit, got "
+            f"{', '.join(on)} in {', '.join(sorted(str(u) for u in units))}"
+        )
+    return units.pop()

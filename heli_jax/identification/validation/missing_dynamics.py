@@ -1,0 +1,118 @@
+"""Whether the inputs still explain what a fit leaves: dynamics that the model lacks.
+
+The whiteness of residuals alone does not say why: a disturbance colours them as well. Dynamics that
+are missing leave a residual that is a filtered input (Ljung, 1999, section 16.6), a disturbance
+does not.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.special
+
+_SECONDS = 0.4
+"""lags of an input that are looked at"""
+_MOST_LAGS = 30
+_ORDER = 10
+"""of the autoregression that whitens"""
+_BY_CHANCE = 1e-5
+"""probability, for all pairs of a fit together, at which nothing is said"""
+_WORTH_IT = 0.02
+"""share of the whitened residual below which it makes no difference to the estimates"""
+_FEWEST = 10
+"""samples for each regressor"""
+
+
+class Left(NamedTuple):
+    """What a fit leaves of one flight."""
+
+    dt: float
+    """[s]"""
+    residuals: Mapping[str, np.ndarray]
+    """by output (N,), NaN where nothing is measured; innovations with filter error"""
+    inputs: Mapping[str, np.ndarray]
+    """(N,)"""
+
+
+class Explained(NamedTuple):
+    """How much of a residual an input explains."""
+
+    share: float
+    """of the variance of the whitened residual"""
+    p_value: float
+    """of an F test"""
+    lag: float
+    """where the response to the input is largest [s]"""
+
+
+def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
+    """Sentences on what inputs still explain of the residuals.
+
+    Args:
+        flights: those that were fitted.
+    """
+    pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
+    found: dict[tuple[str, str], Explained] = {}
+    for flight, output, name in pairs:
+        one = explained_by(flight.residuals[output], flight.inputs[name], flight.dt)
+        if one is None or one.p_value * len(pairs) > _BY_CHANCE or one.share < _WORTH_IT:
+            continue
+        known = found.get((output, name))
+        if known is None or one.share > known.share:
+            found[output, name] = one
+    return [
+        f"{name} still explains {one.share:.0%} of the residual of {output}, most of it "
+        f"{one.lag:.2g} s after it moved: the model lacks dynamics between the two, which its "
+        "estimates then stand for. Is there a servo, a rate loop or a filter (onboard)?"
+        for (output, name), one in found.items()
+    ]
+
+
+def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:
+    """What the last samples of an input explain of a residual; None where nothing can be told.
+
+    Both pass the filter that whitens the residual, so that a slow residual does not pass for an
+    answer to a slow input.
+
+    Args:
+        residual: (N,), NaN where nothing is measured.
+        u: the input (N,), any unit.
+        dt: [s].
+    """
+    lags = max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
+    seen = np.isfinite(residual)
+    # A gap would have to be filled, and what fills it looks like a response.
+    if not seen.all() or residual.size < _FEWEST * (lags + _ORDER):
+        return None
+    e, drive = residual - residual.mean(), u - u.mean()
+    if not (np.std(e) > 0 and np.std(drive) > 0):
+        return None
+    whitening = _whitening(e)
+    e, drive = (np.convolve(v, whitening)[: v.size] for v in (e, drive))
+    # Column k is the input k samples before; the first samples have no past.
+    first = max(lags, _ORDER)
+    X = np.stack([drive[first - k : drive.size - k] for k in range(lags)], axis=1)
+    y = e[first:] - e[first:].mean()
+    X = X - X.mean(axis=0)
+    # An input held for several samples has columns that are the same: only their rank counts.
+    U, values, _ = np.linalg.svd(X, full_matrices=False)
+    U = U[:, values > 1e-6 * values[0]]
+    rank, n = U.shape[1], y.size
+    share = float(np.sum((U.T @ y) ** 2) / np.sum(y**2))
+    freedom = n - rank - 1
+    F = (share / rank) / max((1.0 - share) / freedom, 1e-300)
+    p_value = float(scipy.special.fdtrc(rank, freedom, F))
+    # Less what as many numbers explain of noise.
+    share = max(0.0, 1.0 - (1.0 - share) * (n - 1) / freedom)
+    correlation = np.abs(X.T @ y) / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+    return Explained(share, p_value, float(np.argmax(correlation)) * dt)
+
+
+def _whitening(e: np.ndarray) -> np.ndarray:
+    """The filter (_ORDER + 1,) of an autoregression, by Yule and Walker."""
+    c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(_ORDER + 1)]) / e.size
+    # A little white noise, so that a residual without any has a filter too.
+    c[0] *= 1.0 + 1e-9
+    return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])

@@ -1,0 +1,304 @@
+"""Devices around a model against transfer functions and simulations written out by hand."""
+
+import math
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import linear_model, load_vehicle, models, naming, simulate, trim
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
+from heli_jax.naming import Scalar
+
+ROLL = linear_model("roll-flybarless")
+SERVO: dict[str, Any] = {"omega_servo": 2 * math.pi * 8, "zeta_servo": 0.7}
+
+
+def params(model, base=ROLL, **more: Any):
+    return model.Params(**{**naming.asdict(base.vehicle().params), **more})
+
+
+def transfer(model, p, frequencies, output, stick):
+    """y/u at frequencies [rad/s] from the model's matrices."""
+    A, B, C, D = (np.asarray(M) for M in jacobians(model, p))
+    i = naming.names(model.Outputs).index(output)
+    j = naming.names(model.Inputs).index(stick)
+    eye = np.eye(len(A))
+    return np.array(
+        [C[i] @ np.linalg.solve(1j * w * eye - A, B[:, j]) + D[i, j] for w in frequencies]
+    )
+
+
+def by_hand(frequencies):
+    """p/lat of the flybarless roll: Lb Blat/tau_f / (s (s + 1/tau_f) + Lb)."""
+    s = 1j * np.asarray(frequencies)
+    return 166.1 * 0.1398 / 0.04631 / (s * (s + 1 / 0.04631) + 166.1)
+
+
+W = np.array([0.5, 3.0, 12.0, 40.0])
+
+
+def test_a_servo_is_a_second_order_lag():
+    model = models.with_servos(ROLL.model, ["lat"])
+    assert model.linear
+    p = params(model, **SERVO)
+    assert linear_misfit(model, p) < 1e-12
+    omega, zeta = SERVO.values()
+    _, servo = scipy.signal.freqs([omega**2], [1, 2 * zeta * omega, omega**2], W)
+    np.testing.assert_allclose(transfer(model, p, W, "p", "lat"), servo * by_hand(W), rtol=1e-10)
+
+
+def test_a_servo_has_the_step_response_of_scipy():
+    model = models.with_servos(ROLL.model, ["lat"])
+    p = params(model, **SERVO)
+    omega, zeta = SERVO.values()
+    den = np.polymul([1, 1 / 0.04631, 166.1], [1, 2 * zeta * omega, omega**2])
+    num = [166.1 * 0.1398 / 0.04631 * omega**2]
+    t = np.arange(60) * 0.01
+    _, expected = scipy.signal.step((num, den), T=t)
+    run = simulate(model, p, model.Inputs(lat=np.ones(60)), dt=0.01)
+    np.testing.assert_allclose(run.outputs.p, expected, atol=1e-9)
+
+
+class Params(NamedTuple):
+    k: Annotated[Scalar, "1/s", "gain"]
+
+
+class State(NamedTuple):
+    x: Annotated[Scalar, "rad", "angle"]
+
+
+class Inputs(NamedTuple):
+    u: Annotated[Scalar, "rad", "command"]
+
+
+INTEGRATOR = Model(
+    "integrator",
+    lambda p, s, u: State(x=p.k * u.u),
+    lambda p, s, u: State(x=s.x),
+    Params,
+    State,
+    Inputs,
+    State,
+    linear=True,
+)
+
+
+def test_a_servo_is_limited_in_rate_as_simulated_by_hand():
+    model = models.with_servos(INTEGRATOR, ["u"], rate_limit=True)
+    assert not model.linear
+    p = model.Params(k=1.0, rate_servo=2.0, **SERVO)
+    assert naming.unit(model.Params, "rate_servo") == "rad/s"
+    u = np.repeat([0.0, 1.0, -1.0], 50)
+    run = simulate(model, p, model.Inputs(u=u), dt=0.01, substeps=10)
+    omega, zeta, most = *SERVO.values(), 2.0
+    x = v = 0.0
+    positions, speeds = [], []
+    # Euler in steps of 10 microseconds.
+    for command in u:
+        positions.append(x)
+        speeds.append(v)
+        for _ in range(1000):
+            asked = min(max(omega / (2 * zeta) * (command - x), -most), most)
+            x, v = x + 1e-5 * v, v + 1e-5 * 2 * zeta * omega * (asked - v)
+    np.testing.assert_allclose(run.states.u_servo, positions, atol=2e-3)
+    assert np.max(np.abs(run.states.u_servo_rate)) <= 2.0 + 1e-9
+    assert max(speeds) > 1.9  # the limit is reached
+    # Far from the limit the same numbers as the linear servo.
+    faint = simulate(model, p, model.Inputs(u=1e-3 * u), dt=0.01, substeps=10).states.x
+    linear = models.with_servos(INTEGRATOR, ["u"])
+    same = simulate(linear, linear.Params(k=1.0, **SERVO), linear.Inputs(u=1e-3 * u), dt=0.01)
+    np.testing.assert_allclose(faint, same.states.x, atol=1e-8)
+    assert np.isfinite(
+        jax.grad(
+            lambda rate: jnp.sum(
+                model.vector_field(
+                    p._replace(rate_servo=rate),
+                    model.State(x=0.0, u_servo=0.0, u_servo_rate=0.0),
+                    model.Inputs(u=1.0),
+                ).u_servo_rate
+            )
+        )(2.0)
+    )
+
+
+def test_a_rate_loop_is_a_pi_controller_with_feedforward():
+    servos = models.with_servos(ROLL.model, ["lat"])
+    model = models.with_rate_loop(servos, ["lat"], lag=True)
+    gains = {"Kp_lat": 0.05, "Ki_lat": 0.3, "Kff_lat": 0.4, "Kc_lat": 3.0, "tau_gyro_lat": 0.01}
+    p = params(model, **SERVO, **gains)
+    omega, zeta = SERVO.values()
+    s = 1j * W
+    plant = by_hand(W) * omega**2 / (s**2 + 2 * zeta * omega * s + omega**2)
+    control, gyro = 0.05 + 0.3 / s, 1 / (1 + 0.01 * s)
+    expected = plant * (0.4 + control) * 3.0 / (1 + plant * control * gyro)
+    np.testing.assert_allclose(transfer(model, p, W, "p", "lat"), expected, rtol=1e-10)
+    assert naming.unit(model.Params, "Kc_lat") == "rad/s"
+    assert naming.unit(model.State, "lat_integral") == "rad"
+
+
+def test_a_damper_on_the_tail_is_the_published_yaw_gyro():
+    # Mettler et al. 2000: r_fb' = 2.163 r - 8.258 r_fb and 33.07 (ped - r_fb).
+    bare = linear_model("heave")  # a first-order model; its numbers become those of yaw
+    model = models.with_gyro(bare.model, {"col": "w"}, heading_hold=False)
+    p = params(model, bare, Kp_col=2.163 / 8.258, tau_gyro_col=1 / 8.258)
+    p = p._replace(Zw=-4.129, Zcol=33.07)
+    poles = np.roots(np.poly(np.asarray(jacobians(model, p).A)))
+    # Without the couplings to the rest of the machine, which move the fourth digit.
+    np.testing.assert_allclose(sorted(poles.imag), [-8.1990, 8.1990], atol=5e-3)
+    np.testing.assert_allclose(poles.real, -6.1966, atol=5e-3)
+    np.testing.assert_allclose(np.prod(poles), 4.129 * 8.258 + 33.07 * 2.163, rtol=1e-12)
+    hold = models.with_gyro(bare.model, {"col": "w"}, lag=False)
+    p = params(hold, bare, Kp_col=0.2, Ki_col=0.5, Kc_col=2.0)._replace(Zw=-4.129, Zcol=33.07)
+    s = 1j * W
+    loop = 33.07 / (s + 4.129) * (0.2 + 0.5 / s)
+    got = transfer(hold, p, W, "w", "col")
+    np.testing.assert_allclose(got, 2.0 * loop / (1 + loop), rtol=1e-10)
+
+
+def test_an_output_is_late():
+    model = models.with_delays(ROLL.model, outputs=["p"])
+    assert model.linear
+    p = params(model, delay_p=0.05)
+    w = np.array([1.0, 10.0, 40.0])  # up to two over the delay
+    got = transfer(model, p, w, "p", "lat")
+    np.testing.assert_allclose(got, by_hand(w) * np.exp(-0.05j * w), rtol=1e-3)
+    np.testing.assert_allclose(
+        transfer(model, p, w, "phi", "lat"), by_hand(w) / (1j * w), rtol=1e-10
+    )
+    # The delay line has the numbers of the Pade approximation [3/4].
+    f = math.factorial
+    num = [f(7 - k) * f(3) / (f(7) * f(k) * f(3 - k)) * (-1) ** k for k in range(4)]
+    den = [f(7 - k) * f(4) / (f(7) * f(k) * f(4 - k)) for k in range(5)]
+    x = 0.05j * w
+    pade = np.polyval(num[::-1], x) / np.polyval(den[::-1], x)
+    np.testing.assert_allclose(got, by_hand(w) * pade, rtol=1e-9)
+
+
+def test_a_late_output_in_time_and_its_derivative():
+    model = models.with_delays(ROLL.model, outputs=["p"])
+    lat = np.sin(4.0 * 0.02 * np.arange(100))
+    p = params(model, delay_p=0.06)
+    late = simulate(model, p, model.Inputs(lat=lat), dt=0.02).outputs.p
+    on_time = simulate(ROLL.model, ROLL.vehicle().params, lat_inputs(lat), dt=0.02).outputs.p
+    np.testing.assert_allclose(late[3:], on_time[:-3], atol=5e-3 * np.ptp(on_time))
+
+    def response(delay, w):
+        A, B, C, D = jacobians(model, params(model, delay_p=delay))
+        n, eye = len(A), jnp.eye(len(A))
+        # Real and imaginary part side by side: (i w - A) x = B.
+        both = jnp.block([[-A, -w * eye], [w * eye, -A]])
+        x = jnp.linalg.solve(both, jnp.concatenate([B[:, 0], jnp.zeros(n)]))
+        return jnp.stack([C[1] @ x[:n] + D[1, 0], C[1] @ x[n:]])
+
+    _, slope = jax.jvp(lambda delay: response(delay, 10.0), (0.06,), (1.0,))
+    expected = -10j * np.exp(-0.6j) * by_hand([10.0])[0]
+    np.testing.assert_allclose(slope, [expected.real, expected.imag], rtol=1e-4)
+
+
+def lat_inputs(lat):
+    return ROLL.model.Inputs(lat=lat)
+
+
+def test_an_input_is_late_in_front_and_within_a_loop():
+    servos = models.with_servos(ROLL.model, ["lat"], delay=True)
+    assert servos.delays == (("lat", "delay_servo"),)
+    loop = models.with_rate_loop(servos, ["lat"], feedforward=False, integral=False)
+    assert loop.delays == ()
+    assert loop.delay_parameters == ("delay_servo",)
+    model = models.with_delays(loop, inputs={"lat": "tau_radio"})
+    assert model.delays == (("lat", "tau_radio"),)
+    p = params(model, **SERVO, Kp_lat=0.05, Kc_lat=3.0, delay_servo=0.02, tau_radio=0.04)
+    omega, zeta = SERVO.values()
+    s = 1j * W
+    plant = by_hand(W) * omega**2 / (s**2 + 2 * zeta * omega * s + omega**2) * np.exp(-0.02 * s)
+    expected = plant * 0.15 / (1 + plant * 0.05)  # the radio's delay is in no matrix
+    np.testing.assert_allclose(transfer(model, p, W, "p", "lat"), expected, rtol=2e-3)
+
+
+def test_sensors_lag_and_feel():
+    hover = linear_model("r50-hover")
+    model = models.with_sensors(hover.model, ["p", "ay"], {"phi": "tau_ahrs"}, imu=True)
+    assert model.linear
+    p = params(model, hover, tau_lowpass_p=0.03, tau_lowpass_ay=0.02, tau_ahrs=0.05)
+    p = p._replace(x_imu=0.1, y_imu=-0.2, z_imu=0.3)
+    bare = hover.vehicle().params
+    plain = {n: transfer(hover.model, bare, W, n, "lat") for n in "uvwpqr"}
+    angle = {n: transfer(hover.model, bare, W, n, "lat") for n in ("phi", "theta")}
+    s, g = 1j * W, 32.2 * 0.3048
+    lag = 1 / (1 + 0.03 * s)
+    np.testing.assert_allclose(transfer(model, p, W, "p", "lat"), lag * plain["p"], rtol=1e-9)
+    ax = s * plain["u"] + g * angle["theta"] + s * (0.3 * plain["q"] + 0.2 * plain["r"])
+    np.testing.assert_allclose(transfer(model, p, W, "ax", "lat"), ax, rtol=1e-6)
+    ay = s * plain["v"] - g * angle["phi"] + s * (0.1 * plain["r"] - 0.3 * plain["p"])
+    np.testing.assert_allclose(transfer(model, p, W, "ay", "lat"), ay / (1 + 0.02 * s), rtol=1e-6)
+    az = s * plain["w"] + s * (-0.2 * plain["p"] - 0.1 * plain["q"])
+    np.testing.assert_allclose(transfer(model, p, W, "az", "lat"), az, rtol=1e-6)
+    assert naming.unit(model.Outputs, "ax") == "m/s^2"
+
+
+def test_the_helicopter_feels_its_weight_and_its_lever(vehicles_folder):
+    """In hover an accelerometer shows g upwards; turning it shows the centripetal acceleration."""
+    x_cell = load_vehicle(vehicles_folder / "x-cell-60.yaml")
+    model = models.with_sensors(models.helicopter("consistent"), imu=True)
+    p = model.Params(**{**naming.asdict(x_cell), "x_imu": 0.3})
+    at = trim(model, p)
+    y = model.output(p, at.state, at.inputs)
+    np.testing.assert_allclose(np.linalg.norm([y.ax, y.ay, y.az]), float(x_cell.g), rtol=1e-6)
+    assert float(y.az) < -9.0
+    turning = model.output(p, naming.replace(at.state, dpsi=2.0), at.inputs)
+    # Without an angular acceleration but that of yaw: forward it shows -r^2 x.
+    assert float(turning.ax - y.ax) == pytest.approx(-0.3 * 4.0, abs=0.05)
+
+
+def test_devices_keep_what_a_model_knows():
+    stand = models.with_servos(models.roll_on_stand, ["x_roll"])
+    assert stand.without_stand is models.with_servos(models.roll, ["x_roll"])
+    assert stand is models.with_servos(models.roll_on_stand, ("x_roll",))
+    disturbed = with_disturbance(models.with_delays(ROLL.model, outputs=["p"]), "roll")
+    assert disturbed.delay_parameters == ("delay_p",)
+    onboard = models.with_servos(with_disturbance(ROLL.model, "roll"), ["lat"])
+    p = params(onboard, sigma_w=0.5, tau_w=2.0, **SERVO)
+    assert onboard.random_states == ("w1_roll",)
+    assert onboard.noise_intensity is not None
+    intensity = onboard.noise_intensity(p)
+    assert float(intensity.w1_roll) == pytest.approx(0.5)
+    assert float(intensity.lat_servo) == 0.0
+    assert needed_but_missing(
+        models.with_servos(ROLL.model, ["lat"], delay=True),
+        params(models.with_servos(ROLL.model, ["lat"], delay=True)),
+    ) == ["omega_servo", "zeta_servo", "delay_servo"]
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda m: models.with_servos(m, ["lot"]), "no input 'lot'.*did you mean 'lat'"),
+        (lambda m: models.with_servos(m, []), "expected at least one input of lat"),
+        (lambda m: models.with_servos(m, ["lat", "lat"]), "named twice"),
+        (
+            lambda m: models.with_servos(models.with_servos(m, ["lat"]), ["lat"]),
+            "has a parameter 'omega_servo' already",
+        ),
+        (
+            lambda m: models.with_delays(models.with_servos(m, ["lat"], delay=True), ["lat"]),
+            "late by delay_servo already",
+        ),
+        (lambda m: models.with_delays(m), "expected an input or an output"),
+        (lambda m: models.with_delays(m, outputs=["p"], order=9), "expected 1 to 8"),
+        (lambda m: models.with_delays(m, {"lat": "Lb"}), "has a parameter 'Lb' already"),
+        (lambda m: models.with_rate_loop(m, {"lat": "r"}), "no state 'r'"),
+        (lambda m: models.with_gyro(m), "no stick of its yaw axis"),
+        (lambda m: models.with_sensors(m, imu=True), "does not know its velocities"),
+        (lambda m: models.with_sensors(m), "expected imu, lowpass or delay"),
+        (lambda m: models.with_sensors(m, ["r"]), "no output 'r'"),
+    ],
+)
+def test_errors_are_sentences(make, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make(ROLL.model)

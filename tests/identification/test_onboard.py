@@ -1,0 +1,125 @@
+"""Servo and delays of a simulated record, estimated; and what a fit without the servo says."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Problem, fit, linear_model, models, naming
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.delay_starts import delay_starts
+from heli_jax.identification.estimation.multistart import named_values
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of
+from heli_jax.identification.validation.missing_dynamics import explained_by
+
+ROLL = linear_model("roll-flybarless")
+LB, TAU_F, BLAT = 166.1, 0.04631, 0.1398
+OMEGA, ZETA = 2.0 * math.pi * 8.0, 0.7
+DT, FINE = 0.02, 20
+DELAY_LAT, DELAY_PHI = 0.034, 0.051
+
+
+def record(seed, n=300):
+    """Roll through an 8 Hz servo, by scipy at 1 kHz; delays are whole milliseconds there."""
+    rng = np.random.default_rng(seed)
+    lat = np.repeat(rng.uniform(-0.3, 0.3, n), rng.integers(5, 25, n))[:n]
+    den = np.polymul([1.0, 1.0 / TAU_F, LB], [1.0, 2.0 * ZETA * OMEGA, OMEGA**2])
+    p_of, phi_of = (
+        scipy.signal.cont2discrete(([LB * BLAT / TAU_F * OMEGA**2], d), DT / FINE, method="zoh")
+        for d in (den, np.polymul(den, [1.0, 0.0]))
+    )
+
+    def response(system, delay):
+        # At rest before the record, and read as late as it is logged.
+        lead = 200
+        u = np.concatenate([np.zeros(lead), np.repeat(lat, FINE)])
+        y = scipy.signal.lfilter(system[0].ravel(), system[1], u)
+        return y[lead + FINE * np.arange(n) - round(1000 * delay)]
+
+    p = response(p_of, DELAY_LAT) + 0.004 * rng.standard_normal(n)
+    phi = response(phi_of, DELAY_LAT + DELAY_PHI) + 0.001 * rng.standard_normal(n)
+    return Flight(dt=DT, inputs={"lat": lat}, outputs={"p": p, "phi": phi})
+
+
+def params(model, **more):
+    return model.Params(**{**naming.asdict(ROLL.vehicle().params), **more})
+
+
+def test_a_servo_and_two_delays_are_recovered():
+    model = models.with_servos(ROLL.model, ["lat"])
+    model = models.with_delays(model, ["lat"], ["phi"], order=3)
+    start = params(model, omega_servo=1.0, zeta_servo=ZETA, delay_lat=0.0, delay_phi=0.1)
+    free = {
+        "Lb": Free(120.0),
+        "omega_servo": Free(80.0),
+        "delay_lat": Free(0.01),
+        "delay_phi": Free(0.08),
+    }
+    found = fit(Problem(model, start, [record(1)], free), starts=1)
+    assert found.status == "converged"
+    truth = {"Lb": LB, "omega_servo": OMEGA, "delay_lat": DELAY_LAT, "delay_phi": DELAY_PHI}
+    for name, value in truth.items():
+        estimate = found.estimates[name]
+        assert estimate.lower95 is not None
+        assert estimate.upper95 is not None
+        assert estimate.lower95 < value < estimate.upper95, name
+    # Well enough to tell it from a servo twice as fast.
+    assert found.estimates["omega_servo"].sd < 0.15 * OMEGA
+    assert not any("lacks dynamics" in note for note in found.notes)
+
+
+def test_a_servo_that_is_left_out_is_named():
+    model = models.with_delays(ROLL.model, ["lat"])
+    flight = record(1)
+    rate = Flight(dt=DT, inputs=flight.inputs, outputs={"p": flight.outputs["p"]})
+    free = {"Lb": Free(120.0), "delay_lat": Free(0.01)}
+    found = fit(Problem(model, params(model, delay_lat=0.0), [rate], free))
+    # It passes for a delay of 2 zeta/omega, and all but one number look well.
+    absorbed = found.estimates["delay_lat"].value - DELAY_LAT
+    assert absorbed == pytest.approx(2.0 * ZETA / OMEGA, abs=4e-3)
+    assert found.metrics["p"].vaf > 0.99
+    assert not found.white
+    (note,) = (note for note in found.notes if "lacks dynamics" in note)
+    assert "lat still explains" in note
+    # Five starts, since a delay is free; all of them arrive.
+    assert len(found.starts) == 5
+    assert len({row.start["delay_lat"] for row in found.starts}) == 5
+    assert all(row.optimum == 1 for row in found.starts)
+
+
+def test_the_starts_differ_in_the_delays_alone():
+    model = models.with_delays(ROLL.model, ["lat"], ["phi"])
+    start = params(model, delay_lat=0.02, delay_phi=0.1)
+    free = {"Lb": Free(120.0), "delay_lat": Free(0.02), "delay_phi": Free(0.1)}
+    problem = Problem(model, start, [record(2)], free)
+    layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
+    z0 = start_vector(layout, data, problem)
+    rows = [named_values(layout, data, z) for z in delay_starts(layout, problem, z0, 0)]
+    assert rows[0] == pytest.approx({n: f.start for n, f in free.items()})
+    assert {round(row["Lb"], 9) for row in rows} == {120.0}
+    np.testing.assert_allclose(
+        sorted(row["delay_lat"] for row in rows), [-0.13, -0.03, 0.02, 0.07, 0.17]
+    )
+    # That of an output is positive.
+    np.testing.assert_allclose(
+        sorted(row["delay_phi"] for row in rows), [0.02, 0.05, 0.1, 0.2, 0.4]
+    )
+
+
+def test_noise_and_a_disturbance_are_not_taken_for_missing_dynamics():
+    said = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.uniform(-1.0, 1.0, 60), 10)
+        # A disturbance: a lag of half a second driven by noise.
+        w = scipy.signal.lfilter([1.0], [1.0, -0.96], rng.standard_normal(600))
+        one = explained_by(w + 0.5 * rng.standard_normal(600), u, 0.02)
+        said += one.p_value < 1e-3
+    # One in a thousand is expected.
+    assert said <= 2
+    late = np.concatenate([np.zeros(4), u[:-4]])
+    one = explained_by(w + 2.0 * (late - u), u, 0.02)
+    assert one.p_value < 1e-9
+    assert explained_by(np.full(600, np.nan), u, 0.02) is None
