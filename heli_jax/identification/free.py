@@ -27,7 +27,7 @@ class Free(NamedTuple):
     model of one's own may have any. Bounds that lie on one side of zero keep it in either case.
     """
 
-    start: float
+    start: float = math.nan
     """the initial guess"""
     lower: float | None = None
     upper: float | None = None

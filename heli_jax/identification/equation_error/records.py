@@ -10,11 +10,13 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error import smoothing
-from heli_jax.identification.equation_error.structure import Matrices, Structure
+from heli_jax.identification.equation_error.structure import Structure
 from heli_jax.identification.estimation.noise_covariance import noise_guess
 
 _SEGMENTS = 20
 """of a flight at most, the longest: each has an initial state of its own for what is hidden"""
+_RESOLVED = 4
+"""samples to a half width of the kernel that are kept: what is smoothed moves no faster"""
 
 
 class Segment(NamedTuple):
@@ -111,9 +113,10 @@ def _segment(
         rates[i] if i in rates else made[name][0]
         for i, name in zip(structure.rows, structure.equations, strict=True)
     ]
+    empty, every = np.zeros((0, z.shape[-1])), max(1, half // _RESOLVED)
     return Segment(
-        np.stack(list(states.values())) if states else np.zeros((0, z.shape[-1])),
-        z[len(outputs) :, 0],
-        np.stack(left) if left else np.zeros((0, z.shape[-1])),
-        dt,
+        (np.stack(list(states.values())) if states else empty)[:, ::every],
+        z[len(outputs) :, 0, ::every],
+        np.stack(left)[:, ::every] if left else empty,
+        dt * every,
     )

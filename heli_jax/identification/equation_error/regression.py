@@ -15,10 +15,11 @@ from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.records import Record, Segment
-from heli_jax.identification.equation_error.structure import Matrices, matrices
+from heli_jax.identification.equation_error.structure import Matrices, Structure, matrices
 
-_STEPS = 60
-_SMALL = 1e-7
+_APART = 1_000_000
+_STEPS = 30
+_SMALL = 1e-6
 """relative fall of the sum of squares, and relative step, at which the search ends"""
 _LARGEST = 1e9
 """times the left-hand sides' size at which a hidden state has diverged"""
@@ -50,8 +51,6 @@ class Regression(NamedTuple):
     names: tuple[str, ...]
     """those that are estimated"""
     records: tuple[Record, ...]
-    stride: int
-    """samples from one row to the next: smoothed signals are alike in neighbouring samples"""
 
     @property
     def equations(self) -> tuple[str, ...]:
@@ -71,7 +70,7 @@ class Regression(NamedTuple):
             part = _of_flight(one, at, weights, self)
             parts.append(part._replace(times=part.times + start))
             # A gap between flights, so that no correlation reaches over it.
-            start = int(part.times.max(initial=0)) + start + 1_000_000
+            start += int(part.times.max(initial=0)) + _APART
         return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -83,10 +82,9 @@ def _of_flight(
     residuals, nuisances, times = [], [], []
     for k, segment in enumerate(one.segments):
         full, initial = _residual(segment, structure, at)
-        kept = slice(None, None, regression.stride)
-        residuals.append(full[:, kept])  # (e, n, 1 + q)
-        nuisances.append(initial[:, kept])  # (e, n, hidden)
-        times.append(np.arange(full.shape[1])[kept] // regression.stride + k * 100_000)
+        residuals.append(full)
+        nuisances.append(initial)
+        times.append(np.arange(full.shape[1]) + k * _APART)
     lengths = [part.shape[1] for part in residuals]
     n = sum(lengths)
     scale = np.array([weights[name] for name in structure.equations])[:, None, None]
@@ -129,7 +127,7 @@ def _projected(
 
 
 def _residual(
-    segment: Segment, structure, at: Matrices
+    segment: Segment, structure: Structure, at: Matrices
 ) -> tuple[Float[np.ndarray, "e n c"], Float[np.ndarray, "e n h"]]:
     """Residuals with their derivatives (e, n, 1 + q), and responses to hidden initial values."""
     n, q = structure.n, at.slope.shape[-1]
