@@ -75,6 +75,7 @@ def fit_json(
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
             "baseline_rls": _baseline(baseline),
+            "equation_error_start": _first_guess(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
             "notes": list(fit.notes),
@@ -85,6 +86,28 @@ def fit_json(
             "seed": fit.seed,
         }
     )
+
+
+def _first_guess(problem: Problem) -> dict[str, Any] | None:
+    """How the starts were found: where the fit began, not its result."""
+    guess = problem.first_guess
+    if guess is None:
+        return None
+    selection = guess.selection
+    return {
+        "values": {n: v._asdict() for n, v in guess.values.items()},
+        "equations": [e._asdict() for e in guess.equations],
+        "smoothing_half_width_s": guess.half_width,
+        "not_measured": list(guess.hidden),
+        "stepwise": None
+        if selection is None
+        else {
+            "selected": list(selection.selected),
+            "steps": [s._asdict() for s in selection.steps],
+            "f_ratios": selection.f_ratios,
+        },
+        "sentences": list(guess.sentences),
+    }
 
 
 def _metrics(fit: Fit) -> dict[str, Any]:

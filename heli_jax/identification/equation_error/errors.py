@@ -23,7 +23,7 @@ def covariance(rows: Rows) -> Float[np.ndarray, "q q"]:
 
 
 def partial_f(
-    X: Float[np.ndarray, "n k"],
+    basis: Float[np.ndarray, "n k"],
     y: Float[np.ndarray, " n"],
     x: Float[np.ndarray, " n"],
     times: np.ndarray,
@@ -31,15 +31,13 @@ def partial_f(
     """F-ratio of one more regressor: the square of its estimate over its standard error.
 
     Args:
-        X: the regressors that are in (n, k).
+        basis: of the regressors that are in (n, k), orthonormal (`basis_of`).
         y: what is regressed (n,).
         x: the one more (n,).
         times: which rows belong to one instant, as `Rows.times`.
     """
     size = np.linalg.norm(x)
-    if X.shape[1]:
-        basis, _ = np.linalg.qr(X)
-        x, y = x - basis @ (basis.T @ x), y - basis @ (basis.T @ y)
+    x, y = x - basis @ (basis.T @ x), y - basis @ (basis.T @ y)
     power = float(x @ x)
     # What the others give already has nothing of its own to say.
     if power <= (1e-6 * size) ** 2:
@@ -47,6 +45,11 @@ def partial_f(
     left = y - x * (x @ y) / power
     variance = float(_long_run(by_instant((x * left)[:, None], times))[0, 0])
     return float((x @ y) ** 2 / variance) if variance > 0 else float("inf")
+
+
+def basis_of(X: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """An orthonormal basis of the columns of X."""
+    return np.linalg.qr(X)[0] if X.shape[1] else X
 
 
 def by_instant(scores: Float[np.ndarray, "n k"], times: np.ndarray) -> Float[np.ndarray, "T k"]:

@@ -1,4 +1,4 @@
-"""Flights made ready for regression: smoothed states, derivatives and inputs, segment by segment."""
+"""Flights made ready for regression: smoothed, segment by segment."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -54,9 +54,7 @@ def width(flights: Sequence[Flight]) -> int:
         if longest is None:
             continue
         sd = {n: flight.sd.get(n) or noise_guess(y) for n, y in flight.outputs.items()}
-        widths.append(
-            smoothing.half_width({n: y[longest] for n, y in bridged.items()}, sd)
-        )
+        widths.append(smoothing.half_width({n: y[longest] for n, y in bridged.items()}, sd))
     return min(widths, default=smoothing.HALF_WIDTHS[0])
 
 

@@ -130,7 +130,7 @@ def _residual(
     segment: Segment, structure: Structure, at: Matrices
 ) -> tuple[Float[np.ndarray, "e n c"], Float[np.ndarray, "e n h"]]:
     """Residuals with their derivatives (e, n, 1 + q), and responses to hidden initial values."""
-    n, q = structure.n, at.slope.shape[-1]
+    n = structure.n
     rows, hidden, shown = list(structure.rows), list(structure.hidden), list(structure.shown)
     known = np.concatenate([segment.states, segment.inputs])  # (k + m, N)
     columns = [*shown, *range(n, at.value.shape[1])]

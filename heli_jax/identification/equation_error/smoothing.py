@@ -8,6 +8,7 @@ Identification, 2006, ch. 11), and beyond that keeps a linear equation exact: x'
 for smoothed states, derivatives and inputs as it does for themselves, however much is smoothed.
 """
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -141,7 +142,7 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     if seen.size < 2:
         return y
     filled = np.interp(np.arange(y.size), seen, y[seen], left=np.nan, right=np.nan)
-    for before, after in zip(seen[:-1], seen[1:], strict=True):
+    for before, after in itertools.pairwise(seen):
         if after - before - 1 > _BRIDGED:
             filled[before + 1 : after] = np.nan
     return filled

@@ -7,7 +7,7 @@ a fit, never a result.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,12 +15,14 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model, needed_but_missing
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error import errors, records
-from heli_jax.identification.equation_error.regression import (
-    Optimum,
-    Regression,
-    search,
+from heli_jax.identification.equation_error.first_guess import (
+    Equation,
+    EquationErrorStart,
+    Origin,
+    StartValue,
 )
-from heli_jax.identification.equation_error.stepwise import F_ENTER, Selection, select
+from heli_jax.identification.equation_error.regression import Optimum, Regression, search
+from heli_jax.identification.equation_error.stepwise import Selection, select
 from heli_jax.identification.equation_error.structure import (
     Structure,
     generic,
@@ -33,49 +35,10 @@ from heli_jax.vehicle import of_helicopter
 
 # Params is a class of each model, hence Any.
 
-Origin = Literal["equation error", "as stated", "vehicle", "not selected"]
-
 _ROUNDS = 3
 """of regression and weights of the equations"""
 _NULL = 1e-5
 """singular value, of columns of length one, below which parameters are exchangeable"""
-
-
-class StartValue(NamedTuple):
-    """Where a fit begins with one parameter. The names of the fields are keys of fit.json."""
-
-    value: float
-    sd: float | None
-    """standard error of the regression; None where the value is not from it"""
-    unit: str
-    origin: Origin
-    reason: str
-    """why it is not from the regression; empty where it is"""
-
-
-class Equation(NamedTuple):
-    """One equation as it was regressed."""
-
-    name: str
-    """the state whose derivative it gives, or the output"""
-    r_squared: float
-
-
-class EquationErrorStart(NamedTuple):
-    """First guesses, and how they were found."""
-
-    values: dict[str, StartValue]
-    equations: tuple[Equation, ...]
-    half_width: float
-    """of the smoothing kernel [s]"""
-    hidden: tuple[str, ...]
-    """states that nothing measured shows: integrated by their own equations"""
-    selection: Selection | None = None
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was taken from where."""
-        return tuple(_sentences(self))
 
 
 class _Setup(NamedTuple):
@@ -121,7 +84,8 @@ def equation_error_start(
     optimum, regression, null = _without_null(setup, names, reasons)
     selection = None
     if stepwise is not None:
-        forced = [n for n, keep in zip(regression.names, _keeps(setup, regression), strict=True) if keep]
+        keeps = zip(regression.names, _keeps(setup, regression), strict=True)
+        forced = [n for n, keep in keeps if keep]
         selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
         out = [n for n in regression.names if n not in selection.selected]
         kept = setup._replace(base={**setup.base, **dict.fromkeys(out, 0.0)})
@@ -160,9 +124,7 @@ def _setup(
     for flight in flights:
         missing = needed_but_missing(model, model.Params(**{**base, **some, **flight.known}))
         if missing:
-            raise ValueError(
-                f"vehicle: {', '.join(missing)} missing, model {model.name} needs it"
-            )
+            raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
     structures = []
     for flight in flights:
         names = list(free)
@@ -238,7 +200,9 @@ def _without_null(
     null: dict[str, str] = {}
     for n in reasons:
         if not math.isfinite(setup.base[n]):
-            raise ValueError(f"free.{n}.start: missing, expected a value to begin with: {reasons[n]}")
+            raise ValueError(
+                f"free.{n}.start: missing, expected a value to begin with: {reasons[n]}"
+            )
     names = list(names)
     while names:
         regression = _regression(setup, names)
@@ -310,7 +274,7 @@ def _value(
         return StartValue(inside, sd, unit, "equation error", moved)
     if selection is not None and name not in reasons:
         inside = _inside(setup.free[name], 0.0)
-        return StartValue(inside, None, unit, "not selected", "its term does not help to predict")
+        return StartValue(inside, None, unit, "not selected", "its term hardly helps to predict")
     stated = math.isfinite(setup.free[name].start)
     origin: Origin = "as stated" if stated else "vehicle"
     return StartValue(setup.base[name], None, unit, origin, reasons[name])
@@ -332,29 +296,3 @@ def _explained(regression: Regression, optimum: Optimum) -> tuple[Equation, ...]
         r = optimum.rows.r[optimum.rows.equation == i] / optimum.weights[name]
         made.append(Equation(name, 1.0 - float(np.mean(r**2)) * sizes[name] ** 2))
     return tuple(made)
-
-
-def _sentences(start: EquationErrorStart) -> list[str]:
-    taken = [n for n, v in start.values.items() if v.origin == "equation error"]
-    fits = ", ".join(f"{e.name} {100 * e.r_squared:.0f} %" for e in start.equations)
-    sentences = [
-        f"Start by equation error of {', '.join(taken) or 'nothing'} (variance of the equations "
-        f"explained: {fits}; smoothed over {start.half_width:.2g} s to either side). Measurement "
-        "noise biases these values: they are where the fit begins, not its result."
-    ]
-    if start.hidden:
-        sentences.append(
-            f"Not measured and integrated by their own equations: {', '.join(start.hidden)}."
-        )
-    for name, v in start.values.items():
-        if v.origin == "not selected":
-            sentences.append(
-                f"{name} begins at {v.value:g}: {v.reason}; to leave the term out of the model, "
-                "fix it there."
-            )
-        elif v.reason:
-            where = {"as stated": "the start as stated", "vehicle": "the vehicle's value"}.get(
-                v.origin, "its bound"
-            )
-            sentences.append(f"{name} begins at {v.value:.4g}, {where}: {v.reason}.")
-    return sentences

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from heli_jax.identification.equation_error.errors import partial_f
+from heli_jax.identification.equation_error.errors import basis_of, partial_f
 from heli_jax.identification.equation_error.regression import Rows
 
 F_ENTER = 20.0
@@ -18,14 +19,14 @@ F_ENTER = 20.0
 
 
 class Step(NamedTuple):
-    """One step of the selection."""
+    """One step of the selection. The names of the fields are keys of fit.json."""
 
     parameter: str
     entered: bool
     """or it was removed"""
     f_ratio: float
     r_squared: float
-    """of all equations together, after the step"""
+    """of all equations together, each over its residual, after the step"""
 
 
 class Selection(NamedTuple):
@@ -39,7 +40,7 @@ class Selection(NamedTuple):
 
 def select(
     rows: Rows,
-    values: np.ndarray,
+    values: Float[np.ndarray, " q"],
     names: Sequence[str],
     forced: Sequence[str],
     limits: tuple[float, float],
@@ -55,43 +56,50 @@ def select(
         forced: those that stay in.
         limits: F to enter and F to remove; the second is at most the first.
     """
-    X, y = -rows.J, rows.r - rows.J @ values
-    inside = [names.index(n) for n in forced]
-    steps: list[Step] = []
-
-    def ratio(j: int, others: list[int]) -> float:
-        return partial_f(X[:, others], y, X[:, j], rows.times)
-
-    # At most each term in and out once and again: rounding must not turn in a circle.
+    terms = _Terms(rows, values, tuple(names), frozenset(forced))
+    inside, steps = [names.index(n) for n in forced], []
+    # At most each term in and out a few times: rounding must not turn in a circle.
     for _ in range(4 * len(names)):
-        outside = [j for j in range(len(names)) if j not in inside]
-        entering = {j: ratio(j, inside) for j in outside}
+        entering = terms.to_enter(inside)
         best = max(entering, key=lambda j: entering[j], default=None)
         if best is None or entering[best] < limits[0]:
             break
         inside.append(best)
-        steps.append(Step(names[best], True, entering[best], _explained(X[:, inside], y)))
-        _remove(inside, [names.index(n) for n in forced], ratio, limits[1], (names, X, y, steps))
-    final = {
-        n: ratio(j, [i for i in inside if i != j]) for j, n in enumerate(names) if n not in forced
-    }
-    return Selection(tuple(n for j, n in enumerate(names) if j in inside), tuple(steps), final)
+        steps.append(Step(names[best], True, entering[best], terms.explained(inside)))
+        # What later terms have made needless goes, the least useful first.
+        while (leaving := terms.to_remove(inside)) and min(leaving.values()) < limits[1]:
+            worst = min(leaving, key=lambda j: leaving[j])
+            inside.remove(worst)
+            steps.append(Step(names[worst], False, leaving[worst], terms.explained(inside)))
+    final = {**terms.to_enter(inside), **terms.to_remove(inside)}
+    ratios = {names[j]: final[j] for j in sorted(final)}
+    return Selection(tuple(n for j, n in enumerate(names) if j in inside), tuple(steps), ratios)
 
 
-def _remove(inside: list[int], forced: list[int], ratio, limit: float, told: tuple) -> None:
-    """Take out, one after the other, what later terms have made needless."""
-    names, X, y, steps = told
-    while True:
-        ratios = {j: ratio(j, [i for i in inside if i != j]) for j in inside if j not in forced}
-        worst = min(ratios, key=lambda j: ratios[j], default=None)
-        if worst is None or ratios[worst] >= limit:
-            return
-        inside.remove(worst)
-        steps.append(Step(names[worst], False, ratios[worst], _explained(X[:, inside], y)))
+class _Terms:
+    """The regressors, and what is regressed on them."""
 
+    def __init__(
+        self, rows: Rows, values: np.ndarray, names: tuple[str, ...], forced: frozenset[str]
+    ) -> None:
+        self.X, self.y = -rows.J, rows.r - rows.J @ values
+        self.times, self.names, self.forced = rows.times, names, forced
 
-def _explained(X: np.ndarray, y: np.ndarray) -> float:
-    if not X.shape[1]:
-        return 0.0
-    basis, _ = np.linalg.qr(X)
-    return float(np.sum((basis.T @ y) ** 2) / np.sum(y**2))
+    def to_enter(self, inside: list[int]) -> dict[int, float]:
+        """The F-ratios of what is out, by number."""
+        basis = basis_of(self.X[:, inside])
+        out = [j for j in range(len(self.names)) if j not in inside]
+        return {j: partial_f(basis, self.y, self.X[:, j], self.times) for j in out}
+
+    def to_remove(self, inside: list[int]) -> dict[int, float]:
+        """The F-ratios of what is in and may go, by number."""
+        ratios = {}
+        for j in (j for j in inside if self.names[j] not in self.forced):
+            basis = basis_of(self.X[:, [i for i in inside if i != j]])
+            ratios[j] = partial_f(basis, self.y, self.X[:, j], self.times)
+        return ratios
+
+    def explained(self, inside: list[int]) -> float:
+        """The part of the sum of squares that what is in explains."""
+        basis = basis_of(self.X[:, inside])
+        return float(np.sum((basis.T @ self.y) ** 2) / np.sum(self.y**2))

@@ -1,4 +1,4 @@
-"""Which states a linear model's measured outputs show, and which parameters are in which equation."""
+"""Which states of a linear model the measured outputs show, and which equations to regress."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -178,7 +178,7 @@ def generic(count: int) -> Float[np.ndarray, " q"]:
 
 
 def _closing(plain: np.ndarray) -> np.ndarray:
-    """Where an entry (i, j) closes a loop: on the diagonal, or where i drives j by plain entries."""
+    """Where an entry (i, j) closes a loop: on the diagonal, or where i drives j by plain ones."""
     n = plain.shape[0]
     drives = np.eye(n, dtype=bool)
     for _ in range(n):
