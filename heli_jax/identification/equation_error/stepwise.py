@@ -45,32 +45,35 @@ def select(
     forced: Sequence[str],
     limits: tuple[float, float],
 ) -> Selection:
-    """Terms in and out, until none is left that asks for the other side.
+    """Terms out and in again, until none is left that asks for the other side.
 
+    All terms are in at first, where `swr` begins with none: with half of a response missing, what
+    is left over is so autocorrelated that no term by itself would pass.
     Products of parameters are taken as they are linear about the point where all terms are in.
 
     Args:
         rows: there, weighed.
         values: of the parameters there (q,).
         names: theirs.
-        forced: those that stay in.
+        forced: those that stay in: of a known sign, they cannot be zero.
         limits: F to enter and F to remove; the second is at most the first.
     """
     terms = _Terms(rows, values, tuple(names), frozenset(forced))
-    inside, steps = [names.index(n) for n in forced], []
-    # At most each term in and out a few times: rounding must not turn in a circle.
+    inside, steps = list(range(len(names))), []
+    # At most each term out and in a few times: rounding must not turn in a circle.
     for _ in range(4 * len(names)):
+        leaving = terms.to_remove(inside)
+        worst = min(leaving, key=lambda j: leaving[j], default=None)
+        if worst is not None and leaving[worst] < limits[1]:
+            inside.remove(worst)
+            steps.append(Step(names[worst], False, leaving[worst], terms.explained(inside)))
+            continue
         entering = terms.to_enter(inside)
         best = max(entering, key=lambda j: entering[j], default=None)
         if best is None or entering[best] < limits[0]:
             break
         inside.append(best)
         steps.append(Step(names[best], True, entering[best], terms.explained(inside)))
-        # What later terms have made needless goes, the least useful first.
-        while (leaving := terms.to_remove(inside)) and min(leaving.values()) < limits[1]:
-            worst = min(leaving, key=lambda j: leaving[j])
-            inside.remove(worst)
-            steps.append(Step(names[worst], False, leaving[worst], terms.explained(inside)))
     final = {**terms.to_enter(inside), **terms.to_remove(inside)}
     ratios = {names[j]: final[j] for j in sorted(final)}
     return Selection(tuple(n for j, n in enumerate(names) if j in inside), tuple(steps), ratios)
