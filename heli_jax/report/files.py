@@ -17,6 +17,7 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
+from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.report.card import card
 from heli_jax.versions import versions
 
@@ -74,6 +75,9 @@ def fit_json(
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
+            "feedback": [
+                {**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback
+            ],
             "baseline_rls": _baseline(baseline),
             "equation_error_start": _first_guess(problem),
             "starts": [row._asdict() for row in fit.starts],
