@@ -15,6 +15,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.flights import write as tables
 from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.metrics import Metrics, diverges
@@ -69,6 +70,8 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
+    if problem.first_guess is not None:
+        _print_first_guess(problem.first_guess)
     print(f"acceptance card: {summary(card(problem, fit))}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
@@ -79,6 +82,13 @@ def print_fit(run: FitRun) -> None:
         _print_baseline(run.baseline)
     if run.directory is not None:
         print(f"report: {run.directory / 'report.html'}")
+
+
+def _print_first_guess(guess: EquationErrorStart) -> None:
+    print("Where the fit began, by equation error (no result):")
+    for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
+        if table.rows:
+            _table(table.head, table.rows)
 
 
 def _determined(c: Combination) -> str:

@@ -6,7 +6,7 @@ damping negative).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -190,13 +190,24 @@ def load_vehicle(path: str | Path, params: type = Helicopter) -> Any:
     return read_vehicle(path, params).params
 
 
-def read_vehicle(path: str | Path, params: type = Helicopter) -> Vehicle:
-    """As `load_vehicle`, with each constant's unit and source beside the parameters."""
-    return vehicle_from_mapping(read_mapping(path), str(path), params)
+def read_vehicle(
+    path: str | Path, params: type = Helicopter, may_lack: Collection[str] = ()
+) -> Vehicle:
+    """As `load_vehicle`, with each constant's unit and source beside the parameters.
+
+    Args:
+        path: of the file.
+        params: the class to build.
+        may_lack: constants that may be missing, and are NaN then.
+    """
+    return vehicle_from_mapping(read_mapping(path), str(path), params, may_lack)
 
 
 def vehicle_from_mapping(
-    content: Mapping[str, Any], where: str, params: type = Helicopter
+    content: Mapping[str, Any],
+    where: str,
+    params: type = Helicopter,
+    may_lack: Collection[str] = (),
 ) -> Vehicle:
     """Build the parameters from a mapping of names to numbers or {value, unit, source}.
 
@@ -204,6 +215,7 @@ def vehicle_from_mapping(
         content: constants by name.
         where: what errors name, such as the file.
         params: the class to build, Helicopter or a model's own Params.
+        may_lack: constants that may be missing, and are NaN then.
 
     Raises:
         InputError: an unknown name, a missing or an impossible value; `where` is named.
@@ -214,7 +226,8 @@ def vehicle_from_mapping(
         if name not in known:
             raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
         constants[name] = _constant(entry, name, naming.unit(params, name), where)
-    missing = [n for n in known if n not in constants and n not in naming.defaults(params)]
+    lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]
+    missing = [n for n in lacking if n not in may_lack]
     if missing:
         raise InputError(f"{where}: {', '.join(missing)} missing, expected a number for each")
     # Of a class of one's own nobody knows what is possible.
@@ -225,6 +238,7 @@ def vehicle_from_mapping(
     # Defaults too: a class that devices extend has them as plain numbers.
     values = {n: _scalar(v) for n, v in naming.defaults(params).items()}
     values |= {n: _scalar(c.value) for n, c in constants.items()}
+    values |= {n: _scalar(math.nan) for n in lacking}
     return Vehicle(params(**values), constants, where)
 
 

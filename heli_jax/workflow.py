@@ -170,7 +170,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 
 
 def reading_notes(problem: Problem) -> list[str]:
-    """What the reader of each log assumed or did, a sentence each that begins with the log."""
+    """What the reader of each log assumed or did, a sentence each that begins with the log; and
+    where the starts come from, if they were found."""
     notes = []
     for flight in problem.flights:
         where = flight.source.path if flight.source else flight.name
@@ -181,6 +182,7 @@ def reading_notes(problem: Problem) -> list[str]:
             # Held inputs are what a reader expects of a stick, and need no word.
             if flight.hold[name] == "linear"
         ]
+    notes += problem.first_guess.sentences if problem.first_guess is not None else ()
     return notes
 
 

@@ -1,5 +1,6 @@
 """An experiment: a configuration read and validated, with what it names at hand."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -220,13 +221,8 @@ def _section(annotation: Any) -> Any:
 def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
     if isinstance(config.model, LinearConfig):
         vehicle = _of_linear(config, config.model, path, model)
-    elif config.vehicle is None:
-        raise InputError(f"{path}: vehicle: missing")
-    # The model's Params say which constants there can be, and in which units.
-    elif isinstance(config.vehicle, str):
-        vehicle = read_vehicle(path.parent / config.vehicle, model.Params)
     else:
-        vehicle = vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
+        vehicle = _of_model(config, path, model)
     for name in model.positive:
         constant = vehicle.constants.get(name)
         if constant is not None and constant.value <= 0:
@@ -234,6 +230,24 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
                 f"{vehicle.path}: {name} must be more than zero, got {constant.value:g}"
             )
     return vehicle
+
+
+def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
+    """The vehicle of a model in Python, whose Params say which constants there can be, and in
+    which units."""
+    found = _found_by_fit(config)
+    if config.vehicle is None and not found:
+        raise InputError(f"{path}: vehicle: missing")
+    if isinstance(config.vehicle, str):
+        return read_vehicle(path.parent / config.vehicle, model.Params, found)
+    return vehicle_from_mapping(config.vehicle or {}, f"{path}: vehicle", model.Params, found)
+
+
+def _found_by_fit(config: Config) -> tuple[str, ...]:
+    """The parameters that a fit finds without any value at hand."""
+    if config.fit is None or config.fit.start.method == "given":
+        return ()
+    return tuple(config.fit.free)
 
 
 def _of_linear(config: Config, model: LinearConfig, path: Path, built: Model) -> Vehicle:
@@ -271,6 +285,9 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     content = config.model_dump(mode="json", exclude_none=True)
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
+    for free in content.get("fit", {}).get("free", {}).values():
+        if math.isnan(free["start"]):  # left out, and YAML's .nan is refused
+            del free["start"]
     for flight in content.get("flights", []):
         # With links resolved too: the run's config.yaml is read from its own directory.
         flight["log"] = str((path.parent / flight["log"]).resolve())

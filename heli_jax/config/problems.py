@@ -10,6 +10,7 @@ from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.logs import read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
+from heli_jax.config.starts import first_guesses
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -35,6 +36,7 @@ def problem(experiment: Experiment) -> Problem:
     nuisance = _nuisance(config.fit)
     flights = read_flights(experiment, gain=nuisance.input_gain)
     free = {name: _free(f) for name, f in config.fit.free.items()}
+    free, guess = first_guesses(experiment, flights, free)
     # Output error gets the bare model, whatever `disturbance` says: that section is then for
     # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
@@ -60,6 +62,7 @@ def problem(experiment: Experiment) -> Problem:
             fixed_noise=fixed,
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
+            first_guess=guess,
         )
     except ValueError as e:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.

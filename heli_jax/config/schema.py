@@ -1,5 +1,6 @@
 """What may stand in a configuration: its sections, their keys and their bounds."""
 
+import math
 import warnings
 from typing import Annotated, Any, Literal
 
@@ -7,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 
 from heli_jax.config.onboard import OnboardConfig
 from heli_jax.errors import nearest
+from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
@@ -85,7 +87,9 @@ class PriorConfig(_Strict):
 
 
 class FreeConfig(_Strict):
-    start: Finite
+    # NaN and not None, as `Free` has it; a default is not validated, what a file says is.
+    start: Finite = math.nan
+    """may be left out where `fit.start` finds it"""
     lower: Finite | None = None
     upper: Finite | None = None
     prior: PriorConfig | None = None
@@ -137,10 +141,39 @@ class ShootingConfig(_Strict):
     range; null: free"""
 
 
+class StartMethodConfig(_Strict):
+    """Where the starts of the free parameters come from."""
+
+    method: Literal["given", "equation-error"] = "given"
+    """equation-error: by regression of the records themselves, for linear models"""
+    stepwise: bool = False
+    """whether terms that hardly help to predict are left at zero"""
+    f_enter: Positive = F_ENTER
+    """partial F-ratio from which on a term enters"""
+    f_remove: Positive = F_ENTER
+    """below which it is removed again"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "StartMethodConfig":
+        if self.stepwise and self.method == "given":
+            raise ValueError("stepwise: expected method: equation-error with it, got given")
+        if self.f_remove > self.f_enter:
+            raise ValueError(
+                f"f_remove: expected at most f_enter ({self.f_enter:g}), got {self.f_remove:g}"
+            )
+        return self
+
+
+def _start_method(value: Any) -> Any:
+    return {"method": value} if isinstance(value, str) else value
+
+
 class FitConfig(_Strict):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     free: dict[str, FreeConfig]
+    start: Annotated[StartMethodConfig, BeforeValidator(_start_method)] = StartMethodConfig()
+    """given, equation-error, or {method: equation-error, stepwise: true}"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None

@@ -38,6 +38,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
+from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
@@ -151,6 +152,8 @@ def assemble(
     params = _params(problem, estimates)
     # A perfect model's simulation would leave what the disturbance makes; without one it would not.
     against = None if none else layout.estimator.against_expected(layout, data, noise, e, best.z)
+    found = feedback_of(problem)
+    closed_loop = feedback_notes(problem, found, all(w.white for w in white.values()))
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     # Where the model is inadequate its own sentences say more.
@@ -180,8 +183,9 @@ def assemble(
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(*notes, *adequacy.sentences, *missing, *held.notes),
+        notes=(*notes, *closed_loop, *adequacy.sentences, *missing, *held.notes),
         reached=solution,
+        feedback=found,
         seed=run.seed,
         timing=run.timing,
     )

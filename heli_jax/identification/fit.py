@@ -33,6 +33,7 @@ from heli_jax.identification.unknowns.layout import (
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.other_hold import other_hold
 
 __all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
@@ -75,6 +76,7 @@ def check(problem: Problem) -> Check:
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
     notes = excitation.notes(problem, runs, guess.noise.sd)
+    notes += feedback_notes(problem, feedback_of(problem))
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += other_hold(problem, Solution(*guess[:4]), guess.e, skip=not_identifiable)

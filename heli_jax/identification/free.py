@@ -27,8 +27,9 @@ class Free(NamedTuple):
     model of one's own may have any. Bounds that lie on one side of zero keep it in either case.
     """
 
-    start: float
-    """the initial guess"""
+    start: float = math.nan
+    """the initial guess; NaN where none is stated, and one has to be found before a Problem is made
+    (`equation_error_start`)"""
     lower: float | None = None
     upper: float | None = None
     prior: Prior | None = None
@@ -50,6 +51,11 @@ def check_free(name: str, free: Free, model: Model) -> None:
         known = naming.names(model.Params)
         raise ValueError(
             f"free.{name}: model {model.name} has no such parameter{nearest(name, known)}"
+        )
+    if math.isnan(free.start):
+        raise ValueError(
+            f"free.{name}.start: missing, expected a number to begin with (or, for a linear model, "
+            "start: equation-error, which finds one)"
         )
     numbers = {"start": free.start, "lower": free.lower, "upper": free.upper}
     if free.prior is not None:

@@ -86,6 +86,9 @@ class Problem:
     continuity: float | None = None
     """with windows: standard deviation of the jump of each state from one window to the next, as a
     part of what the state does; None leaves them apart"""
+    # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
+    first_guess: Any = None
+    """how the starts were found, for the report; None where they were given"""
 
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.

@@ -12,6 +12,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
+from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:
@@ -126,6 +127,8 @@ class Fit:
     """whether the model explains what was measured, judged against what"""
     coloured: bool = False
     """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
+    feedback: tuple[Feedback, ...] = ()
+    """by flight and input, whether it follows the response"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 

@@ -17,6 +17,7 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
+from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.report.card import card
 from heli_jax.versions import versions
 
@@ -74,7 +75,11 @@ def fit_json(
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
+            "feedback": [
+                {**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback
+            ],
             "baseline_rls": _baseline(baseline),
+            "equation_error_start": _first_guess(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
             "notes": list(fit.notes),
@@ -85,6 +90,28 @@ def fit_json(
             "seed": fit.seed,
         }
     )
+
+
+def _first_guess(problem: Problem) -> dict[str, Any] | None:
+    """How the starts were found: where the fit began, not its result."""
+    guess = problem.first_guess
+    if guess is None:
+        return None
+    selection = guess.selection
+    return {
+        "values": {n: v._asdict() for n, v in guess.values.items()},
+        "equations": [e._asdict() for e in guess.equations],
+        "smoothing_half_width_s": guess.half_width,
+        "not_measured": list(guess.hidden),
+        "stepwise": None
+        if selection is None
+        else {
+            "selected": list(selection.selected),
+            "steps": [s._asdict() for s in selection.steps],
+            "f_ratios": selection.f_ratios,
+        },
+        "sentences": list(guess.sentences),
+    }
 
 
 def _metrics(fit: Fit) -> dict[str, Any]:

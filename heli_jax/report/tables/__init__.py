@@ -11,6 +11,7 @@ from heli_jax.report.tables.estimates import (
     starts,
     verdict,
 )
+from heli_jax.report.tables.first_guess import first_guess, selection_steps
 from heli_jax.report.tables.headline import Headline, adequate, headline, model_remark, warnings
 from heli_jax.report.tables.provenance import Origin, constants, origins
 from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
@@ -29,6 +30,7 @@ __all__ = [
     "choice",
     "combinations",
     "constants",
+    "first_guess",
     "headline",
     "intervals",
     "model_remark",
@@ -37,6 +39,7 @@ __all__ = [
     "pairs",
     "parameters",
     "residuals",
+    "selection_steps",
     "starts",
     "verdict",
     "warnings",

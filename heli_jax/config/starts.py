@@ -1,0 +1,50 @@
+"""The starts of a configuration's free parameters, where its `fit.start` has them found."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from heli_jax.config.experiment import Experiment
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.free import Free
+
+if TYPE_CHECKING:
+    from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+
+
+def first_guesses(
+    experiment: Experiment, flights: Sequence[Flight], free: Mapping[str, Free]
+) -> "tuple[dict[str, Free], EquationErrorStart | None]":
+    """The free parameters with their starts, and how these were found; None where they are given.
+
+    Args:
+        experiment: whose model is regressed without a disturbance, which needs no start here.
+        flights: read.
+        free: as the configuration has them; NaN where a start is left out.
+
+    Raises:
+        InputError: a start is missing, or none can be found.
+    """
+    config, path = experiment.config.fit, experiment.path
+    assert config is not None
+    if config.start.method == "given":
+        missing = [n for n, f in free.items() if math.isnan(f.start)]
+        if missing:
+            raise InputError(
+                f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with, "
+                "or fit.start: equation-error, which finds one for linear models"
+            )
+        return dict(free), None
+    # Not before it is needed: it takes a second to import.
+    from heli_jax.identification.equation_error.start import equation_error_start
+
+    limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
+    try:
+        guess = equation_error_start(
+            experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
+        )
+    except ValueError as e:
+        place = f"{path}" if str(e).startswith("vehicle") else f"{path}: fit"
+        raise InputError(f"{place}: {e}") from e
+    return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess

@@ -1,0 +1,275 @@
+"""Equation error: the equations' left-hand sides against what they say of them, by least squares.
+
+States that nothing measured shows are integrated by their own equations, from what is measured.
+Their initial values, and a constant in each equation and flight (trim, bias), are projected out.
+Where parameters multiply each other or enter otherwise than linearly the squares are made small by
+Levenberg-Marquardt steps, else one step is the regression.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from heli_jax.dynamics.model import Model
+from heli_jax.identification.equation_error.records import Record, Segment
+from heli_jax.identification.equation_error.structure import Matrices, Structure, matrices
+
+_APART = 1_000_000
+_STEPS = 30
+_SMALL = 1e-6
+"""relative fall of the sum of squares, and relative step, at which the search ends"""
+_LARGEST = 1e9
+"""times the left-hand sides' size at which a hidden state has diverged"""
+
+
+class Rows(NamedTuple):
+    """Residuals of all flights and equations at one point, weighed."""
+
+    r: Float[np.ndarray, " n"]
+    J: Float[np.ndarray, "n q"]
+    """derivative of r"""
+    times: np.ndarray
+    """(n,) which rows belong to one instant: the same whole number; jumps between segments"""
+    equation: np.ndarray
+    """(n,) which equation, in the order of `Regression.equations`"""
+
+    @property
+    def cost(self) -> float:
+        """The sum of squares."""
+        return float(self.r @ self.r)
+
+
+class Regression(NamedTuple):
+    """A regression of some parameters of a model."""
+
+    model: Model
+    base: Mapping[str, float]
+    """all parameters by name, SI"""
+    names: tuple[str, ...]
+    """those that are estimated"""
+    records: tuple[Record, ...]
+
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """The states and outputs whose equations are regressed."""
+        return tuple(dict.fromkeys(e for r in self.records for e in r.structure.equations))
+
+    def rows(self, values: Float[np.ndarray, " q"], weights: Mapping[str, float]) -> Rows:
+        """Residuals and their derivatives.
+
+        Args:
+            values: of the parameters `names` (q,), SI.
+            weights: one over the residuals' size, by equation.
+        """
+        parts, start = [], 0
+        for one in self.records:
+            at = matrices(self.model, {**self.base, **one.known}, self.names, values)
+            part = _of_flight(one, at, weights, self)
+            parts.append(part._replace(times=part.times + start))
+            # A gap between flights, so that no correlation reaches over it.
+            start += int(part.times.max(initial=0)) + _APART
+        return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _of_flight(
+    one: Record, at: Matrices, weights: Mapping[str, float], regression: Regression
+) -> Rows:
+    structure, q = one.structure, len(regression.names)
+    e = len(structure.rows)
+    residuals, nuisances, times = [], [], []
+    for k, segment in enumerate(one.segments):
+        full, initial = _residual(segment, structure, at)
+        residuals.append(full)
+        nuisances.append(initial)
+        times.append(np.arange(full.shape[1]) + k * _APART)
+    lengths = [part.shape[1] for part in residuals]
+    n = sum(lengths)
+    scale = np.array([weights[name] for name in structure.equations])[:, None, None]
+    together = (scale * np.concatenate(residuals, axis=1)).reshape(e * n, 1 + q)
+    beside = scale * _beside(nuisances, lengths, e)
+    together = _projected(together, beside.reshape(e * n, -1))
+    number = [regression.equations.index(name) for name in structure.equations]
+    return Rows(
+        together[:, 0],
+        together[:, 1:],
+        np.tile(np.concatenate(times), e),
+        np.repeat(number, n),
+    )
+
+
+def _beside(
+    initial: Sequence[Float[np.ndarray, "e n h"]], lengths: Sequence[int], e: int
+) -> Float[np.ndarray, "e n b"]:
+    """What is estimated beside the parameters: the hidden states' initial values of each segment,
+    and a constant in each equation."""
+    n, hidden = sum(lengths), initial[0].shape[-1]
+    columns = np.zeros((e, n, len(lengths) * hidden + e))
+    begin = np.r_[0, np.cumsum(lengths)]
+    for k, part in enumerate(initial):
+        columns[:, begin[k] : begin[k + 1], k * hidden : (k + 1) * hidden] = part
+    for i in range(e):
+        columns[i, :, len(lengths) * hidden + i] = 1.0
+    return columns
+
+
+def _projected(
+    x: Float[np.ndarray, "n c"], away: Float[np.ndarray, "n b"]
+) -> Float[np.ndarray, "n c"]:
+    """What of the columns of x the columns of `away` cannot give."""
+    size = np.linalg.norm(away, axis=0)
+    away = away[:, size > 0] / size[size > 0]
+    basis, triangle, _ = scipy.linalg.qr(away, mode="economic", pivoting=True)
+    basis = basis[:, np.abs(np.diag(triangle)) > 1e-9]
+    return x - basis @ (basis.T @ x)
+
+
+def _residual(
+    segment: Segment, structure: Structure, at: Matrices
+) -> tuple[Float[np.ndarray, "e n c"], Float[np.ndarray, "e n h"]]:
+    """Residuals with their derivatives (e, n, 1 + q), and responses to hidden initial values."""
+    n = structure.n
+    rows, hidden, shown = list(structure.rows), list(structure.hidden), list(structure.shown)
+    known = np.concatenate([segment.states, segment.inputs])  # (k + m, N)
+    columns = [*shown, *range(n, at.value.shape[1])]
+    # [value, slope] side by side: what is done to the one is done to the other.
+    both = np.concatenate([at.value[..., None], at.slope], axis=-1)
+    predicted = np.einsum("ekc,kN->eNc", both[np.ix_(rows, columns)], known)
+    initial = np.zeros((len(rows), known.shape[1], 0))
+    if hidden:
+        h, free = _hidden(both, known, (hidden, columns), segment.step)
+        coefficients = both[np.ix_(rows, hidden)]
+        predicted += np.einsum("eh,Nhc->eNc", coefficients[..., 0], h)
+        predicted[..., 1:] += np.einsum("ehq,Nh->eNq", coefficients[..., 1:], h[..., 0])
+        initial = np.einsum("eh,Nhj->eNj", coefficients[..., 0], free)
+    residual = -predicted
+    residual[..., 0] += segment.left
+    return residual, initial
+
+
+def _hidden(
+    both: np.ndarray, known: np.ndarray, which: tuple[list[int], list[int]], step: float
+) -> tuple[Float[np.ndarray, "N h c"], Float[np.ndarray, "N h h"]]:
+    """The hidden states with their derivatives (N, h, 1 + q), begun at zero, and their free
+    motions from one of them at one (N, h, h)."""
+    hidden, columns = which
+    dynamics = both[np.ix_(hidden, hidden)]
+    phi, first, second = _first_order_hold(dynamics[..., 0], step)
+    forcing = np.einsum("hkc,kN->Nhc", both[np.ix_(hidden, columns)], known)
+
+    def integrated(forcing: np.ndarray) -> np.ndarray:
+        pushed = np.zeros_like(forcing)
+        pushed[1:] = first @ forcing[:-1] + second @ forcing[1:]
+        return recurrence(phi, pushed)
+
+    h = integrated(forcing[..., :1])
+    # d/dt of a derivative by a parameter: the same dynamics, driven also by what these change.
+    forcing[..., 1:] += np.einsum("hjq,Nj->Nhq", dynamics[..., 1:], h[..., 0])
+    free = np.zeros((known.shape[1], len(hidden), len(hidden)))
+    free[0] = np.eye(len(hidden))
+    return (
+        np.concatenate([h, integrated(forcing[..., 1:])], axis=-1),
+        recurrence(phi, free),
+    )
+
+
+def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
+    """x(k+1) = phi x(k) + first f(k) + second f(k+1) for x' = A x + f, f straight between."""
+    h = A.shape[0]
+    block = np.zeros((3 * h, 3 * h))
+    block[:h, :h], block[:h, h : 2 * h] = A * step, np.eye(h) * step
+    block[h : 2 * h, 2 * h :] = np.eye(h)
+    whole = scipy.linalg.expm(block)
+    second = whole[:h, 2 * h :]
+    return whole[:h, :h], whole[:h, h : 2 * h] - second, second
+
+
+def recurrence(
+    phi: Float[np.ndarray, "h h"], f: Float[np.ndarray, "N h c"]
+) -> Float[np.ndarray, "N h c"]:
+    """x(0) = f(0), x(k) = phi x(k-1) + f(k).
+
+    In blocks side by side, since a loop over all samples in Python would take seconds.
+
+    Args:
+        phi: transition matrix.
+        f: what is added at each sample, for many columns.
+    """
+    N, h, c = f.shape
+    b = max(1, int(np.sqrt(N)))
+    blocks = -(-N // b)
+    x = np.zeros((blocks * b, h, c))
+    x[:N] = f
+    x = x.reshape(blocks, b, h, c)
+    powers = [phi]
+    for k in range(1, b):
+        x[:, k] += phi @ x[:, k - 1]
+        powers.append(phi @ powers[-1])
+    for i in range(1, blocks):
+        # The end of the block before is whole by now: its motion goes on through this one.
+        x[i] += np.stack(powers) @ x[i - 1, -1]
+    return x.reshape(blocks * b, h, c)[:N]
+
+
+class Optimum(NamedTuple):
+    """Where a search ended."""
+
+    values: Float[np.ndarray, " q"]
+    rows: Rows
+    weights: dict[str, float]
+
+
+def search(
+    regression: Regression,
+    start: Float[np.ndarray, " q"],
+    keep_sign: np.ndarray,
+    weights: Mapping[str, float],
+) -> tuple[np.ndarray, Rows]:
+    """Levenberg-Marquardt on the equation error.
+
+    Args:
+        regression: what is regressed.
+        start: values to begin with (q,), SI.
+        keep_sign: whether a parameter keeps its start's sign (q,): searched in its logarithm.
+        weights: by equation.
+    """
+    x, damping = start.copy(), 1e-6
+    at = regression.rows(x, weights)
+    for _ in range(_STEPS):
+        # A logarithm's step is relative: its column is the parameter's times its value.
+        size = np.where(keep_sign, x, 1.0)
+        step = _damped(at.r, at.J * size, damping)
+        with np.errstate(over="ignore"):
+            new = np.where(keep_sign, x * np.exp(np.clip(step, -2.0, 2.0)), x + step)
+        tried = _finite(lambda new=new: regression.rows(new, weights))
+        if tried is None or not tried.cost < at.cost:
+            damping = 10.0 * damping
+            if damping > 1e8:
+                break
+            continue
+        gain = at.cost - tried.cost
+        x, at, damping = new, tried, max(0.1 * damping, 1e-12)
+        if gain < _SMALL * at.cost:
+            break
+    return x, at
+
+
+def _finite(make: Callable[[], Rows]) -> Rows | None:
+    with np.errstate(all="ignore"):
+        try:
+            rows = make()
+        except (ValueError, np.linalg.LinAlgError):  # an infinite matrix or signal
+            return None
+    return rows if np.isfinite(rows.cost) and np.isfinite(rows.J).all() else None
+
+
+def _damped(r: np.ndarray, J: np.ndarray, damping: float) -> np.ndarray:
+    norms = np.linalg.norm(J, axis=0)
+    used = norms > 0
+    scaled = J[:, used] / norms[used]
+    step = np.zeros(J.shape[1])
+    normal = scaled.T @ scaled + damping * np.eye(int(used.sum()))
+    step[used] = -np.linalg.lstsq(normal, scaled.T @ r, rcond=1e-13)[0] / norms[used]
+    return step

@@ -1,0 +1,260 @@
+"""Whether inputs follow the response: feedback, by a pilot or a controller.
+
+Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
+multivariable ARX model of the record itself, so that a poor model of the machine is no alarm. Under
+feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999, 13.4
+and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the rest is
+correlated with sums of past innovations. The variance of such a correlation between two
+autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
+(L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.nuisances import labels
+
+LEVEL = 0.01
+"""of the test of a whole record: all inputs, outputs and lags together"""
+_RATE = 50.0
+"""samples a second at most: no feedback that a machine flies by is faster than a quarter of that"""
+_LONGEST = 2.0
+"""lag up to which an input may follow [s]"""
+_ORDERS = (2, 4, 8, 16)
+"""of the ARX models, of which BIC takes one"""
+_MOST = 20_000
+"""samples that are looked at"""
+_LEAST = 200
+"""samples of a record to be tested"""
+_PER_UNKNOWN = 8
+"""samples for each coefficient of a model, at least"""
+_JUMP, _ROUNDS = 5.0, 3
+"""times the median size of what is unforeseen of an input, above which it is a jump; how often what
+is left is looked at again"""
+_SEEN = 0.8
+"""part of the samples of an output that is used"""
+
+
+class Feedback(NamedTuple):
+    """What was found of one input of one flight. The names of the fields are keys of fit.json."""
+
+    flight: str
+    input: str
+    output: str
+    """whose past innovations it follows most surely"""
+    correlation: float
+    """of the unforeseen part of the input with them"""
+    lag: tuple[float, float]
+    """[s] how long ago they were"""
+    p_value: float
+    """for all inputs, outputs and lags of the record that were tested"""
+
+    @property
+    def present(self) -> bool:
+        """Whether the input follows the response."""
+        return self.p_value < LEVEL
+
+
+def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
+    """By input that moves freely, whether it follows past innovations; nothing where the record is
+    too short to tell.
+
+    Args:
+        flight: inputs and outputs as measured; no model is asked.
+        together: how many flights are tested side by side, for the p values.
+    """
+    inputs, outputs, dt = _decimated(flight)
+    n = next(iter(outputs.values())).size if outputs else 0
+    if not inputs or n < _LEAST:
+        return ()
+    y = np.stack(list(outputs.values()), axis=1)
+    u = np.stack(list(inputs.values()), axis=1)
+    innovations = _innovations(y, np.concatenate([y, u], axis=1))
+    if innovations is None:
+        return ()
+    blocks = _blocks(max(1, min(round(_LONGEST / dt), n // 10)))
+    # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
+    tests = together * len(inputs) * len(outputs) * len(blocks)
+    found = []
+    for name, values in inputs.items():
+        unforeseen = _unforeseen(values)
+        if unforeseen is None:
+            continue
+        p, correlation, output, (first, last) = min(
+            (*_correlation(unforeseen, innovations[:, k], block), output, block)
+            for k, output in enumerate(outputs)
+            for block in blocks
+        )
+        lag, label = (first * dt, last * dt), flight.name or "flight 1"
+        found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p)))
+    return tuple(found)
+
+
+def feedback_of(problem: Problem) -> tuple[Feedback, ...]:
+    """Of all flights that are fitted."""
+    flights = problem.training
+    return tuple(
+        one._replace(flight=label)
+        for label, f in zip(labels(flights), flights, strict=True)
+        for one in feedback(f, len(flights))
+    )
+
+
+def feedback_notes(
+    problem: Problem, found: Sequence[Feedback], white: bool | None = None
+) -> list[str]:
+    """What a closed loop does to the estimates, and what to do; nothing where there is none.
+
+    Args:
+        problem: says the method and what can be disturbed.
+        found: of `feedback_of`.
+        white: whether the errors that the method asks to be white are; None before a fit.
+    """
+    present = [one for one in found if one.present]
+    filtered = estimator_of(problem.method).process_noise
+    # With disturbances in the model and white innovations the noise model is right, and the direct
+    # estimate is unbiased in a closed loop too.
+    if not present or (filtered and white):
+        return []
+    sure = min(present, key=lambda one: one.p_value)
+    names = list(dict.fromkeys(one.input for one in present))
+    follows = "follow" if len(names) > 1 else "follows"
+    begun = (
+        f"The loop is closed: {' and '.join(names)} {follows} the response ({sure.flight}: "
+        f"correlation {sure.correlation:+.2f} of what is unforeseen of {sure.input} with what was "
+        f"unforeseen of {sure.output} {sure.lag[0]:.2g} to {sure.lag[1]:.2g} s before). Estimates "
+        "are then unbiased only if the noise model is right. "
+    )
+    if filtered:
+        doubt = "" if white is None else ", and they are not: disturbances or dynamics are missing"
+        return [f"{begun}Filter error asks for white innovations{doubt}."]
+    axes = disturbable(problem.model)
+    how = f" with disturbance: {{axis: {axes[0]}, poles: 1}}" if axes else " and process noise"
+    return [
+        f"{begun}That of {problem.method} knows no gusts, which feedback brings into the inputs: "
+        f"in gusts its estimates are biased, and method: filter-error{how} is advised."
+    ]
+
+
+def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
+    """What an input's own past does not foretell (N,), without its jumps; None where nothing is
+    left.
+
+    A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
+    out is chosen by the input alone, so that the test stays one.
+    """
+    left = _innovations(u[:, None], u[:, None])
+    for _ in range(_ROUNDS):
+        if left is None:
+            return None
+        size = float(np.nanmedian(np.abs(left)))
+        calm = np.abs(left[:, 0]) <= _JUMP * size
+        # An input that mostly stays where it is has no other motion than its jumps.
+        if size <= 1e-9 * np.std(u):
+            break
+        left = _innovations(np.where(calm, u, np.nan)[:, None], u[:, None])
+    if left is None or not np.nanstd(left) > 1e-9 * np.std(u):
+        return None
+    return left[:, 0]
+
+
+def _decimated(
+    flight: Flight,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
+    """Inputs that move and outputs that are mostly seen, averaged down to a moderate rate."""
+    every = max(1, int(np.ceil(1.0 / (flight.dt * _RATE) - 1e-9)))
+
+    def thinned(x: np.ndarray) -> np.ndarray:
+        whole = x[: x.size // every * every].reshape(-1, every)
+        return whole.mean(axis=1)  # NaN where one of them is missing
+
+    inputs = {n: thinned(u) for n, u in flight.inputs.items()}
+    outputs = {n: thinned(y) for n, y in flight.outputs.items()}
+    # Of a very long record a part will do, and its regressors fit into memory.
+    inputs = {n: u[:_MOST] for n, u in inputs.items()}
+    outputs = {n: y[:_MOST] for n, y in outputs.items()}
+    return (
+        {n: u for n, u in inputs.items() if np.ptp(u) > 0},
+        {n: y for n, y in outputs.items() if np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0},
+        flight.dt * every,
+    )
+
+
+def _innovations(
+    y: Float[np.ndarray, "N p"], past: Float[np.ndarray, "N z"]
+) -> Float[np.ndarray, "N p"] | None:
+    """What past samples do not foretell of y (N, p), NaN where one of them is missing; None where
+    the record is too short."""
+    scale = np.nanstd(past, axis=0)
+    past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
+    best, least = None, np.inf
+    longest = _ORDERS[-1]
+    for order in _ORDERS:
+        unknowns = order * past.shape[1] + 1
+        if y.shape[0] - longest < _PER_UNKNOWN * unknowns:
+            break
+        # The same samples for all orders, or their criteria could not be compared.
+        X = np.concatenate(
+            [past[longest - k : past.shape[0] - k] for k in range(1, order + 1)]
+            + [np.ones((y.shape[0] - longest, 1))],
+            axis=1,
+        )
+        rows = np.isfinite(X).all(axis=1) & np.isfinite(y[longest:]).all(axis=1)
+        if rows.sum() < _PER_UNKNOWN * unknowns:
+            break
+        left = np.full(y.shape, np.nan)
+        solution = np.linalg.lstsq(X[rows], y[longest:][rows], rcond=1e-10)[0]
+        left[longest:][rows] = y[longest:][rows] - X[rows] @ solution
+        m = int(rows.sum())
+        criterion = sum(m * np.log(np.nanmean(e**2) + 1e-300) for e in left.T)
+        criterion += y.shape[1] * unknowns * np.log(m)
+        if criterion < least:
+            best, least = left, criterion
+    return best
+
+
+def _blocks(longest: int) -> list[tuple[int, int]]:
+    """Lags in samples, in groups that grow with the lag: what follows the response does so over a
+    while, and few sums over many lags see it where each lag by itself would not."""
+    blocks, first = [], 1
+    while first <= longest:
+        last = max(first, int(first * 1.5))
+        blocks.append((first, min(last, longest)))
+        first = last + 1
+    return blocks
+
+
+def _correlation(
+    u: Float[np.ndarray, " N"], e: Float[np.ndarray, " N"], block: tuple[int, int]
+) -> tuple[float, float]:
+    """p value and correlation of u with the sum of e over the lags of a block."""
+    first, last = block
+    seen = np.isfinite(u) & np.isfinite(e)
+    u, e = np.where(seen, u, 0.0), np.where(seen, e, 0.0)
+    sums = np.concatenate([np.zeros(last), np.convolve(e, np.ones(last - first + 1), "valid")])
+    past = sums[: u.size]  # at t the sum over t - last ... t - first
+    n = int(seen.sum())
+    size = float(np.sqrt(np.sum(u**2) * np.sum(past**2)))
+    if size == 0:
+        return 1.0, 0.0
+    correlation = float(u @ past) / size
+    # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's own.
+    lags = min(4 * (last - first + 1) + 20, u.size - 1)
+    a, b = _autocorrelation(u, lags), _autocorrelation(past, lags)
+    variance = max(float(1.0 + 2.0 * (a[1:] @ b[1:])), 0.1) / n
+    p = 2.0 * scipy.special.ndtr(-abs(correlation) / np.sqrt(variance))
+    return float(p), correlation
+
+
+def _autocorrelation(x: np.ndarray, lags: int) -> np.ndarray:
+    size = 1 << (2 * x.size - 1).bit_length()
+    c = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: lags + 1]
+    return c / c[0]
