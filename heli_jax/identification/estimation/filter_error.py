@@ -24,7 +24,7 @@ from heli_jax.identification.estimation.estimator import (
     signals,
 )
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.kalman import Innovations, innovations
+from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
 from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
@@ -256,9 +256,13 @@ def filtered_flights(
         u: the unknowns, in the units of the model.
     """
     together: dict[int, Innovations] = {}
+    small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
-        found = innovations_together(layout, data, noise, u, group)
-        together |= dict(zip(group, found, strict=True))
+        # One record of a small model: written out in rows the exact filter takes as long, and two
+        # seconds less to compile (experiments/benchmarks/filter.py).
+        if not (small and len(group) == 1):
+            found = innovations_together(layout, data, noise, u, group)
+            together |= dict(zip(group, found, strict=True))
     return tuple(
         together[i] if i in together else _filtered(layout, data, noise, u, i)
         for i in range(len(data.flights))

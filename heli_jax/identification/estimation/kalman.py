@@ -31,7 +31,7 @@ from heli_jax.simulation.stepping import held_columns
 
 # Params, Inputs and State are a model's own classes: they are annotated Any.
 
-_SMALL = 8
+SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""
 _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
@@ -93,7 +93,7 @@ def innovations(
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
     drive = _Drive(model, params, inputs, options, linear, rows)
     if model.linear:
-        e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(_linear(drive), x, P, y, R)
+        e, s = (_by_rows if x.shape[0] <= SMALL else _by_arrays)(_linear(drive), x, P, y, R)
     else:
         e, s = _run(_local(drive), x, P, y, R)
     return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
