@@ -18,7 +18,7 @@ from heli_jax.naming import Scalar
 
 DT = 0.02
 AXES = ("p", "q", "r", "u", "v", "w")
-SIGMA = {"p": 0.3, "q": 0.3, "r": 0.3, "u": 0.6, "v": 0.6, "w": 0.6}
+SIGMA = {"p": 0.4, "q": 0.4, "r": 0.8, "u": 0.3, "v": 0.6, "w": 0.4}
 """of the turbulent acceleration, rad/s^2 and m/s^2"""
 TAU = {"p": 0.4, "q": 0.5, "r": 0.7, "u": 2.0, "v": 2.0, "w": 1.0}
 """its correlation time [s]"""
@@ -27,8 +27,8 @@ NOISE |= {"phi": 0.01, "theta": 0.01}
 """of the measurements, m/s, rad/s and rad"""
 FIXED = ("g", "Kr", "tau_ped")
 """not estimated: only Kr Nrfb acts, and the pedal's delay is a study of its own"""
-STICK = 0.05
-"""how far the steps move each stick"""
+STICK = 0.2
+"""how far the steps move each stick: the gusts' response is then 0.2 to 0.5 of the driven one"""
 
 
 def _sigma(axis: str) -> str:
@@ -131,6 +131,7 @@ def _step() -> _Step:
     pedal = naming.names(model.Inputs).index("ped")
     before = np.zeros_like(B)
     before[:, pedal], now[:, pedal] = late_A @ early[:, pedal], late[:, pedal]
+    assert model.noise_intensity is not None
     g = np.array([float(v) for v in naming.asdict(model.noise_intensity(params)).values()])
     # Van Loan (1978): the covariance that the noise adds in one sample.
     E = scipy.linalg.expm(np.block([[-A, np.diag(g**2)], [np.zeros((n, n)), A.T]]) * DT)

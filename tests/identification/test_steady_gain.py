@@ -1,6 +1,7 @@
 """The filter with one covariance and a gain that freezes, against NumPy and the exact filter."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ CASES = {
 }
 
 
-def gaussian(decay, noise, seen=1.0, R=0.04):
+def gaussian(decay, noise, seen=1.0, R: Any = 0.04):
     """A system of which everything that may depend on an unknown does."""
     return Gaussian(
         Ad=jnp.asarray([[0.95, 0.1 * seen], [0.0, 1.0]]).at[1, 1].set(decay),
