@@ -34,6 +34,7 @@ bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/identification.py
 	$(BIN)/python experiments/benchmarks/helicopter.py
 	$(BIN)/python experiments/benchmarks/sweeps.py
+	$(BIN)/python experiments/benchmarks/filter.py
 
 clean:
 	rm -rf .venv runs .pytest_cache .ruff_cache

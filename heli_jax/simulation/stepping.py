@@ -169,8 +169,8 @@ def field_term(model: Model, vector_field: Callable[[Any, Any, Any], Any]) -> df
     return dfx.ODETerm(_Field(model.State, vector_field))
 
 
-# Where a Kalman filter goes through the record, inputs enter as a known drive: multiplied by B
-# for all samples at once they cost one matrix product.
+# Where a Kalman filter goes through the record, inputs enter as a known drive: how B and U are
+# multiplied, all samples at once or some at a time, is left to the filter.
 def held_columns(
     model: Model,
     params: Record,
@@ -178,8 +178,8 @@ def held_columns(
     dt: Number,
     delay: Number | None,
     linear: tuple[bool, ...] = (),
-) -> tuple[Float[Array, "n n"], Float[Array, "N n"], Float[Array, "N m"]]:
-    """x[k+1] = Ad x[k] + drive[k] for a linear model: Ad, drive, and the inputs that act at k.
+) -> tuple[Float[Array, "n n"], Float[Array, "n r"], Float[Array, "N r"], Float[Array, "N m"]]:
+    """x[k+1] = Ad x[k] + B U[k] for a linear model: Ad, B, U, and the inputs that act at k.
 
     Args:
         model: linear, with n states and m inputs.
@@ -196,4 +196,4 @@ def held_columns(
     acting = inputs
     if args.delays is not None:
         acting = delayed(inputs, args.delays, jnp.arange(U.shape[0]), linear)
-    return args.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
+    return args.discrete.Ad, B, U, jnp.stack(jax.tree.leaves(acting), axis=1)

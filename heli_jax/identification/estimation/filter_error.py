@@ -24,7 +24,8 @@ from heli_jax.identification.estimation.estimator import (
     signals,
 )
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.kalman import Innovations, innovations
+from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
+from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
@@ -170,12 +171,14 @@ class FilterError(Estimator):
         A filter whose measurements are all but noise never corrects its state: the variance of its
         innovations is then that of a simulation's error. The program is the one that is compiled.
         """
+        largest: dict[str, float] = {}
+        for f in data.flights:
+            for n, y in f.outputs.items():
+                largest[n] = max(largest.get(n, 0.0), _BLIND * _root_mean_square(y))
+        # The same in all flights, as the noise is, so that they share their covariances here too.
         blinding = tuple(
-            {
-                n: np.asarray(_BLIND * _root_mean_square(y), np.asarray(sd[n]).dtype)
-                for n, y in f.outputs.items()
-            }
-            for f, sd in zip(data.flights, noise.sd, strict=True)
+            {n: np.asarray(largest[n], np.asarray(s).dtype) for n, s in sd.items()}
+            for sd in noise.sd
         )
         blind = evaluate(layout, data, noise._replace(sd=blinding), z)
         scales = unpack(layout, data, z).scales
@@ -252,7 +255,18 @@ def filtered_flights(
         noise: of the measurements, by flight and output.
         u: the unknowns, in the units of the model.
     """
-    return tuple(_filtered(layout, data, noise, u, i) for i in range(len(data.flights)))
+    together: dict[int, Innovations] = {}
+    small = len(naming.names(layout.model.State)) <= SMALL
+    for group in layout.one_covariance:
+        # One record of a small model: written out in rows the exact filter takes as long, and two
+        # seconds less to compile (experiments/benchmarks/filter.py).
+        if not (small and len(group) == 1):
+            found = innovations_together(layout, data, noise, u, group)
+            together |= dict(zip(group, found, strict=True))
+    return tuple(
+        together[i] if i in together else _filtered(layout, data, noise, u, i)
+        for i in range(len(data.flights))
+    )
 
 
 def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> Innovations:

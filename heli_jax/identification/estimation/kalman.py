@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
@@ -30,7 +31,7 @@ from heli_jax.simulation.stepping import held_columns
 
 # Params, Inputs and State are a model's own classes: they are annotated Any.
 
-_SMALL = 8
+SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""
 _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
@@ -84,8 +85,7 @@ def innovations(
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
     x = naming.ravel(x0, dtype)
-    sds = initial_sd_of(model, params, dtype)
-    P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
+    P = first_covariance(model, params, dtype)
     # Only what is measured: an output more would cost a correction a sample.
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
@@ -93,10 +93,22 @@ def innovations(
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
     drive = _Drive(model, params, inputs, options, linear, rows)
     if model.linear:
-        e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(_linear(drive), x, P, y, R)
+        e, s = (_by_rows if x.shape[0] <= SMALL else _by_arrays)(_linear(drive), x, P, y, R)
     else:
         e, s = _run(_local(drive), x, P, y, R)
     return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
+
+
+def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "n n"]:
+    """Covariance of the state at the first sample (P0).
+
+    Args:
+        model: of n states.
+        params: the model's Params, SI.
+        dtype: of the result.
+    """
+    sds = initial_sd_of(model, params, dtype)
+    return correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
 
 
 def _checked(options: SimulationOptions) -> SimulationOptions:
@@ -135,11 +147,12 @@ class _Linear(NamedTuple):
 def _linear(drive: _Drive) -> _Linear:
     model, params, options = drive.model, drive.params, drive.options
     _, _, C, D = jacobians(model, params)
-    Ad, column, acting = held_columns(
+    Ad, B, U, acting = held_columns(
         model, params, drive.inputs, options.dt, options.delay, drive.linear
     )
     Q = process_noise(model, params, options.dt)
-    return _Linear(Ad, Q, C[drive.rows], column, acting @ D[drive.rows].T)
+    # For all samples at once: one matrix product.
+    return _Linear(Ad, Q, C[drive.rows], U @ B.T, acting @ D[drive.rows].T)
 
 
 def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:

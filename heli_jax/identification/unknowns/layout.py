@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
@@ -100,6 +101,8 @@ class Layout(eqx.Module):
     """see `Problem.continuity`"""
     holds: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
+    one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    """filter error: groups of flights that share the covariances of one Kalman filter"""
 
     @property
     def of_interest(self) -> tuple[str, ...]:
@@ -222,6 +225,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         windows=tuple(_windows(problem, flight) for flight in flights),
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
+        one_covariance=_one_covariance(problem, flights),
     )
 
 
@@ -245,6 +249,20 @@ def _block(problem: Problem) -> int:
 
 def _holds(model: Model, flight: Flight) -> tuple[str, ...]:
     return tuple(flight.hold[n] for n in naming.names(model.Inputs))
+
+
+def _one_covariance(problem: Problem, flights: tuple[Flight, ...]) -> tuple[tuple[int, ...], ...]:
+    """The flights of a linear model without missing samples, in groups of one covariance."""
+    if not (problem.model.linear and estimator_of(problem.method).process_noise):
+        return ()
+    groups: dict[Any, list[int]] = {}
+    for i, flight in enumerate(flights):
+        # A missing sample changes the covariance of its own record.
+        if all(np.isfinite(y).all() for y in flight.outputs.values()):
+            numbers = (sorted(flight.sd.items()), sorted(flight.known.items()))
+            key = (flight.dt, sorted(flight.outputs), _holds(problem.model, flight), numbers)
+            groups.setdefault(repr(key), []).append(i)
+    return tuple(tuple(group) for group in groups.values())
 
 
 def _windows(problem: Problem, flight: Flight) -> tuple[int, int]:
