@@ -22,7 +22,7 @@ LARGEST_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
 
 
 def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
-    """Numbers of seven bits a byte, the lowest first; the top bit says that another byte follows."""
+    """Numbers of seven bits a byte, the lowest first; the top bit says that more follow."""
     byte = _bytes(data, at)
     values, at = byte & 127, at + 1
     more = np.flatnonzero(byte & 128)

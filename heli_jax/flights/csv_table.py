@@ -19,7 +19,9 @@ from heli_jax.flights.csv_text import (
     find_delimiter,
     find_header,
     header_names,
+    is_of_blanks,
     require_short_lines,
+    tabs_for_blanks,
 )
 from heli_jax.flights.table import (
     Survey,
@@ -69,7 +71,10 @@ def open_csv(path: Path) -> "CsvTable":
     if len(header) > LONGEST_HEADER:
         raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
     require_short_lines(str(path), body, line + 1)
-    delimiter = find_delimiter(header, body.lstrip("\n").split("\n", 1)[0])
+    first = body.lstrip("\n").split("\n", 1)[0]
+    delimiter = find_delimiter(header, first)
+    if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
+        header, body, delimiter = tabs_for_blanks(header), tabs_for_blanks(body), "\t"
     # Counted before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(str(path), header.count(delimiter) + 1, f"line {line}")
     names = header_names(str(path), header, delimiter, line)

@@ -15,7 +15,7 @@ from heli_jax.flights.table import shown, wrong
 
 
 class Channel(NamedTuple):
-    """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where a value is missing."""
+    """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where one is missing."""
 
     times: np.ndarray
     values: np.ndarray
@@ -54,6 +54,7 @@ class ChannelLog:
         parameters: the firmware's settings, by name.
         notes: what was lost or assumed when it was read, in sentences.
         flight: which flight of the file it is, from 1, and of how many.
+        start: when the logger began [s], in the log's own count, where the log says so.
     """
 
     path: str
@@ -65,6 +66,7 @@ class ChannelLog:
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     flight: tuple[int, int] = (1, 1)
+    start: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,10 +75,15 @@ class ChannelLog:
 
     @property
     def first_time(self) -> float:
-        """The earliest time of all topics [s], from which windows count."""
-        return min(
-            (float(t.times[0]) for t in self.topics if t.clock and t.times.size), default=0.0
-        )
+        """The time [s] from which windows count: when the logger began, or the earliest sample."""
+        clocks = [t.times for t in self.topics if t.clock and t.times.size]
+        earliest = min((float(times[0]) for times in clocks), default=0.0)
+        latest = max((float(times[-1]) for times in clocks), default=0.0)
+        if self.start is not None and self.start <= latest:
+            return self.start
+        # What was published once, before the logger began, is older than the flight.
+        longest = [times for times in clocks if times.size > 1]
+        return min((float(times[0]) for times in longest), default=earliest)
 
     def topic_of(self, name: str) -> Topic:
         """The topic that holds a channel.
