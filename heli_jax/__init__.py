@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from heli_jax.identification.problem import Problem as Problem
     from heli_jax.identification.result import Fit as Fit
     from heli_jax.identification.uncertainty.comparison import intervals as intervals
+    from heli_jax.linear_models.read import LinearModel as LinearModel
+    from heli_jax.linear_models.read import linear_model as linear_model
     from heli_jax.report.saved_fit import SavedFit as SavedFit
     from heli_jax.report.saved_fit import load_fit as load_fit
     from heli_jax.simulation.accumulate import accumulate as accumulate
@@ -51,6 +53,8 @@ _HOMES = {
     "load_vehicle": "vehicle",
     "Model": "dynamics.model",
     "models": "",
+    "LinearModel": "linear_models.read",
+    "linear_model": "linear_models.read",
     "Flight": "flights",
     "Signal": "flights",
     "read_flight": "flights",

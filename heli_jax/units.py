@@ -7,6 +7,7 @@ frequency in Hz means turns per second: 25 Hz of rotor speed is 157 rad/s.
 import functools
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from heli_jax.errors import nearest
@@ -162,6 +163,30 @@ def si_of(unit: str) -> str:
         if _parse(si).dimensionality == kind:
             return si
     raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
+
+
+_BASE = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad"}
+
+
+def base_of(unit: str) -> dict[str, int]:
+    """The exponents of kg, m, s and rad in a unit of any kind, those that are not zero.
+
+    Raises:
+        ValueError: the unit is unknown.
+    """
+    kind = dict(_parse(unit).dimensionality)
+    return {si: round(kind[name]) for name, si in _BASE.items() if kind.get(name)}
+
+
+def as_text(exponents: Mapping[str, int]) -> str:
+    """The SI unit with these exponents of kg, m, s and rad: `kg m^2/s^2`."""
+
+    def power(unit: str, n: int) -> str:
+        return unit if n == 1 else f"{unit}^{n}"
+
+    above = " ".join(power(u, n) for u, n in exponents.items() if n > 0)
+    below = "".join(f"/{power(u, -n)}" for u, n in exponents.items() if n < 0)
+    return f"{above or '1'}{below}"
 
 
 def is_plain(unit: str) -> bool:

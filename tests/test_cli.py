@@ -253,7 +253,7 @@ WRONG = {
             c["disturbance"].update(fixed=["sigma_y"]),
             c["flights"][0]["signals"]["outputs"]["roll"].pop("sd"),
         ),
-        ["output 'roll'", "fixed (sigma_y) but not stated", "its sd"],
+        ["output 'roll'", "expected the sd of its noise", "fixed (sigma_y), got none"],
     ),
     "profile of what is fixed": (
         lambda c: c["fit"].update(intervals={"profile": ["Iff"]}),
@@ -328,7 +328,8 @@ def test_missing_samples(bench, capsys):
     many = [gone(r) if i % 5 else r for i, r in enumerate(rows)]
     log.write_text("\n".join([head, *many]))
     assert main(["fit", str(bench), "--out", str(bench.parent / "other")]) == 2
-    assert "output 'roll' is missing in 80 % of its samples" in capsys.readouterr().err
+    said = "output 'roll': expected at most half of its samples to be missing, got 80 %"
+    assert said in capsys.readouterr().err
 
 
 def test_comparison_by_configuration(bench, capsys):

@@ -58,7 +58,8 @@ def fitted(vehicle: Any, u: np.ndarray, y: np.ndarray, free: dict[str, Free]) ->
     flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": y})
     result = fit(Problem(models.roll_on_stand, vehicle, [flight], free))
     run = intervals(result, {n: float(getattr(vehicle, n)) for n in free})
-    flags = {"taken for white": not result.coloured, "not determined": bool(result.lost)}
+    undetermined = bool(result.not_identifiable)
+    flags = {"taken for white": not result.coloured, "not determined": undetermined}
     return dataclasses.replace(run, flags=flags)
 
 

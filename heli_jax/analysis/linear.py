@@ -13,6 +13,8 @@ from heli_jax.analysis.lti import siso_polynomials
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import Model, axes_of
 
+# Params, State and Inputs are classes of the user's: `Any` below.
+
 
 class Linearization(NamedTuple):
     """A, B, C, D about a point, with the names of their rows and columns."""
@@ -22,7 +24,7 @@ class Linearization(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
-    def to_control(self) -> Any:
+    def to_control(self) -> Any:  # python-control is an extra: its class cannot be named here
         """The same as a `control.StateSpace` of python-control, with its names.
 
         Raises:
@@ -32,7 +34,7 @@ class Linearization(NamedTuple):
             import control
         except ImportError as e:
             raise ImportError(
-                "python-control is not installed, wanted is: pip install control"
+                "to_control: python-control is not installed; remedy: pip install control"
             ) from e
         A, B, C, D = (np.asarray(M, np.float64) for M in self.matrices)
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
@@ -40,7 +42,14 @@ class Linearization(NamedTuple):
 
 
 def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) -> Linearization:
-    """The model's matrices at a state and inputs: its initial state and zeros unless given."""
+    """The model's matrices at a point.
+
+    Args:
+        model: any.
+        params: its constants.
+        state: the model's initial state unless given.
+        inputs: zeros unless given.
+    """
     return Linearization(
         jacobians(model, params, state, inputs),
         naming.names(model.State),
@@ -50,7 +59,14 @@ def linearize(model: Model, params: Any, state: Any = None, inputs: Any = None) 
 
 
 def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> np.ndarray:
-    """Eigenvalues of A [1/s], (n,) complex, slowest first. Concrete parameters only."""
+    """Eigenvalues of A [1/s], (n,) complex, slowest first.
+
+    Args:
+        model: any.
+        params: its constants, concrete.
+        state: the model's initial state unless given.
+        inputs: zeros unless given.
+    """
     eigenvalues = np.linalg.eigvals(np.asarray(jacobians(model, params, state, inputs).A))
     return eigenvalues[np.argsort(np.abs(eigenvalues))]
 
@@ -76,7 +92,9 @@ _MOTIONS = {
     "Omega": "rotor speed", "vi": "inflow",
 }  # fmt: skip
 _TAKES_PART = 0.2
+"""share of a motion in a mode from which on the mode has its name too"""
 _STILL = 1e-9
+"""of the fastest eigenvalue (or 1/s): slower is zero, which rounding has spread"""
 
 
 def eigenmodes(
@@ -84,26 +102,34 @@ def eigenmodes(
 ) -> tuple[Mode, ...]:
     """The modes of the linearisation, slowest first, named by the states that take part.
 
-    A state's share is its participation factor |left x right eigenvector|, which does not depend
-    on units; in a mode that does not move (an eigenvalue of zero, a position or a heading) it is
-    the right eigenvector's alone. Concrete parameters only.
+    A state's share is its participation factor |left x right eigenvector|; in a mode that does not
+    move (an eigenvalue of zero, a position or a heading) it is the right eigenvector's alone.
+
+    Args:
+        model: any.
+        params: its constants, concrete.
+        state: the model's initial state unless given.
+        inputs: zeros unless given.
     """
     A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
     values, left, right = scipy.linalg.eig(A, left=True)
+    # At least 1/s: of a model that does not move at all every eigenvalue is zero.
     largest = max(float(np.max(np.abs(values), initial=0.0)), 1.0)
-    names, motions, found = naming.names(model.State), _motions(model), []
+    names, motions, result = naming.names(model.State), _motions(model), []
     for i in np.argsort(np.abs(values), kind="stable"):
         value = complex(values[i])
-        if value.imag < 0:
+        if value.imag < 0:  # the other one of its pair tells the same
             continue
         still = abs(value) < _STILL * largest
+        # The product does not depend on units. Of several zeros the left eigenvectors are any that
+        # span the same space, so that products say nothing.
         part = np.abs(right[:, i]) if still else np.abs(left[:, i] * right[:, i])
         part = part / np.sum(part)
         shares = dict(zip(names, (float(p) for p in part), strict=True))
         size = abs(value)
         damping = 1.0 if still else -value.real / size
-        found.append(Mode(value, _mode_name(shares, motions), size, damping, shares))
-    return tuple(found)
+        result.append(Mode(value, _mode_name(shares, motions), size, damping, shares))
+    return tuple(result)
 
 
 def _motions(model: Model) -> dict[str, str]:
@@ -133,6 +159,13 @@ def transfer_function(
     """Numerator and denominator in s, highest power first, from the linearisation about zero.
 
     The denominator has n + 1 numbers and begins with 1; leading zeros of the numerator are cut.
+    A delay of the input (`Model.delays`) is no ratio of polynomials and is left out.
+
+    Args:
+        model: any.
+        params: its constants, concrete.
+        output: the name of one.
+        input: the name of one.
 
     Raises:
         ValueError: the model has no such output or input.
@@ -140,7 +173,9 @@ def transfer_function(
     lin = linearize(model, params)
     for name, known, what in ((output, lin.outputs, "output"), (input, lin.inputs, "input")):
         if name not in known:
-            raise ValueError(f"model {model.name} has no {what} {name!r}; it has {known}")
+            raise ValueError(
+                f"model {model.name} has no {what} {name!r}: expected one of {', '.join(known)}"
+            )
     A, B, C, D = (np.asarray(M, dtype=np.float64) for M in lin.matrices)
     i, j = lin.outputs.index(output), lin.inputs.index(input)
     return siso_polynomials(A, B[:, j], C[i], float(D[i, j]))
@@ -149,14 +184,29 @@ def transfer_function(
 def frequency_response(
     model: Model, params: Any, omega: Float[Array, " k"]
 ) -> Complex[Array, "k p m"]:
-    """H(i omega) = C (i omega - A)^-1 B + D of the linearisation about zero; omega in rad/s."""
+    """H(i omega) = C (i omega - A)^-1 B + D of the linearisation about zero.
+
+    An input that acts late by d [s] (`Model.delays`) has the factor exp(-i omega d).
+
+    Args:
+        model: any, with p outputs and m inputs.
+        params: its constants.
+        omega: (k,) [rad/s].
+    """
     A, B, C, D = jacobians(model, params)
     w = jnp.asarray(omega, A.dtype)
     s = jax.lax.complex(jnp.zeros_like(w), w)
     eye = jnp.eye(A.shape[0], dtype=s.dtype)
 
-    def at(one: Array) -> Array:
-        inner = jnp.linalg.solve(one * eye - A.astype(s.dtype), B.astype(s.dtype))
+    # A solution for each frequency: with eigenvectors it would be one, and none for a double mode.
+    def at(s_: Array) -> Array:
+        inner = jnp.linalg.solve(s_ * eye - A.astype(s.dtype), B.astype(s.dtype))
         return C.astype(s.dtype) @ inner + D.astype(s.dtype)
 
-    return jax.vmap(at)(s)
+    late = dict(model.delays)
+    if not late:
+        return jax.vmap(at)(s)
+    names = naming.names(model.Inputs)
+    d = [getattr(params, late[n]) if n in late else 0.0 for n in names]
+    factors = jnp.exp(-s[:, None] * jnp.stack([jnp.asarray(v, A.dtype) for v in d])[None, :])
+    return jax.vmap(at)(s) * factors[:, None, :]

@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 Polynomials = tuple[np.ndarray, np.ndarray]
@@ -12,8 +13,12 @@ Polynomials = tuple[np.ndarray, np.ndarray]
 def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
     """The zero-order-hold equivalent of H(s) = num/den for steps of `dt` [s].
 
-    Polynomials with the highest power first; both results have the length of `den`, and the
-    denominator begins with 1.
+    Both results have the length of `den`, and the denominator begins with 1.
+
+    Args:
+        num: of H(s), highest power first.
+        den: of H(s), highest power first.
+        dt: time between samples [s].
 
     Raises:
         ValueError: not a proper transfer function, or `dt` is not positive.
@@ -22,6 +27,7 @@ def c2d(num: ArrayLike, den: ArrayLike, dt: float) -> Polynomials:
     n = A.shape[0]
     M = np.zeros((n + 1, n + 1))
     M[:n, :n], M[:n, n:] = A, B
+    # The exponential of [[A, B], [0, 0]] holds the integral of the held input: A may be singular.
     E = scipy.linalg.expm(M * dt)
     return _polynomials(E[:n, :n], E[:n, n:], C, D)
 
@@ -36,18 +42,25 @@ def d2c(
     of Kim & Tilbury's eq. 35 were made from eq. 34; where "zoh" refuses, its result is another
     system than Hd.
 
+    Args:
+        num: of Hd(z), highest power first.
+        den: of Hd(z), highest power first.
+        dt: time between samples [s].
+        method: "zoh" or "real-log".
+
     Raises:
         ValueError: no such method, not a proper transfer function, a pole at z = 0 (its logarithm
             does not exist), or, with "zoh", a pole on the negative real axis, which is named.
     """
     if method not in ("zoh", "real-log"):
-        raise ValueError(f"unknown method {method!r}: use 'zoh' or 'real-log'")
+        raise ValueError(f"method: expected 'zoh' or 'real-log', got {method!r}")
     A, B, C, D = _state_space(num, den, dt)
     n = A.shape[0]
     poles = np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
     size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
     if np.any(np.abs(poles) < 1e-12 * size):
         raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")
+    # Rounding may turn a real pole a little off the axis.
     negative = poles[(poles.real < 0) & (np.abs(poles.imag) < 1e-9 * size)].real
     if method == "zoh" and negative.size:
         named = ", ".join(f"{p:.3f}" for p in sorted(negative))
@@ -58,6 +71,7 @@ def d2c(
         )
     M = np.eye(n + 1)
     M[:n, :n], M[:n, n:] = A, B
+    # [[Ad, Bd], [0, 1]] is the exponential of [[A, B], [0, 0]] dt.
     # logm warns where eigenvalues are negative; that case was named above.
     L = np.asarray(scipy.linalg.logm(M.astype(complex))).real / dt
     if not np.isfinite(L).all():
@@ -69,7 +83,7 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
     b: np.ndarray = np.atleast_1d(np.asarray(num, float))
     a: np.ndarray = np.atleast_1d(np.asarray(den, float))
     if not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt is {dt}, wanted is a sample time in seconds above zero")
+        raise ValueError(f"dt must be above zero, a sample time in seconds, got {dt}")
     if b.ndim != 1 or a.ndim != 1 or not (np.isfinite(b).all() and np.isfinite(a).all()):
         raise ValueError("num and den must be lists of finite numbers")
     b, a = np.trim_zeros(b, "f"), np.trim_zeros(a, "f")
@@ -80,6 +94,7 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
     b, a = b / a[0], a / a[0]
     padded = np.concatenate([np.zeros(a.size - b.size), b])
     n = a.size - 1
+    # The controllable canonical form.
     A = np.eye(n, k=-1)
     A[0] = -a[1:]
     B = np.eye(n, 1)
@@ -93,17 +108,24 @@ def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> 
     return num, den
 
 
-def siso_polynomials(A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float) -> Polynomials:
+def siso_polynomials(
+    A: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
+) -> Polynomials:
     """num and den of c (s - A)^-1 b + d; leading zeros of num are cut, and zero stays one number.
 
-    What rounding leaves of a coefficient that is zero is judged against the Markov parameters
-    c A^k b, which set its scale.
+    Args:
+        A: (n, n).
+        b: (n,).
+        c: (n,).
+        d: the direct part.
     """
     den = np.real(np.poly(A))
     proper = _numerator(A, b, c)
+    # What rounding leaves of a coefficient that is zero. The Markov parameters c A^k b set its
+    # scale, and norms bound them.
     size = np.linalg.norm(c) * np.linalg.norm(b)
-    spread = np.linalg.norm(A, 2) if A.size else 0.0
-    limit = 1e-12 * size * np.array([max(spread, 1.0) ** max(k - 1, 0) for k in range(den.size)])
+    norm = np.linalg.norm(A, 2) if A.size else 0.0
+    limit = 1e-12 * size * np.array([max(norm, 1.0) ** max(k - 1, 0) for k in range(den.size)])
     num = d * den + np.where(np.abs(proper) <= limit, 0.0, proper)
     kept = np.flatnonzero(num)
     return (num[kept[0] :] if kept.size else np.zeros(1)), den
@@ -114,6 +136,7 @@ def _numerator(A: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     n = A.shape[0]
     den = np.real(np.poly(A))
     num = np.zeros(n + 1)
+    # The coefficient of s^(n-1-k) is c (A^k + den_1 A^(k-1) + ... + den_k) b.
     v = b.astype(float)
     for k in range(n):
         num[k + 1] = c @ v

@@ -56,8 +56,7 @@ def margins(
 ) -> Margins:
     """Margins of the loops L(s) = gain (C (s - A)^-1 B + D), closed by negative unity feedback.
 
-    A (batch, n, n), B (batch, n), C (batch, n), D (batch,), gain a number or (batch,); time in
-    seconds. An element with a number that is not finite, or with 1 + gain D = 0, has NaN, NaN and
+    An element with a number that is not finite, or with 1 + gain D = 0, has NaN, NaN and
     False; each element's result is its own, whatever stands beside it.
 
     Stable: all eigenvalues of A - gain B C / (1 + gain D) have negative real parts, apart from
@@ -74,30 +73,37 @@ def margins(
     the open and the closed loop (slower than 1e-6 of the fastest is zero here), and 6 more
     about each eigenvalue.
 
+    Args:
+        A: (batch, n, n) [1/s].
+        B: (batch, n).
+        C: (batch, n).
+        D: (batch,).
+        gain: a number or (batch,).
+
     Raises:
         ValueError: the shapes do not fit together.
     """
     A, B, C, D = (np.asarray(M, np.float64) for M in (A, B, C, D))
     if A.ndim != 3 or A.shape[1] != A.shape[2]:
-        raise ValueError(f"A has shape {A.shape}, wanted is (batch, n, n)")
+        raise ValueError(f"A: expected shape (batch, n, n), got {A.shape}")
     batch, n = A.shape[:2]
     for name, M, shape in (("B", B, (batch, n)), ("C", C, (batch, n)), ("D", D, (batch,))):
         if M.shape != shape:
-            raise ValueError(f"{name} has shape {M.shape}, wanted is {shape}")
+            raise ValueError(f"{name}: expected shape {shape}, got {M.shape}")
     k = np.asarray(gain, np.float64)
     if k.shape not in ((), (batch,)):
-        raise ValueError(f"gain has shape {k.shape}, wanted is a number or {(batch,)}")
+        raise ValueError(f"gain: expected a number or shape {(batch,)}, got shape {k.shape}")
     result = Margins(np.full(batch, np.nan), np.full(batch, np.nan), np.zeros(batch, bool))
     with np.errstate(all="ignore"):
         k = np.broadcast_to(k, (batch,))
         C, D = k[:, None] * C, k * D
         closed = A - B[:, :, None] * (C / (1.0 + D)[:, None])[:, None, :]
         # What is not finite, or does not close, is not finite here.
-        good = np.isfinite(closed).all((1, 2)) & np.isfinite(D) & (1.0 + D != 0)
-        good &= np.isfinite(B).all(1) & np.isfinite(C).all(1)
-        found = np.flatnonzero(good)
-        for start in range(0, found.size, _ELEMENTS):
-            i = found[start : start + _ELEMENTS]
+        sound = np.isfinite(closed).all((1, 2)) & np.isfinite(D) & (1.0 + D != 0)
+        sound &= np.isfinite(B).all(1) & np.isfinite(C).all(1)
+        elements = np.flatnonzero(sound)
+        for start in range(0, elements.size, _ELEMENTS):
+            i = elements[start : start + _ELEMENTS]
             _fill(result, i, _Loop(A, B, C, D).take(i), closed[i])
     return result
 
@@ -119,12 +125,15 @@ def _fill(result: Margins, where: np.ndarray, loop: _Loop, closed: np.ndarray) -
     ends = np.stack([still, loop.D], 1)
     decibels = np.min(np.where(ends < 0, _decibels(ends), np.inf), axis=1)
     row, L, noise = _crossings(loop, omega, sine, L.real < 0, 1)
+    # The search for a root ends at a jump of the sine too, as at an undamped pole.
     real = (L.real < 0) & (np.abs(L.imag) <= 1e-4 * np.abs(L.real)) & (np.abs(L) > noise)
     np.minimum.at(decibels, row[real], _decibels(L[real]))
     degrees = np.full(decibels.shape, np.inf)
     row, L, noise = _crossings(loop, omega, log_size, np.ones(omega.shape, bool), 0)
-    one = (np.abs(np.abs(L) - 1.0) <= 1e-4) & (noise < 1.0)
-    np.minimum.at(degrees, row[one], np.abs(np.degrees(np.angle(-L[one]))))
+    # A sign may change through infinity too, at a pole on the axis: a crossing is only where L
+    # really has size one.
+    unity = (np.abs(np.abs(L) - 1.0) <= 1e-4) & (noise < 1.0)
+    np.minimum.at(degrees, row[unity], np.abs(np.degrees(np.angle(-L[unity]))))
     result.gain[where[stable]] = decibels
     result.phase[where[stable]] = degrees
 
@@ -135,6 +144,7 @@ def _decibels(L: np.ndarray) -> np.ndarray:
 
 def _eigenvalues(A: np.ndarray) -> _Complex:
     """Eigenvalues (m, n); NaN for a matrix where the iteration does not end."""
+    # NumPy refuses the whole stack for one matrix: halves until that one stands alone.
     try:
         return np.linalg.eigvals(A).astype(np.complex128)
     except np.linalg.LinAlgError:
@@ -163,6 +173,7 @@ def _stable(before: _Complex, after: _Complex, size: np.ndarray) -> np.ndarray:
     rank = np.empty_like(order)
     np.put_along_axis(rank, order, np.broadcast_to(np.arange(n), order.shape), 1)
     unmoved |= rank < longest[:, None]
+    # Zero to rounding is not negative: such a loop is at the edge.
     negative = after.real < -10.0 * _EPS * size[:, None]
     return np.all(negative | unmoved, axis=1) & np.isfinite(size)
 
@@ -177,6 +188,7 @@ def _grid(eigenvalues: _Complex) -> np.ndarray:
     high = np.where(most > 0, most, 1.0) * _BEYOND
     even = low[:, None] * (high / low)[:, None] ** np.linspace(0.0, 1.0, _POINTS)
     # Of a pair one looks to higher frequencies and the other to lower ones.
+    # An undamped one has no width of its own.
     width = np.maximum(np.abs(eigenvalues.real), 1e-6 * speed)
     width = np.where(eigenvalues.imag < 0, -width, width)
     sides = np.abs(eigenvalues.imag)[:, :, None] + width[:, :, None] * _SIDES
@@ -191,6 +203,7 @@ def _response(
     m, n = B.shape
     L = np.empty(omega.shape, np.complex128)
     noise = np.empty(omega.shape)
+    # A few frequencies at a time: all at once would be hundreds of megabytes.
     step = max(1, _BYTES // (16 * max(m, 1) * max(n, 1) ** 2))
     diagonal = np.arange(n)
     for start in range(0, omega.shape[1], step):
@@ -230,8 +243,10 @@ def _at_rest(loop: _Loop, lowest: np.ndarray) -> np.ndarray:
     """
     L, noise = _response(*loop, 15.0 * lowest[:, None] * np.arange(1.0, 5.0))
     a, b, c, d = L.real.T
+    # Extrapolated to zero by the polynomial in omega^2 through the four points.
     value = (56.0 * a - 28.0 * b + 8.0 * c - d) / 35.0
     size = np.abs(L)
+    # Where L grows towards lower frequencies there is a pole at zero, and no value.
     finite = size[:, 0] <= 1.5 * size[:, 1]
     # Less than this beside what L has there already is a zero at the origin.
     known = np.abs(value) > np.maximum(1e-4 * size[:, 0], noise[:, 0])
@@ -253,7 +268,10 @@ def _crossings(
 ) -> tuple[np.ndarray, _Complex, np.ndarray]:
     """Elements (c,) where test `which` crosses zero, and L and its rounding (c,) there.
 
-    f (m, k) is that test at omega (m, k); only where `among` (m, k) is true at one end.
+    Args:
+        f: (m, k) that test at omega.
+        among: (m, k) only brackets with one end where this is true.
+        which: 0 for log |L|, 1 for the sine of its angle.
     """
     # A zero has the sign of what it follows.
     sign = np.sign(f)
@@ -261,10 +279,11 @@ def _crossings(
     sign = np.take_along_axis(sign, last, 1)
     change = (sign[:, :-1] * sign[:, 1:] < 0) & (among[:, :-1] | among[:, 1:])
     row, i = np.nonzero(change)
+    # In logarithms a Bode plot is nearly made of straight lines, which roots are found on.
     x = np.log(omega)
-    found = [(row, x[row, i], x[row, i + 1], f[row, i], f[row, i + 1])]
-    found += _dips(loop, x, f, among, which)
-    row, x1, x2, f1, f2 = (np.concatenate(part) for part in zip(*found, strict=True))
+    brackets = [(row, x[row, i], x[row, i + 1], f[row, i], f[row, i + 1])]
+    brackets += _dips(loop, x, f, among, which)
+    row, x1, x2, f1, f2 = (np.concatenate(part) for part in zip(*brackets, strict=True))
     loop = loop.take(row)
     L, noise = _response(*loop, np.exp(_roots(loop, x1, x2, f1, f2, which))[:, None])
     return row, L[:, 0], noise[:, 0]
@@ -289,10 +308,11 @@ def _dips(
     row, side, part = row[j], side[j], loop.take(row[j])
     # Three points each: x and g, the middle one lowest.
     x3, g3 = x[j[:, None] + np.arange(-1, 2)], g[j[:, None] + np.arange(-1, 2)]
-    found = []
+    brackets = []
     for _ in range(_DIP_STEPS):
         if not row.size:
             break
+        # The lowest point of the parabola through the three.
         near, far = x3[:, 0] - x3[:, 1], x3[:, 2] - x3[:, 1]
         near_g, far_g = g3[:, 0] - g3[:, 1], g3[:, 2] - g3[:, 1]
         v = (far**2 * near_g - near**2 * far_g) / (2.0 * (far * near_g - near * far_g))
@@ -314,10 +334,11 @@ def _dips(
         for k in (0, 1):
             ends = (x3[through, k], x3[through, k + 1])
             values = (g3[through, k] * side[through], g3[through, k + 1] * side[through])
-            found.append((row[through], *ends, *values))
+            brackets.append((row[through], *ends, *values))
+        # Those that passed zero are brackets now, to either side of the point below.
         on = gv > 0
         row, side, part, x3, g3 = row[on], side[on], part.take(on), x3[on], g3[on]
-    return found
+    return brackets
 
 
 def _roots(
@@ -333,7 +354,7 @@ def _roots(
     Chandrupatla's method for all at once: inverse quadratic interpolation where it can be
     trusted, bisection otherwise.
     """
-    found = np.where(f1 == 0, x1, x2)
+    roots = np.where(f1 == 0, x1, x2)
     left, t = np.flatnonzero(f1 * f2 != 0), 0.5
     x1, x2, f1, f2 = x1[left], x2[left], f1[left], f2[left]
     part = loop.take(left)
@@ -342,13 +363,15 @@ def _roots(
             break
         x = x1 + t * (x2 - x1)
         fx = _tests(*_response(*part, np.exp(x)[:, None]))[which][:, 0]
+        # x1 is the newest point, x2 the one beyond the root, x3 the one that was given up.
         same = np.sign(fx) == np.sign(f1)
         x3, f3 = np.where(same, x1, x2), np.where(same, f1, f2)
         x2, f2 = np.where(same, x2, x1), np.where(same, f2, f1)
         x1, f1 = x, fx
-        found[left] = np.where(np.abs(f2) < np.abs(f1), x2, x1)
+        roots[left] = np.where(np.abs(f2) < np.abs(f1), x2, x1)
         least = 2.0 * _EPS * np.maximum(np.abs(x1), 1.0) / np.abs(x2 - x1)
         xi, phi = (x1 - x2) / (x3 - x2), (f1 - f2) / (f3 - f2)
+        # Chandrupatla (1997): where the inverse parabola is monotone between the points.
         trusted = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
         a = f1 / (f2 - f1) * f3 / (f2 - f3)
         b = (x3 - x1) / (x2 - x1) * f1 / (f3 - f1) * f2 / (f3 - f2)
@@ -358,4 +381,4 @@ def _roots(
         if not on.all():
             left, t, part = left[on], t[on], part.take(on)
             x1, x2, f1, f2 = x1[on], x2[on], f1[on], f2[on]
-    return found
+    return roots

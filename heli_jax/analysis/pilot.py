@@ -29,6 +29,9 @@ turns over without the pilot, stays within 0.17 rad of roll and pitch; with the 
 where 0.01 mm does the same, within 0.25."""
 
 
+# State and inputs are classes of the user's: `Any` below.
+
+
 class Pilot(NamedTuple):
     """How far each stick moves for each state's distance from the trim."""
 
@@ -39,16 +42,22 @@ class Pilot(NamedTuple):
 
     def __call__(self, state: Any, inputs: Any) -> Any:
         """`inputs` with the pilot's part added: a `feedback` for `simulate`."""
-        moved = {
+        commands = {
             stick: getattr(inputs, stick)
             - sum(k * (getattr(state, n) - getattr(self.trimmed, n)) for n, k in by.items())
             for stick, by in self.gains.items()
         }
-        return naming.replace(inputs, **moved)
+        return naming.replace(inputs, **commands)
 
 
 def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) -> Pilot:
     """The pilot who holds the attitude of `trimmed`, heading included; concrete parameters only.
+
+    Args:
+        model: with sticks for its axes.
+        params: its constants.
+        trimmed: the flight to hold.
+        pace: every mode of the attitude decays at least as fast [1/s].
 
     Raises:
         ValueError: the sticks do not move all of the attitude.
@@ -66,6 +75,7 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     x = naming.ravel(trimmed.state, only=states)
     u = naming.ravel(trimmed.inputs, only=sticks)
     A, B = (np.asarray(m) for m in jax.jit(jax.jacfwd(rates, argnums=(0, 1)))(x, u))
+    # A stick that moves nothing has no gain: the regulator would divide by it.
     size = np.linalg.norm(B, axis=0)
     if not np.all(size > 0):
         raise ValueError(f"the sticks of {model.name} do not move all of its attitude")
@@ -85,9 +95,11 @@ def _least_energy(
 
     Only those modes z = W x matter: P is W^T X^-1 W with X from Lyapunov's equation.
     """
+    # Decay faster than `pace` is stability of what is shifted by it.
     shifted = A + pace * np.eye(A.shape[0])
-    found: Any = scipy.linalg.schur(shifted.T, sort="rhp")
-    T, Z, k = found
+    # By Schur vectors, which are orthogonal: eigenvectors of equal modes nearly coincide.
+    schur: Any = scipy.linalg.schur(shifted.T, sort="rhp")  # three with `sort`, which stubs ignore
+    T, Z, k = schur
     W, slow = Z[:, :k].T, T[:k, :k].T
     X = scipy.linalg.solve_continuous_lyapunov(slow, W @ B @ B.T @ W.T)
     return B.T @ W.T @ np.linalg.solve(X, W)

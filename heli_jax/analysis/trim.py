@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
@@ -19,9 +19,16 @@ from heli_jax.vehicle import of_helicopter
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
 """Where the sticks end, unless `trim` is told otherwise; the cyclic ones are lengths, and open."""
 
+# Params, State and Inputs are classes of the user's, of numbers, arrays or tracers: `Any` below.
+
 _TOLERANCE = 1e-10
+"""acceleration left, in m/s^2 or rad/s^2, below which a flight is steady"""
 _POLISH = 3
+"""steps of Newton's method, each doubling the digits"""
 _TRIES = 12
+"""starts, the first from momentum theory and the others about it"""
+_UPRIGHT = 1.5
+"""roll and pitch [rad] below which a machine is not on its back"""
 
 
 class _Condition(NamedTuple):
@@ -112,6 +119,9 @@ def trim(
     parameters only: `equilibrium` is what can be differentiated and batched.
 
     Args:
+        model: the full nonlinear model of a helicopter.
+        params: its constants.
+        condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
         sticks: the ends of the sticks' travel by name.
 
@@ -128,18 +138,20 @@ def trim(
     params, condition, air = jax.tree.map(
         lambda v: jnp.asarray(v, jnp.result_type(float)), (params, condition, tuple(wind))
     )
+    # The same starts each time: a trim is a function of its arguments.
     rng = np.random.default_rng(0)
-    spread = np.zeros(len(steady.unknowns))
+    offset = np.zeros(len(steady.unknowns))
     for _ in range(_TRIES):
-        found = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(spread)))
-        sound = plausible(found) and np.isfinite(found.residual)
-        if sound and (best is None or found.residual < best.residual):
-            best = found
+        result = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(offset)))
+        # The equations have more roots, such as inverted flight or blades that push downwards.
+        sound = plausible(result) and np.isfinite(result.residual)
+        if sound and (best is None or result.residual < best.residual):
+            best = result
         if best is not None and best.residual < _TOLERANCE:
             _check_sticks(model, params, best, condition, sticks)
             _check_range(model, params, best, condition)
             return best
-        spread = rng.standard_normal(spread.size)
+        offset = rng.standard_normal(offset.size)
     left = "" if best is None else f": the nearest leaves an acceleration of {best.residual:.3g}"
     raise ValueError(f"no trim of {_words(condition)} exists for this vehicle{left}")
 
@@ -152,6 +164,12 @@ def equilibrium(
 ) -> Trim:
     """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
 
+    Args:
+        model: the full nonlinear model of a helicopter.
+        params: its constants, concrete or traced.
+        condition: the flight.
+        wind: velocity of the air along x, y and z [m/s], for a model that has it.
+
     Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
     """
     steady = _require(model)
@@ -160,10 +178,16 @@ def equilibrium(
 
 @eqx.filter_jit
 def _equilibrium(
-    model: Model, params: Any, condition: Condition, wind: Any, spread: Float[Array, " k"]
+    model: Model,
+    params: Any,
+    condition: Condition,
+    wind: tuple[Any, Any, Any],
+    offset: Float[Array, " k"],
 ) -> Trim:
+    """From the guess and half of `offset`, in the unknowns' sizes."""
     names, rates = _require(model)
-    dtype = spread.dtype
+    dtype = offset.dtype
+    # In units of their sizes: a rotor's speed is a thousand times a flapping angle.
     guess, scale = _guess(params, condition)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
     scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
@@ -171,6 +195,7 @@ def _equilibrium(
 
     def point(z: Array) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
+        # Speeds are along the heading, the states along the axes of the ground.
         fixed = {
             "psi": condition.heading,
             "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,
@@ -195,10 +220,11 @@ def _equilibrium(
     solution = optx.root_find(
         fn,
         optx.LevenbergMarquardt(1e-12, 1e-12),
-        start / scales + 0.5 * spread,
+        start / scales + 0.5 * offset,
+        # Derivatives through the iterations would be those of its path, not of the root.
         args=jax.lax.stop_gradient(params),
         max_steps=200,
-        throw=False,
+        throw=False,  # in a batch one that fails must not end the others; `residual` tells
     )
     # Newton's method takes it to the last digit, and gives it the derivatives of a root.
     xi = jax.lax.stop_gradient(solution.value)
@@ -223,8 +249,9 @@ def steady_flight(model: Model) -> SteadyFlight | None:
     unknowns += [n for n in states if n.startswith("beta")]
     unknowns += [n for n in naming.names(model.Inputs) if not n.startswith("wind")]
     # A state whose derivative is another state does not vanish by itself, it is that state.
-    given = {"x", "y", "z", "phi", "theta", "psi"}
-    equations = [n for n in states if n not in given and f"d{n}" not in states]
+    no_equation = {"x", "y", "z", "phi", "theta", "psi"}
+    equations = [n for n in states if n not in no_equation and f"d{n}" not in states]
+    # Another model by the same names: Newton's method needs as many of the one as of the other.
     if len(unknowns) != len(equations):
         return None
     return SteadyFlight(tuple(unknowns), tuple(equations))
@@ -253,6 +280,7 @@ def _require(model: Model) -> SteadyFlight:
 
 def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]]:
     """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight."""
+    # Momentum theory in hover, then blade-element theory solved for the collective pitch.
     area = jnp.pi * p.R**2
     vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
     tip = p.R * p.Omega
@@ -269,44 +297,46 @@ def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]
     return guess, scale
 
 
-def plausible(found: Trim) -> Any:
+def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
     """Whether the rotor turns, the blades push upwards, and the machine is not on its back."""
-    level = (abs(found.state.phi) < 1.5) & (abs(found.state.theta) < 1.5)
-    return level & (found.state.Omega > 0) & (found.inputs.x_throttle > 0)
+    level = (abs(result.state.phi) < _UPRIGHT) & (abs(result.state.theta) < _UPRIGHT)
+    return level & (result.state.Omega > 0) & (result.inputs.x_throttle > 0)
 
 
 def _check_sticks(
     model: Model,
     params: Any,
-    found: Trim,
+    result: Trim,
     condition: Condition,
     sticks: Mapping[str, tuple[float, float]],
 ) -> None:
     for name, (low, high) in sticks.items():
         if name not in naming.names(model.Inputs):
             raise ValueError(
-                f"trim: model {model.name} has no stick {name!r}, it has "
+                f"trim: model {model.name} has no stick {name!r}: expected one of "
                 f"{', '.join(naming.names(model.Inputs))}"
             )
-        value = float(getattr(found.inputs, name))
+        value = float(getattr(result.inputs, name))
         if low <= value <= high:
             continue
         why = ""
         if name == "x_throttle" and value > high:
-            weight, speed = float(params.m * params.g), float(found.state.Omega)
+            weight, speed = float(params.m * params.g), float(result.state.Omega)
             why = (
                 f"; to carry its weight of {weight:.3g} N the rotor would have to turn at "
                 f"{speed:.4g} rad/s: too heavy, or too slow a rotor (K_throttle, K_theta0)"
             )
         raise ValueError(
-            f"no trim of {_words(condition)}: it needs {name} {value:.3g}, the stick goes from "
-            f"{low:g} to {high:g}{why}"
+            f"no trim of {_words(condition)}: expected {name} within {low:g} to {high:g}, got "
+            f"{value:.3g}{why}"
         )
 
 
-def _check_range(model: Model, params: Any, found: Trim, condition: Condition) -> None:
-    left = [] if model.limits is None else model.limits(params, found.state, found.inputs).items()
-    outside = [name for name, out in left if bool(out)]
+def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:
+    if model.limits is None:
+        return
+    limits = model.limits(params, result.state, result.inputs)
+    outside = [name for name, out in limits.items() if bool(out)]
     if outside:
         raise ValueError(
             f"no trim of {_words(condition)} within the model's range: {', '.join(outside)}"

@@ -9,10 +9,11 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
-from heli_jax.config.schema import Config
+from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, nearest
+from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
 from heli_jax.yaml_file import parse_value, read_mapping
 
@@ -55,12 +56,24 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
 
 def _model(config: Config, path: Path) -> Model:
     folder = path.absolute().parent
+    if isinstance(config.model, LinearConfig):
+        if config.corrections is not None:
+            raise InputError(f"{path}: corrections: a linear model takes none")
+        return _started(config, path, _linear(config.model, path).model)
     model = models.by_name(config.model, f"{path}: model", folder)
     # Looked up without corrections first: a name that no model has is an error of `model`.
     if config.corrections is not None:
         where = f"{path}: corrections"
         model = models.by_name(config.model, where, folder, corrections=config.corrections)
     return _started(config, path, model)
+
+
+def _linear(model: LinearConfig, path: Path) -> LinearModel:
+    """The linear model that a configuration names; the same file is read once."""
+    try:
+        return linear_model(model.linear, path.parent)
+    except InputError as e:
+        raise InputError(f"{path}: model.linear: {e}") from e
 
 
 def _started(config: Config, path: Path, model: Model) -> Model:
@@ -83,6 +96,8 @@ def in_wind(experiment: Experiment) -> Experiment:
         InputError: the model takes no wind.
     """
     config, path = experiment.config, experiment.path
+    if isinstance(config.model, LinearConfig):
+        raise InputError(f"{path}: simulate.wind: a linear model takes no wind")
     # Anew by name: the wind's inputs are part of the model, and the initial state goes with it.
     model = models.by_name(
         config.model,
@@ -201,10 +216,25 @@ def _section(annotation: Any) -> Any:
 
 
 def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
+    if isinstance(config.model, LinearConfig):
+        return _of_linear(config, config.model, path)
+    if config.vehicle is None:
+        raise InputError(f"{path}: vehicle: missing")
     # The model's Params say which constants there can be, and in which units.
     if isinstance(config.vehicle, str):
         return read_vehicle(path.parent / config.vehicle, model.Params)
     return vehicle_from_mapping(config.vehicle, f"{path}: vehicle", model.Params)
+
+
+def _of_linear(config: Config, model: LinearConfig, path: Path) -> Vehicle:
+    """The values of a linear model's file, with those of the configuration in their place."""
+    read = _linear(model, path)
+    if config.vehicle is None:
+        return read.vehicle()
+    if isinstance(config.vehicle, str):
+        file = path.parent / config.vehicle
+        return read.vehicle(read_mapping(file), str(file))
+    return read.vehicle(config.vehicle, f"{path}: vehicle")
 
 
 def resolved(experiment: Experiment) -> dict[str, Any]:
@@ -215,6 +245,8 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     config, path = experiment.config, experiment.path
     # Without what is None: an absent key means the same, and stays right where a default changes.
     content = config.model_dump(mode="json", exclude_none=True)
+    if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
+        content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
     for flight in content.get("flights", []):
         # With links resolved too: the run's config.yaml is read from its own directory.
         flight["log"] = str((path.parent / flight["log"]).resolve())

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
+from heli_jax.errors import nearest
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
@@ -20,6 +21,26 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class _Strict(BaseModel):
     # An unknown key is an error: a misspelt `lower` would leave the parameter without a bound.
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LinearConfig(_Strict):
+    """A model from a file (docs/linear-models.md)."""
+
+    linear: str
+    """its path, or the name of a shipped one"""
+
+
+def _model_choice(value: Any) -> Any:
+    if isinstance(value, str | LinearConfig):
+        return value
+    if not isinstance(value, dict):
+        raise ValueError(f"expected a model's name or {{linear: FILE}}, got {value!r:.60}")
+    for key in value:
+        if key != "linear":
+            raise ValueError(f"unknown key {key!r:.40}{nearest(str(key), ['linear'])}")
+    if not isinstance(value.get("linear"), str):
+        raise ValueError(f"linear: expected the name of a file, got {value.get('linear')!r:.60}")
+    return LinearConfig(**value)
 
 
 class TimeConfig(_Strict):
@@ -140,7 +161,8 @@ class RLSConfig(_Strict):
 class DisturbanceConfig(_Strict):
     """A random acceleration on one axis: simulation draws it, filter error estimates it."""
 
-    axis: Literal["roll", "pitch", "yaw"]
+    axis: str
+    """one of the model's axes: roll, pitch, yaw, heave, ..."""
     poles: Literal[1, 2] = 1
     sigma_w: Positive | None = None
     """standard deviation [rad/s^2]: needed to simulate, an initial guess for filter error"""
@@ -312,9 +334,10 @@ class SweepConfig(DesignConfig):
 class Config(_Strict):
     """One experiment."""
 
-    model: str
+    model: Annotated[str | LinearConfig, BeforeValidator(_model_choice)]
     # A file, or constants as in one: checked by the readers of vehicle files, with their messages.
-    vehicle: str | dict[str, Any]
+    vehicle: str | dict[str, Any] | None = None
+    """may be left out where the model is a file: its own values are a vehicle"""
     corrections: dict[str, StrictBool] | None = None
     """what of the paper is corrected, by name (`heli_jax.dynamics.helicopter.Corrections`): on or
     off in place of what the model has; for the whole helicopter only"""

@@ -42,7 +42,7 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
     if poles not in (1, 2):
         raise ValueError(f"poles must be 1 or 2, got {poles}")
     lags = tuple(f"w{i + 1}_{axis}" for i in range(poles))
-    Params, State = _records(model, lags)
+    Params, State = _records(model, lags, _acceleration(model, rates[axis]))
     disturbed = _Disturbed(model, rates[axis], lags, State)
     return Model(
         f"{model.name}-disturbed",
@@ -59,24 +59,32 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         correlation=None if poles == 1 else disturbed.correlation,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
+        delays=model.delays,
+        positive=model.positive,
     )
 
 
-def _records(model: Model, lags: tuple[str, ...]) -> tuple[type, type]:
-    """The classes of parameters and states with those of the disturbance."""
+def _acceleration(model: Model, rate: str) -> str:
+    """The unit of a rate's derivative: heave is no rotation."""
+    unit = naming.unit(model.State, rate) or "rad/s"
+    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+
+
+def _records(model: Model, lags: tuple[str, ...], unit: str) -> tuple[type, type]:
+    """The classes of parameters and states with those of the disturbance, whose unit is given."""
     Params = naming.extended(
         model.Params,
         f"{model.Params.__name__}Disturbed",
         {
             # Zero by default: without a value for it the model flies as the undisturbed one does.
-            "sigma_w": (Annotated[Scalar, "rad/s^2", "disturbance standard deviation"], 0.0),
+            "sigma_w": (Annotated[Scalar, unit, "disturbance standard deviation"], 0.0),
             "tau_w": (Annotated[Scalar, "s", "disturbance correlation time"], 1.0),
         },
     )
     State = naming.extended(
         model.State,
         f"{model.State.__name__}Disturbed",
-        dict.fromkeys(lags, (Annotated[Scalar, "rad/s^2", "disturbance acceleration"], None)),
+        dict.fromkeys(lags, (Annotated[Scalar, unit, "disturbance acceleration"], None)),
     )
     return Params, State
 

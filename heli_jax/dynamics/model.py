@@ -89,6 +89,10 @@ class Model(eqx.Module):
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
     """of a machine on a stand, the same machine in free flight"""
+    delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    """inputs that act late, each with the parameter that is its delay [s]"""
+    positive: tuple[str, ...] = eqx.field(static=True, default=())
+    """the parameters that are above zero whatever else may change its sign"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
@@ -258,17 +262,21 @@ def needed_but_missing(model: Model, params: Record) -> list[str]:
     # may be left out (c_paddle) has another in its place by jnp.where, and does not show.
     params = plain(params)
     missing = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
-    return [n for n in missing if np.isnan(_at_one(model, params, n, np.nan)).any()]
+    late = dict(model.delays).values()
+    return [n for n in missing if n in late or np.isnan(_at_one(model, params, n, np.nan)).any()]
 
 
 def reads(model: Model, params: Record, name: str) -> bool:
-    """Whether the rates or the outputs depend on a parameter, where states and inputs are one.
+    """Whether the rates or the outputs depend on a parameter, where states and inputs are one, or
+    an input is late by it.
 
     Args:
         model: of one machine.
         params: the model's Params; concrete numbers.
         name: of the parameter.
     """
+    if name in dict(model.delays).values():
+        return True
     if np.isnan(_at_one(model, params, name, np.nan)).any():
         return True
     # One that may be left out has another in its place where it is NaN.

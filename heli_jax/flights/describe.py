@@ -9,7 +9,14 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal
-from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.grid import (
+    LATEST,
+    SHORTEST_STEP,
+    Uneven,
+    not_increasing,
+    rounding_of,
+    uniform_grid,
+)
 from heli_jax.flights.open_log import open_table
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
@@ -192,10 +199,10 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
         return f"{bad} stamps are empty or no finite numbers"
     if not np.all(np.abs(seconds) <= LATEST):
         return "the stamps are too large for times"
-    if not np.all(steps > 0):
-        row = int(np.flatnonzero(steps <= 0)[0])
-        fault = "stands still" if steps[row] == 0 else "runs backwards"
-        return f"the time {fault} after {seconds[row] - seconds[0]:.6g} s"
+    back = not_increasing(seconds)
+    if back is not None:
+        row, fault = back
+        return f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
     if np.median(steps) < SHORTEST_STEP:
         return "the steps are shorter than 1 ns"
     return ""

@@ -46,6 +46,17 @@ class Uneven:
     drift: float | None = None
 
 
+def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
+    """The first of the stamps (N,) that is not later than the one before it: its row, and what the
+    time does there; None where all increase."""
+    steps = np.diff(stamps)
+    rows = np.flatnonzero(steps <= 0)
+    if not rows.size:
+        return None
+    row = int(rows[0])
+    return row + 1, "stands still" if steps[row] == 0 else "runs backwards"
+
+
 def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:
     """The uniform grid that stamps (N,) [s] stand for, N >= 2 and strictly increasing.
 

@@ -12,7 +12,15 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Grid, Uneven, rounding_of, uniform_grid
+from heli_jax.flights.grid import (
+    LATEST,
+    SHORTEST_STEP,
+    Grid,
+    Uneven,
+    not_increasing,
+    rounding_of,
+    uniform_grid,
+)
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.open_log import open_log
@@ -157,11 +165,9 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         row = int(bad[0])
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
         raise wrong(table.path, problem, table.place(row), place)
-    # In the log's own unit: a product with the scale can round two stamps to one.
-    back = np.flatnonzero(np.diff(stamps) <= 0)
-    if back.size:
-        row = int(back[0]) + 1
-        fault = "stands still" if stamps[row] == stamps[row - 1] else "runs backwards"
+    back = not_increasing(stamps)
+    if back is not None:
+        row, fault = back
         after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
         problem = f"the time {fault}, got {now} after {after}, expected increasing times"
         raise wrong(table.path, problem, table.place(row), place)

@@ -17,6 +17,9 @@ from heli_jax.identification.validation.metrics import (
 _SURELY_CORRELATED = 4.5
 """standard deviations from zero at which two residuals are taken for correlated"""
 _WORTH_IT = 0.1
+"""correlation below which intervals do not change enough to speak of: a long record shows less"""
+_FEWEST = 8
+"""pairs of samples from which a correlation is told"""
 
 
 def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
@@ -24,38 +27,44 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
 
     White residuals of two outputs that go together count one piece of news twice.
     """
-    found = {}
+    correlated = {}
     for s in signals:
         names = list(s.measured)
-        for i, a in enumerate(names):
-            for b in names[:i]:
-                x, y = s.residual(a), s.residual(b)
-                seen = np.isfinite(x) & np.isfinite(y)
-                n = int(seen.sum())
-                if n < 8 or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
-                    continue
-                rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
-                if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
-                    found[f"{b} and {a}, {s.flight}"] = rho
-    return found
+        for b, a in ((b, a) for i, a in enumerate(names) for b in names[:i]):
+            x, y = s.residual(a), s.residual(b)
+            seen = np.isfinite(x) & np.isfinite(y)
+            n = int(seen.sum())
+            if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
+                continue
+            rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
+            # Of independent white residuals rho has the standard deviation 1 / sqrt(n).
+            if abs(rho) > max(_SURELY_CORRELATED / n**0.5, _WORTH_IT):
+                correlated[f"{b} and {a}, {s.flight}"] = rho
+    return correlated
 
 
 def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, Whiteness]:
     """Of the innovations where there are some, else of the residuals."""
     if e.innovations:
+        # Their variance falls while the filter learns the initial state: only over it are they one
+        # sequence of equal variance.
         errors = {
-            f"{s.flight}/{n}": error / np.sqrt(one.variance[n])
-            for s, one in zip(signals, e.innovations, strict=True)
-            for n, error in one.error.items()
+            f"{s.flight}/{n}": np.asarray(error) / np.sqrt(np.asarray(innovations.variance[n]))
+            for s, innovations in zip(signals, e.innovations, strict=True)
+            for n, error in innovations.error.items()
         }
     else:
         errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
+    # Of many signals one looks coloured by chance: the level is shared by all.
     return {name: whiteness(error, len(errors)) for name, error in errors.items()}
 
 
 def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...]:
     """Measured and simulated signals; what is simulated carries the bias."""
-    errors = [one.error for one in e.innovations] or [None] * len(flights)
+    errors = [
+        {n: np.asarray(error) for n, error in innovations.error.items()}
+        for innovations in e.innovations
+    ] or [None] * len(flights)
     return tuple(
         Signals(
             label,
@@ -84,7 +93,11 @@ def free_runs(
 
 def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> dict[str, Metrics]:
     """Metrics by output over all the flights that have it; of one-step predictions none without
-    innovations."""
+    innovations.
+
+    Over their samples together and not averaged over flights: a long one counts for more, and a
+    flight in which an output hardly moves has no R^2 of its own worth having.
+    """
     if one_step:
         signals = tuple(s for s in signals if s.innovations is not None)
     outputs = sorted({n for s in signals for n in s.measured})
@@ -93,6 +106,7 @@ def pooled_metrics(signals: tuple[Signals, ...], *, one_step: bool = False) -> d
         have = [s for s in signals if n in s.measured]
         measured = np.concatenate([s.measured[n] for s in have])
         model = np.concatenate([s.predicted(n) if one_step else s.simulated[n] for s in have])
+        # A simulation that diverges has no metrics: one number of it would outweigh all others.
         finite = bool(np.isfinite(model[~np.isnan(measured)]).all())
         pooled[n] = metrics(measured, model) if finite else NO_METRICS
     return pooled

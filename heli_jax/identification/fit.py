@@ -3,10 +3,10 @@
 import time
 from typing import NamedTuple
 
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax.identification.agreement import signals_of
-from heli_jax.identification.assemble import Ran, assemble, noise_by_name
+from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
@@ -37,50 +37,52 @@ from heli_jax.identification.validation.other_hold import other_hold
 __all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
 
 _FIRST_STEPS = 40
+"""of filter error, until it is known that there is a disturbance to find"""
 
 
-class _Begin(NamedTuple):
+class _FirstGuess(NamedTuple):
     """A problem at its first guess."""
 
     layout: Layout
     data: Data
     noise: Noise
-    z: Array
+    z: Float[Array, " q"]
     e: Evaluation
 
 
-def _begin(problem: Problem) -> _Begin:
+def _first_guess(problem: Problem) -> _FirstGuess:
     layout, data = layout_of(problem, problem.training), data_of(problem, problem.training)
     noise = first_noise(problem, problem.training)
     z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
+    # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return _Begin(layout, data, noise, z, e)
+    return _FirstGuess(layout, data, noise, z, e)
 
 
 def check(problem: Problem) -> Check:
-    """What the flights can determine, judged at the start values, before any fit.
+    """What the flights can determine at the start values, before any fit.
 
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
-    begin = _begin(problem)
-    e = begin.e
-    verdict = verdict_of(problem, begin.layout, e)
-    runs = tuple(s.simulated for s in signals_of(e, problem.training))
-    notes = excitation.notes(problem, runs, begin.noise.sd)
-    lost = (*verdict.undetermined, *verdict.without_effect)
-    notes += other_hold(problem, Solution(*begin[:4]), e, skip=lost)
-    scales = unpack(begin.layout, begin.data, begin.z).scales
+    guess = _first_guess(problem)
+    verdict = verdict_of(problem, guess.layout, guess.e)
+    # What the model does at the start values says whether the record can show it in this noise.
+    runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
+    notes = excitation.notes(problem, runs, guess.noise.sd)
+    # A parameter that is not identifiable moves by any amount, with another hold too.
+    not_identifiable = (*verdict.undetermined, *verdict.without_effect)
+    notes += other_hold(problem, Solution(*guess[:4]), guess.e, skip=not_identifiable)
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
         for name in flight.outputs
         if name not in flight.sd
     )
-    sds = noise_by_name(problem, begin.layout, begin.noise, scales)
+    sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
     return Check(verdict, sds, tuple(notes), guessed)
 
 
@@ -95,37 +97,47 @@ def fit(
     """Estimate the free parameters by the problem's method: output error or filter error.
 
     Args:
+        problem: model, vehicle, flights and what is free.
         starts: how many points to start from; the first is the given one, the others are drawn
             within the bounds, or about a factor of three around the start.
         seed: of that draw.
-        progress: told in words what is going on.
+        max_steps: of the optimiser, in each of its runs.
+        progress: called with a line of text before each longer part of the work.
 
     Returns:
         A Fit whose `status` says whether it converged and whether the data determine what was
         asked. Cramér-Rao intervals; those of output error allow for residuals that are not white
-        (`coloured`), and `narrow` says where nothing does.
+        (`coloured`), and `overconfident` says where nothing does.
+
+    Raises:
+        ValueError: the simulation is not finite at the start values.
     """
-    start = time.perf_counter()
-    tell = progress or (lambda _: None)
-    begin = _begin(problem)
-    before = verdict_of(problem, begin.layout, begin.e)
-    tell(f"fitting {', '.join(begin.layout.of_interest)}")
-    points = starting.draw(begin.layout, problem, begin.z, starts, seed)
-    asked = "sigma_w" in begin.layout.disturbance
+    began = time.perf_counter()
+    report = progress or (lambda _: None)
+    guess = _first_guess(problem)
+    layout, data, noise = guess.layout, guess.data, guess.noise
+    # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
+    before = verdict_of(problem, layout, guess.e)
+    report(f"fitting {', '.join(layout.of_interest)}")
+    points = starting.draw(layout, problem, guess.z, starts, seed)
+    disturbed = "sigma_w" in layout.disturbance
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
-    short = min(max_steps, _FIRST_STEPS) if asked else max_steps
-    search = starting.Search(problem, begin.layout, begin.data, short)
-    runs = search.run(begin.noise, points, tell)
-    best, said = min(runs, key=starting.rank), ()
-    other = by_windows(problem, search, begin.noise, begin.e, begin.z, best)
-    if other is not None:
-        best, said = other, (SAID,)
-    settled = relax_noise_covariance(search, begin.noise, best)
-    settled = settled._replace(notes=(*said, *settled.notes))
-    settled = better_of_two_guesses(search, points, settled, problem.training)
+    search = starting.Search(
+        problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
+    )
+    optima = search.run(noise, points, report)
+    best, notes = min(optima, key=starting.rank), ()
+    # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
+    shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
+    if shooting is not None:
+        best, notes = shooting, (SAID,)
+    optimum = relax_noise_covariance(search, noise, best)
+    optimum = optimum._replace(notes=(*notes, *optimum.notes))
+    # Relaxation ends where its first weights of the outputs lead: tried from others too.
+    optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
-    if asked:
-        settled = disturbance_or_none(search, settled)
-    timing = {"fit": time.perf_counter() - start}
-    return assemble(problem, search, settled, Ran(before, points, runs, seed, timing))
+    if disturbed:
+        optimum = disturbance_or_none(search, optimum)
+    timing = {"fit": time.perf_counter() - began}
+    return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))

@@ -19,6 +19,7 @@ class Method(NamedTuple):
     """as reports call it"""
 
 
+# By name: estimators import the problem, and a problem asks here which methods there are.
 _ESTIMATION = "heli_jax.identification.estimation"
 
 METHODS = {
@@ -32,10 +33,14 @@ def estimator_of(method: str) -> Any:
 
     Typed Any since its class stands above this module in the order of imports.
 
+    Args:
+        method: its name in `METHODS`.
+
     Raises:
         ValueError: there is no such method.
     """
     if method not in METHODS:
+        # Cut: a configuration may hold anything in this place.
         raise ValueError(
             f"method: expected one of {', '.join(METHODS)}, got {method!r:.60}"
             f"{nearest(str(method)[:60], METHODS)}"

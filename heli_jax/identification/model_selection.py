@@ -1,4 +1,4 @@
-"""Which model the record asks for: likelihood, information criteria, nested tests in a table."""
+"""Model selection: likelihood, information criteria and nested tests of candidates in a table."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -69,40 +69,48 @@ def alternatives(
     Args:
         problem: gives vehicle, flights, free parameters and nuisances.
         model: the model without disturbance.
+        axis: whose angular acceleration is disturbed, such as 'roll'.
         without_stand: the same machine without its stand, where that is in question too; it is
             fitted without the stand's kappa and zeta.
     """
     problems: dict[str, Problem] = {}
     nested = []
-    grounds = {"": (model, dict(problem.free))}
+    machines = {"": (model, dict(problem.free))}
     if without_stand is not None:
         free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
-        grounds[", no stand"] = (without_stand, free)
-    for ending, (ground, free) in grounds.items():
+        machines[", no stand"] = (without_stand, free)
+    for ending, (machine, free) in machines.items():
         if not free:
             continue
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
-            one = with_disturbance(ground, axis, max(poles, 1))
-            given = naming.asdict(problem.vehicle)
-            known = {n: given[n] for n in naming.names(one.Params) if n in given}
-            fixed = tuple(n for n in problem.fixed_noise if poles)
-            if not poles:
-                # So little that it is none; the noise is then laid out as in the others.
-                known |= {"sigma_w": jnp.asarray(1e-9 * problem.motion), "tau_w": jnp.asarray(1.0)}
-                fixed = ("sigma_w", "tau_w", *(n for n in problem.fixed_noise if n == "sigma_y"))
-            problems[words + ending] = replace(
-                problem,
-                model=one,
-                vehicle=one.Params(**known),
-                free=free,
-                method="filter-error",
-                fixed_noise=fixed,
-            )
+            problems[words + ending] = _disturbed(replace(problem, free=free), machine, axis, poles)
+            # One pole is no special case of two: both of these have the same time constant.
             if poles:
                 nested.append((f"no disturbance{ending}", words + ending))
+            # Free flight is the stand without stiffness and damping, where these may go to zero.
             if ending and _stand_may_vanish(problem):
                 nested.append((words + ending, words))
     return Alternatives(problems, tuple(nested))
+
+
+def _disturbed(problem: Problem, model: Model, axis: str, poles: int) -> Problem:
+    """The problem by filter error, with a disturbance of so many poles, or all but none."""
+    disturbed = with_disturbance(model, axis, max(poles, 1))
+    vehicle = naming.asdict(problem.vehicle)
+    known = {n: vehicle[n] for n in naming.names(disturbed.Params) if n in vehicle}
+    fixed = tuple(n for n in problem.fixed_noise if poles)
+    if not poles:
+        # So little that it is none, and by filter error too: the measurement noise is then laid out
+        # as in the others, and the likelihoods can be compared.
+        known |= {"sigma_w": jnp.asarray(1e-9 * problem.motion), "tau_w": jnp.asarray(1.0)}
+        fixed = ("sigma_w", "tau_w", *(n for n in problem.fixed_noise if n == "sigma_y"))
+    return replace(
+        problem,
+        model=disturbed,
+        vehicle=disturbed.Params(**known),
+        method="filter-error",
+        fixed_noise=fixed,
+    )
 
 
 def _stand_may_vanish(problem: Problem) -> bool:
@@ -124,37 +132,43 @@ def choose(
     nested: Sequence[tuple[str, str]] = (),
     *,
     progress: Callable[[str], None] | None = None,
-    **how: Any,
+    **fit_options: Any,  # the keywords of `fit`, whose types stand there
 ) -> Choice:
-    """Fit every problem and compare; `nested` names pairs (small, large) for a likelihood ratio.
+    """Fit every problem and compare.
 
-    All must have the same flights. `how` goes to `fit`. A model that ends below one nested in it is
-    fitted again from there, and a sentence says so.
+    A model that ends below one nested in it is fitted again from there, and a sentence says so.
+
+    Args:
+        problems: by name, all with the same flights.
+        nested: names (small, large) of those to compare by a likelihood ratio.
+        progress: called with a line of text before each fit.
+        fit_options: go to `fit`.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     fits: dict[str, Fit] = {}
     for name, problem in problems.items():
-        tell(f"comparing models: {name}")
-        fits[name] = fit(problem, **how)
+        report(f"comparing models: {name}")
+        fits[name] = fit(problem, **fit_options)
     pairs = [(a, b) for a, b in nested if a in fits and b in fits]
-    said = _none_below_its_part(problems, pairs, fits, tell, how)
-    found = {name: _candidate(name, one) for name, one in fits.items()}
-    asked = [_test(found[a], found[b]) for a, b in pairs]
-    tests = [t for t in asked if t.degrees > 0]
-    ranked = tuple(sorted(found.values(), key=lambda c: (c.status == "not-converged", c.aic)))
-    said += _sentences(ranked, tests)
-    said += [
+    sentences = _none_below_its_part(problems, pairs, fits, report, fit_options)
+    candidates = {name: _candidate(name, fits[name]) for name in fits}
+    compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
+    tests = [t for t in compared if t.degrees > 0]
+    # A fit that has not arrived has a likelihood too, of no optimum: it comes last, whatever it is.
+    ranked = tuple(sorted(candidates.values(), key=lambda c: (c.status == "not-converged", c.aic)))
+    sentences += _sentences(ranked, tests)
+    sentences += [
         f"{t.small} within {t.large}: the larger one has no unknown more, so there is no test."
-        for t in asked
+        for t in compared
         if t.degrees <= 0
     ]
-    return Choice(ranked, tuple(tests), tuple(said))
+    return Choice(ranked, tuple(tests), tuple(sentences))
 
 
-def _candidate(name: str, one: Fit) -> Candidate:
-    values = {n: e.value for n, e in one.estimates.items()}
+def _candidate(name: str, fit: Fit) -> Candidate:
+    values = {n: e.value for n, e in fit.estimates.items()}
     return Candidate(
-        name, one.status, one.log_likelihood, one.unknowns, one.aic, one.bic, one.white, values
+        name, fit.status, fit.log_likelihood, fit.unknowns, fit.aic, fit.bic, fit.white, values
     )
 
 
@@ -168,19 +182,22 @@ def _none_below_its_part(
     problems: Mapping[str, Problem],
     nested: Sequence[tuple[str, str]],
     fits: dict[str, Fit],
-    tell: Callable[[str], None],
-    how: dict[str, Any],
+    report: Callable[[str], None],
+    fit_options: dict[str, Any],
 ) -> list[str]:
     """Fit again, from the better optimum, what ended below a model that is nested in it, or far
     below one that has the same parameters; `fits` is changed, and the words are returned."""
-    said = []
+    sentences = []
+    # At the parameters of the nested model the larger one has its likelihood: an optimum below it
+    # is a local one, and a ratio of the two would be negative.
     for (a, b), least in [*((p, _BELOW) for p in nested), *((p, _FAR) for p in _alike(problems))]:
         before, other = fits[b].log_likelihood, fits[a].log_likelihood
         if not before < other - least:
             continue
-        tell(f"comparing models: {b} again, from {a}")
+        report(f"comparing models: {b} again, from {a}")
         try:
-            again = fit(begun_from(problems[b], problems[a], fits[a]), **how)
+            again = fit(begun_from(problems[b], problems[a], fits[a]), **fit_options)
+        # Another model may diverge at parameters that suit this one.
         except ValueError:  # the model is unstable there
             again = fits[b]
         if again.log_likelihood > before + least:
@@ -192,21 +209,22 @@ def _none_below_its_part(
             else f"far below {a}, which has the same parameters"
         )
         if reached > before:
-            said.append(
+            sentences.append(
                 f"{b} first ended {where} (log-likelihood {before:.1f} for {other:.1f}): begun "
                 f"anew from that optimum it reaches {reached:.1f}."
             )
         if part and reached < other - least:
-            said.append(
+            sentences.append(
                 f"{b} ends {where} (log-likelihood {reached:.1f} for {other:.1f}), also when it "
                 "begins there: its own optimum was not found, and its test means nothing."
             )
-    return said
+    return sentences
 
 
 def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
     """Pairs of models with the same parameters, each with a disturbance of its own."""
     with_noise = [name for name, problem in problems.items() if problem.noise]
+    # Neither is nested in the other, but a disturbance seldom moves parameters far.
     return [
         (a, b)
         for a in with_noise
@@ -219,30 +237,36 @@ _ALL_BUT_NOTHING = 1e-3
 """part of its start at which a parameter begins that the nested model does not have"""
 
 
-def begun_from(problem: Problem, nested: Problem, found: Fit) -> Problem:
+def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
     """The problem with its starts where the fit of another one ended, the disturbance's too.
 
-    A parameter that is fixed there begins at its value there; one that the other model does not
-    have begins all but at zero.
+    Args:
+        problem: to be fitted again.
+        nested: the other one; a parameter that is fixed there begins at its value there, one that
+            its model does not have begins all but at zero.
+        optimum: the fit of `nested`.
     """
     free = {}
-    for name, one in problem.free.items():
-        value = _ALL_BUT_NOTHING * one.start
-        if name in found.estimates:
-            value = found.estimates[name].value
+    for name, parameter in problem.free.items():
+        # Not at zero itself, which has no logarithm.
+        value = _ALL_BUT_NOTHING * parameter.start
+        if name in optimum.estimates:
+            value = optimum.estimates[name].value
         elif nested.model.name == problem.model.name and getattr(nested.vehicle, name) != 0:
             value = float(getattr(nested.vehicle, name))
-        free[name] = one._replace(start=_inside(one, value))
+        free[name] = parameter._replace(start=_inside(parameter, value))
+    # A disturbance that did not show ended at zero: this one then begins where it always does.
     noise = {
-        n: jnp.asarray(found.nuisance[n].value)
+        n: jnp.asarray(optimum.nuisance[n].value)
         for n in problem.noise
-        if n in found.nuisance and found.nuisance[n].value > 0
+        if n in optimum.nuisance and optimum.nuisance[n].value > 0
     }
     return replace(problem, free=free, vehicle=naming.replace(problem.vehicle, **noise))
 
 
 def _inside(free: Free, value: float) -> float:
     """The value, or the nearest that is well inside the bounds."""
+    # An optimum may lie on a bound, where the coordinates of a bounded parameter are at infinity.
     low, high = free.lower, free.upper
     size = high - low if low is not None and high is not None else abs(value) or abs(free.start)
     if low is not None:
@@ -256,34 +280,40 @@ def _test(small: Candidate, large: Candidate) -> Nested:
     """Without a further unknown there is nothing to test: degrees of 0, and no p-value."""
     ratio = 2.0 * (large.log_likelihood - small.log_likelihood)
     degrees = large.unknowns - small.unknowns
+    # Wilks: chi-squared with as many degrees of freedom as there are unknowns more.
     p = float(scipy.special.chdtrc(degrees, max(ratio, 0.0))) if degrees > 0 else float("nan")
     return Nested(small.name, large.name, ratio, degrees, p)
 
 
 def _sentences(ranked: tuple[Candidate, ...], tests: list[Nested]) -> list[str]:
-    settled = [c for c in ranked if c.status != "not-converged"]
-    said = []
-    if settled:
-        first, by_bic = settled[0], min(settled, key=lambda c: c.bic)
+    converged = [c for c in ranked if c.status != "not-converged"]
+    sentences = []
+    if converged:
+        first, by_bic = converged[0], min(converged, key=lambda c: c.bic)
         if first.name == by_bic.name:
-            said.append(f"AIC and BIC prefer: {first.name}.")
+            sentences.append(f"AIC and BIC prefer: {first.name}.")
         else:
-            said.append(f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}.")
-        close = [c.name for c in settled[1:] if c.aic - first.aic < 2.0]
+            sentences.append(
+                f"AIC prefers: {first.name}; BIC, which asks more of it: {by_bic.name}."
+            )
+        # Burnham and Anderson (2002): within 2 of the best there is substantial support.
+        close = [c.name for c in converged[1:] if c.aic - first.aic < 2.0]
         if close:
-            said.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
+            sentences.append(f"Hardly worse (AIC within 2): {', '.join(close)}.")
         if not first.white:
-            said.append("Not even the preferred one leaves white residuals: something is missing.")
+            sentences.append(
+                "Not even the preferred one leaves white residuals: something is missing."
+            )
     failed = [c.name for c in ranked if c.status == "not-converged"]
     if failed:
-        said.append(f"Did not converge, so not judged: {', '.join(failed)}.")
-    said += [
+        sentences.append(f"Did not converge, so not compared: {', '.join(failed)}.")
+    sentences += [
         f"{t.small} within {t.large}: twice the log-likelihood gained is {t.ratio:.3g} for "
         f"{t.degrees} more unknown{'s' if t.degrees > 1 else ''} (p {_shown(t.p_value)})."
         for t in tests
         if not {t.small, t.large} & set(failed)
     ]
-    return said
+    return sentences
 
 
 def _shown(p: float) -> str:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,34 +14,9 @@ from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.vehicle import impossible, of_helicopter
-
-
-class Prior(NamedTuple):
-    """What is known of a parameter beforehand: a normal distribution, in the parameter's unit."""
-
-    mean: float
-    sd: float
-
-
-Sign = Literal["keep", "any"]
-
-
-class Free(NamedTuple):
-    """A parameter to be estimated: where to start, between what bounds, with what prior.
-
-    `sign` says whether the estimate may have another sign than the start: `keep` (searched in its
-    logarithm) or `any` (searched in units of its start, which may then be zero). Unless given, a
-    Helicopter's parameters keep theirs and those of a model of one's own may have any. Bounds that
-    lie on one side of zero keep it in either case.
-    """
-
-    start: float
-    lower: float | None = None
-    upper: float | None = None
-    prior: Prior | None = None
-    sign: Sign | None = None
 
 
 class Nuisance(NamedTuple):
@@ -63,7 +38,16 @@ class Nuisance(NamedTuple):
     input_offset: bool | tuple[str, ...] | None = None
 
 
+# `Any` stands for Params, a class of the user's, here and below.
+__all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
+
 _FIXABLE = ("sigma_w", "tau_w", "sigma_y")
+_FEWEST = 4
+"""samples of a window at least: each window brings an initial state of its own"""
+_PER_PARAMETER = 3
+"""samples of a flight for each free parameter, at least"""
+_LINEAR = 1e-6
+"""relative misfit above which a model is not linear: rounding leaves less"""
 
 MAX_TIME_SHIFT = 0.5
 """Bound on an estimated time shift to either side [s]."""
@@ -104,19 +88,24 @@ class Problem:
     part of what the state does; None leaves them apart"""
 
     def __post_init__(self) -> None:
+        # The model first: all that follows asks it for names and units.
         check_model(self.model)
         object.__setattr__(self, "flights", tuple(self.flights))
-        ours = of_helicopter(self.model.Params)
+        # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
+        ours, positive = of_helicopter(self.model.Params), self.model.positive
         free = {
-            n: f if f.sign is not None else f._replace(sign="keep" if ours else "any")
+            n: f
+            if f.sign is not None
+            else f._replace(sign="keep" if ours or n in positive else "any")
             for n, f in self.free.items()
         }
+        # Frozen: what was accepted in another form is put right once, here.
         object.__setattr__(self, "free", free)
         _check_method(self)
         if not self.free:
             raise ValueError("nothing is free: name at least one parameter to estimate")
-        for name, one in self.free.items():
-            _check_free(name, one, self.model)
+        for name, free in self.free.items():
+            check_free(name, free, self.model)
         _check_possible(self)
         _check_windows(self)
         _check_offsets(self)
@@ -131,12 +120,13 @@ class Problem:
         """The parameters of the disturbance that filter error estimates, with their starts."""
         if not estimator_of(self.method).process_noise:
             return {}
-        found = {"sigma_w": Free(self.motion), "tau_w": Free(1.0)}
-        for name in found:
+        # Of the size of the motion, and a second: a coarse search takes it from there.
+        free = {"sigma_w": Free(self.motion), "tau_w": Free(1.0)}
+        for name in free:
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
-                found[name] = Free(value)
-        return {n: f for n, f in found.items() if n not in self.fixed_noise}
+                free[name] = Free(value)
+        return {n: f for n, f in free.items() if n not in self.fixed_noise}
 
     @property
     def noise_is_fixed(self) -> bool:
@@ -182,19 +172,21 @@ def _check_method(problem: Problem) -> None:
             "made with with_disturbance (in a configuration: a `disturbance`)"
         )
     if not all(n in _FIXABLE for n in problem.fixed_noise):
-        raise ValueError(f"fixed_noise is {problem.fixed_noise}, wanted are some of {_FIXABLE}")
+        raise ValueError(
+            f"fixed_noise: expected some of {', '.join(_FIXABLE)}, got {problem.fixed_noise}"
+        )
     for name in ("sigma_w", "tau_w"):
         if name in problem.free:
             raise ValueError(f"free.{name}: {problem.method} estimates it by itself, leave it out")
         value = float(getattr(problem.vehicle, name))
         if name in problem.fixed_noise and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"disturbance: {name} is fixed at {value:g}, wanted is above zero")
+            raise ValueError(f"disturbance: fixed {name} must be above zero, got {value:g}")
 
 
 def _check_offsets(problem: Problem) -> None:
-    asked = problem.nuisance.input_offset
+    offsets = problem.nuisance.input_offset
     known = naming.names(problem.model.Inputs)
-    for name in () if asked is None or isinstance(asked, bool) else asked:
+    for name in () if offsets is None or isinstance(offsets, bool) else offsets:
         if name not in known:
             raise ValueError(
                 f"nuisance.input_offset: model {problem.model.name} has no input {name!r}"
@@ -205,65 +197,31 @@ def _check_offsets(problem: Problem) -> None:
 def _check_windows(problem: Problem) -> None:
     if problem.window is None:
         if problem.continuity is not None:
-            raise ValueError("continuity is for windows only, wanted is a window")
+            raise ValueError("continuity is for windows only: expected a window as well, got none")
         return
     if not (math.isfinite(problem.window) and problem.window > 0):
-        raise ValueError(f"window is {problem.window:g} s, wanted is above zero")
+        raise ValueError(f"window must be above zero, got {problem.window:g} s")
     if problem.continuity is not None and not (
         math.isfinite(problem.continuity) and problem.continuity > 0
     ):
-        raise ValueError(f"continuity is {problem.continuity:g}, wanted is above zero")
+        raise ValueError(f"continuity must be above zero, got {problem.continuity:g}")
+    # A filter corrects its state at every sample, which is what windows are for.
     if not estimator_of(problem.method).windows:
         raise ValueError(f"window is for method output-error: {problem.method} needs none")
+    # Nothing measured says where a window begins.
     if not problem.nuisance.initial_state:
         raise ValueError("windows need nuisance.initial_state, which is off")
-    if problem.nuisance.time_shift:
-        raise ValueError(
-            "shooting.window and nuisance.time_shift: expected one of the two, got both"
-        )
     for flight in problem.flights:
         samples = round(problem.window / flight.dt)
-        if samples < 4:
-            where = f"flight {flight.name!r}" if flight.name else "a flight"
+        if samples < _FEWEST:
             raise ValueError(
-                f"{where}: a window of {problem.window:g} s holds {samples} samples, wanted are 4 "
-                "at least"
+                f"{_of(flight)}: a window must hold {_FEWEST} samples at least, got {samples} in "
+                f"{problem.window:g} s"
             )
 
 
-def _check_free(name: str, one: Free, model: Model) -> None:
-    if name not in naming.names(model.Params):
-        known = naming.names(model.Params)
-        raise ValueError(
-            f"free.{name}: model {model.name} has no such parameter{nearest(name, known)}"
-        )
-    numbers = {"start": one.start, "lower": one.lower, "upper": one.upper}
-    if one.prior is not None:
-        numbers |= {"prior.mean": one.prior.mean, "prior.sd": one.prior.sd}
-    for key, value in numbers.items():
-        if value is not None and not math.isfinite(value):
-            raise ValueError(f"free.{name}.{key}: found {value}, wanted is a finite number")
-    if one.prior is not None and one.prior.sd <= 0:
-        raise ValueError(f"free.{name}.prior.sd: found {one.prior.sd:g}, wanted is above zero")
-    low, high = one.lower, one.upper
-    if one.sign == "keep" and low is not None and high is not None and low < 0 < high:
-        raise ValueError(
-            f"free.{name}.sign: keep needs bounds of one sign, got {low:g} to {high:g}"
-        )
-    if low is not None and high is not None and low >= high:
-        raise ValueError(f"free.{name}: lower {low:g} is not below upper {high:g}")
-    if (low is not None and one.start <= low) or (high is not None and one.start >= high):
-        shown = (
-            f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
-        )
-        raise ValueError(f"free.{name}.start: found {one.start:g}, wanted is inside {shown}")
-    if one.sign not in ("keep", "any"):
-        raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {one.sign!r}")
-    if one.start == 0 and one.sign == "keep" and (low is None or high is None):
-        raise ValueError(
-            f"free.{name}.start: found 0 without two bounds, wanted is a start of the right sign "
-            "and size, or lower and upper, or sign: any"
-        )
+def _of(flight: Flight) -> str:
+    return f"flight {flight.name!r}" if flight.name else "a flight"
 
 
 def _check_possible(problem: Problem) -> None:
@@ -271,12 +229,14 @@ def _check_possible(problem: Problem) -> None:
         return
     for key in ("start", "lower", "upper"):
         values = {n: getattr(f, key) for n, f in problem.free.items()}
-        given = {
+        # A bound of zero is the usual way to say that a mass is positive, and is never reached.
+        stated = {
             n: v for n, v in values.items() if v is not None and not (key != "start" and v == 0)
         }
-        wrong = impossible(given)
+        wrong = impossible(stated)
         if wrong:
             raise ValueError(f"free: the {key} of {wrong}")
+    # Constants that are possible one by one may contradict each other, such as R1 and R2.
     concrete = {n: float(np.asarray(v)) for n, v in naming.asdict(problem.start_params()).items()}
     wrong = impossible({n: v for n, v in concrete.items() if not math.isnan(v)})
     if wrong:
@@ -284,11 +244,11 @@ def _check_possible(problem: Problem) -> None:
 
 
 def _check_flight(flight: Flight, problem: Problem) -> None:
-    where = f"flight {flight.name!r}" if flight.name else "a flight"
-    model = problem.model
+    where, model = _of(flight), problem.model
     missing = [n for n in naming.names(model.Inputs) if n not in flight.inputs]
     if missing:
         raise ValueError(f"{where} has no input {missing[0]!r}, which model {model.name} needs")
+    # An output of the model need not be measured; what is measured has to be one of them.
     unknown = [n for n in flight.outputs if n not in naming.names(model.Outputs)]
     if unknown:
         raise ValueError(
@@ -298,6 +258,18 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
     _check_measured(flight, problem, where)
+    _check_known(flight, problem, where)
+    count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
+    if not flight.hold_out and flight.n_samples < least:
+        raise ValueError(
+            f"{where}: expected at least {least} samples for {count} free parameters, got "
+            f"{flight.n_samples}"
+        )
+
+
+def _check_known(flight: Flight, problem: Problem, where: str) -> None:
+    model = problem.model
+    # What one flight knows cannot be estimated over all of them.
     for name, value in flight.known.items():
         if name not in naming.names(model.Params):
             raise ValueError(
@@ -305,17 +277,12 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
                 f"{nearest(name, naming.names(model.Params))}"
             )
         if name in problem.free or name in problem.noise:
-            raise ValueError(f"{where}, known.{name}: is free as well, wanted is one of the two")
+            raise ValueError(f"{where}, known.{name}: expected known or free, got both")
         if not math.isfinite(value):
-            raise ValueError(f"{where}, known.{name}: found {value}, wanted is a finite number")
+            raise ValueError(f"{where}, known.{name}: expected a finite number, got {value}")
         wrong = impossible({name: value}) if of_helicopter(model.Params) else None
         if wrong:
             raise ValueError(f"{where}, known: {wrong}")
-    if not flight.hold_out and flight.n_samples < 3 * len(problem.free):
-        raise ValueError(
-            f"{where} has {flight.n_samples} samples for {len(problem.free)} free parameters, "
-            f"wanted are {3 * len(problem.free)} at least"
-        )
 
 
 def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
@@ -323,19 +290,21 @@ def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
         missing = float(np.mean(np.isnan(y)))
         if missing > 0.5:
             raise ValueError(
-                f"{where}: output {name!r} is missing in {100 * missing:.0f} % of its samples, "
-                "wanted is at most half"
+                f"{where}, output {name!r}: expected at most half of its samples to be missing, "
+                f"got {100 * missing:.0f} %"
             )
+        # A flight held out is simulated, not weighed: it needs no noise.
         stated = name in flight.sd or flight.hold_out
         if problem.noise_is_fixed and not stated:
             raise ValueError(
-                f"{where}: the noise of output {name!r} is fixed (sigma_y) but not stated, wanted "
-                "is its sd"
+                f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
+                "(sigma_y), got none"
             )
 
 
 def _check_model(problem: Problem) -> None:
     params = problem.start_params()
+    # With what each flight knows: that alone may complete a vehicle.
     for flight in problem.flights:
         missing = needed_but_missing(problem.model, naming.replace(params, **flight.known))
         if missing:
@@ -344,7 +313,7 @@ def _check_model(problem: Problem) -> None:
             )
     if not problem.model.linear:
         _check_start(problem, params)
-    if problem.model.linear and linear_misfit(problem.model, params) > 1e-6:
+    if problem.model.linear and linear_misfit(problem.model, params) > _LINEAR:
         raise ValueError(
             f"model {problem.model.name} says linear=True, but its vector field or output is not "
             "linear in state and inputs at the start values"
@@ -352,10 +321,11 @@ def _check_model(problem: Problem) -> None:
 
 
 def _check_start(problem: Problem, params: Any) -> None:
-    """Refuse a model that cannot begin where it is told to; one of ours begins anywhere."""
+    """Refuse a model that cannot begin at its initial state; one of ours begins anywhere."""
     if of_helicopter(problem.model.Params):
         return
     for flight in problem.flights:
+        # Its first rates depend on the inputs that the flight begins with.
         first = {n: float(u[0]) for n, u in flight.inputs.items()}
         wrong = cannot_start(problem.model, naming.replace(params, **flight.known), first)
         if wrong:

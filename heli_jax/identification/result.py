@@ -1,5 +1,6 @@
 """What a fit gives: plain data."""
 
+import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -16,11 +17,12 @@ from heli_jax.identification.validation.metrics import Metrics, Whiteness
 if TYPE_CHECKING:
     import pandas as pd
 
+# Of a fit that converged too: numbers that the data do not determine are no estimates.
 Status = Literal["converged", "not-converged", "not-identifiable"]
 
 
 class Estimate(NamedTuple):
-    """One estimated number; sd and interval are None where the data do not determine it."""
+    """One estimated number; sd and interval are None where it is not identifiable."""
 
     value: float
     sd: float | None
@@ -28,12 +30,14 @@ class Estimate(NamedTuple):
     upper95: float | None
     unit: str
     start: float
+    """the initial guess"""
     prior_share: float
+    """share of the prior in the posterior precision, 0 to 1"""
     at_bound: bool
     sd_white: float | None = None
     """the Cramer-Rao sd, as if the residuals were white; the same as `sd` where they are"""
     sd_alone: float | None = None
-    """the Cramer-Rao sd if all other unknowns were known (insensitivity)"""
+    """the Cramer-Rao sd if all other unknowns were known: Tischler's insensitivity"""
 
 
 class Signals(NamedTuple):
@@ -42,6 +46,7 @@ class Signals(NamedTuple):
     flight: str
     hold_out: bool
     times: np.ndarray
+    """[s]"""
     inputs: dict[str, np.ndarray]
     measured: dict[str, np.ndarray]
     simulated: dict[str, np.ndarray]
@@ -72,7 +77,10 @@ class Check:
     """sd assumed for each flight and output"""
     notes: tuple[str, ...]
     guessed: tuple[str, ...] = ()
-    """those of them that nobody stated"""
+    """flights and outputs whose noise nobody stated"""
+
+
+# Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +93,7 @@ class Fit:
     n_samples: int
     estimates: dict[str, Estimate]
     nuisance: dict[str, Estimate]
-    params: Any
+    params: Any  # of the model's Params, a class of the user's
     """the vehicle with the estimates in place"""
     verdict_before: Verdict
     verdict: Verdict
@@ -117,7 +125,7 @@ class Fit:
     adequacy: Adequacy = UNJUDGED
     """whether the model explains what was measured, judged against what"""
     coloured: bool = False
-    """whether `sd` and the intervals allow for residuals with a memory (output error)"""
+    """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
@@ -127,9 +135,15 @@ class Fit:
         return METHODS[self.method].label
 
     @property
-    def lost(self) -> tuple[str, ...]:
+    def not_identifiable(self) -> tuple[str, ...]:
         """The free parameters that the data do not determine."""
         return tuple(n for n, e in self.estimates.items() if e.sd is None)
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Deprecated: the name that `not_identifiable` had."""
+        _warn_renamed("lost", "not_identifiable")
+        return self.not_identifiable
 
     @property
     def adequate(self) -> bool:
@@ -139,8 +153,12 @@ class Fit:
     @property
     def disturbable(self) -> bool:
         """Whether filter error could be tried: its model has an axis to disturb and none yet."""
+        # A disturbance on one axis already: its model has all that filter error asks for.
         model = self.reached.layout.model
         return model.noise_intensity is None and bool(disturbable(model))
+
+    # `unknowns` counts noise, disturbance and initial states too: models that differ in these are
+    # compared by differences of the criteria, in which the constants of the likelihood cancel.
 
     @property
     def aic(self) -> float:
@@ -153,21 +171,29 @@ class Fit:
         return self.unknowns * float(np.log(self.n_samples)) - 2.0 * self.log_likelihood
 
     @property
-    def narrow(self) -> bool:
+    def overconfident(self) -> bool:
         """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
         return not self.white and not self.coloured
+
+    @property
+    def narrow(self) -> bool:
+        """Deprecated: the name that `overconfident` had."""
+        _warn_renamed("narrow", "overconfident")
+        return self.overconfident
 
     @property
     def interval(self) -> str:
         """What to call the intervals."""
         if self.coloured:
             return "95 % (coloured residuals)"
-        return "95 % (too narrow)" if self.narrow else "95 % interval"
+        return "95 % (too narrow)" if self.overconfident else "95 % interval"
 
     @property
     def white(self) -> bool:
         """Whether all residuals look white, so that the intervals may be taken at their word."""
         return all(w.white for w in self.whiteness.values())
+
+    # What prints and exports stands above this module in the order of imports, hence inside.
 
     def __repr__(self) -> str:
         from heli_jax.summaries import as_text, of_fit
@@ -189,3 +215,7 @@ class Fit:
         from heli_jax.exports import estimates_frame
 
         return estimates_frame({**self.estimates, **(self.nuisance if nuisance else {})})
+
+
+def _warn_renamed(old: str, new: str) -> None:
+    warnings.warn(f"Fit: {old} is deprecated, expected {new}", DeprecationWarning, stacklevel=3)

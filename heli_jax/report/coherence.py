@@ -11,6 +11,7 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.spectra import segment_transforms
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
@@ -117,20 +118,10 @@ def _spectra(
         duration = length * dt * (least + 1) / 2
         return f"expected {least} segments of {length * dt:.3g} s, a record of {duration:.3g} s"
     channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
-    at = np.arange(segments)[:, None] * (length // 2) + np.arange(length)[None, :]
-    transforms = np.fft.rfft(_detrended(channels[:, at]) * np.hanning(length), axis=-1)[..., 1:-1]
-    transforms = np.moveaxis(transforms, -1, 0)  # (k, channels, segments)
-    omega = 2.0 * np.pi * np.fft.rfftfreq(length, dt)[1:-1]
-    inputs = np.moveaxis(transforms[:, :-2], 1, 2)
-    return _Spectra(omega, inputs, transforms[:, -2], transforms[:, -1])
-
-
-def _detrended(pieces: np.ndarray) -> np.ndarray:
-    """Segments (..., n) less the straight line that fits each best."""
-    # About the middle of a segment, so that mean and slope are orthogonal: two projections.
-    t = np.linspace(-1.0, 1.0, pieces.shape[-1])
-    slopes = (pieces @ t / (t @ t))[..., None]
-    return pieces - pieces.mean(axis=-1, keepdims=True) - slopes * t
+    omega, transforms = segment_transforms(channels, dt, length)
+    # Without the mean, which was taken out, and Nyquist's frequency.
+    omega, transforms = omega[1:-1], transforms[1:-1]
+    return _Spectra(omega, transforms[..., :-2], transforms[..., -2], transforms[..., -1])
 
 
 def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:

@@ -136,9 +136,15 @@ def responses(
     def response(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
         return _transfer(points, A, b, C[i], D[i, j])
 
+    delay = dict(model.delays).get(input)
+    late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
+
+    def turned(omega: np.ndarray, points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return response(points, A, b) * np.exp(-1j * omega * late)
+
     return (
-        lambda omega: response(1j * omega, A, B[:, j]),
-        lambda omega: response(np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
+        lambda omega: turned(omega, 1j * omega, A, B[:, j]),
+        lambda omega: turned(omega, np.exp(1j * omega * dt), held[:n, :n], held[:n, n]),
     )
 
 

@@ -17,10 +17,11 @@ from heli_jax.naming import Record
 from heli_jax.numerics.hoist import hoisted
 from heli_jax.numerics.matrix_exponential import product
 from heli_jax.simulation.blocks import without_next
+from heli_jax.simulation.delays import at
 from heli_jax.simulation.discretize import Discrete, scalars
 from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
 from heli_jax.simulation.options import DEFAULT
-from heli_jax.simulation.solvers import ZeroOrderHoldArgs, advance, at, dot
+from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at, advance, dot
 from heli_jax.simulation.stepping import field_term, held_inputs, per_sample, start_state
 from heli_jax.simulation.wrappers import Accumulating
 
@@ -107,13 +108,14 @@ def accumulated(
     block = options.block
     if block != 1 and (run[1].discrete is None or block < 1):
         raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
-    # Limits are looked at sample by sample, so they take the way of one step a sample.
+    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
+    # inputs, since a block's coefficients know no sample before its first.
     reducer = _Reducer(model, params, update, model.limits if limits else None)
-    if block > 1 and reducer.limits is None:
+    if block > 1 and reducer.limits is None and run[1].delays is None:
         value, state = _in_blocks(reducer, run[1], block, x0, start, data)
         return Accumulated(value, state, {}, dfx.RESULTS.successful)
     adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
-    return _by_samples(reducer, run, x0, start, data, adjoint)
+    return _by_samples(reducer, (*run, linear), x0, start, data, adjoint)
 
 
 class _Reducer(NamedTuple):
@@ -135,14 +137,14 @@ class _Reducer(NamedTuple):
 
 def _by_samples(
     reducer: _Reducer,
-    run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm],
+    run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm, tuple[bool, ...]],
     x0: Record,
     start: PyTree,
     data: PyTree,
     adjoint: dfx.AbstractAdjoint,
 ) -> Accumulated:
     """The run one step a sample."""
-    method, args, term = run
+    method, args, term, linear = run
     model, params, inputs = reducer.model, reducer.params, args.inputs
     n = jax.tree.leaves(inputs)[0].shape[0]
     args = args.in_scalars()
@@ -160,7 +162,7 @@ def _by_samples(
     sol = dfx.diffeqsolve(
         term,
         # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
-        Accumulating(method, lambda *now: reducer(*now)),
+        Accumulating(method, lambda *now: reducer(*now), linear),
         t0=jnp.zeros((), dtype),
         t1=jnp.asarray(n - 1, dtype),
         dt0=jnp.ones((), dtype),
@@ -175,7 +177,8 @@ def _by_samples(
     )
     state, carried = jax.tree.map(lambda v: v[0], sol.ys)
     # The solver updates the value before each step, so the last sample is left.
-    value, outside = reducer(carried, state, at(inputs, n - 1), at(data, n - 1))
+    last = acting_at(args, n - 1, linear)
+    value, outside = reducer(carried, state, last, at(data, n - 1))
     return Accumulated(value, state, {n: v > 0 for n, v in outside.items()}, sol.result)
 
 

@@ -71,9 +71,9 @@ def columns(args: ZeroOrderHoldArgs) -> tuple[Array, Array]:
     if before is None and after is None:
         return B, jnp.stack(jax.tree.leaves(args.inputs), axis=1)
     n = jax.tree.leaves(args.inputs)[0].shape[0]
-    k = jnp.arange(n) if args.delay is None else jnp.arange(n) - args.delay[0]
+    k = jnp.arange(n)
     taps = [(B, k), *((M, k + i) for M, i in ((before, -1), (after, 1)) if M is not None)]
-    U = [u for _, at_k in taps for u in jax.tree.leaves(at(args.inputs, at_k))]
+    U = [u for _, at_k in taps for u in jax.tree.leaves(at(args.inputs, at_k, args.delays))]
     return jnp.concatenate([M for M, _ in taps], axis=1), jnp.stack(U, axis=1)
 
 
@@ -91,8 +91,7 @@ def _next_sample(args: ZeroOrderHoldArgs, like: Record) -> Any:
     """Bn u as a State with arrays (N,), built as `like` is."""
     assert args.discrete is not None
     n = jax.tree.leaves(args.inputs)[0].shape[0]
-    k = jnp.arange(n) if args.delay is None else jnp.arange(n) - args.delay[0]
-    U = jnp.stack(jax.tree.leaves(at(args.inputs, k)), axis=1)
+    U = jnp.stack(jax.tree.leaves(at(args.inputs, jnp.arange(n), args.delays)), axis=1)
     return jax.tree.unflatten(jax.tree.structure(like), list((U @ args.discrete.Bn.T).T))
 
 

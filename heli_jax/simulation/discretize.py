@@ -12,6 +12,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.numerics.matrix_exponential import expm, product, van_loan
+from heli_jax.simulation.delays import Delays
 
 
 class Discrete(NamedTuple):
@@ -36,7 +37,7 @@ def discretize(
     model: Model,
     params: Record,
     dt: Number,
-    late: Number | None = None,
+    delays: Delays | None = None,
     linear: tuple[bool, ...] = (),
 ) -> Discrete:
     """The exact equivalent of a linear model for steps of `dt` [s], in matrices.
@@ -45,21 +46,49 @@ def discretize(
         model: linear, with n states and m inputs.
         params: the model's Params, SI.
         dt: [s].
-        late: [s], within [0, dt]: the part of each interval before the delayed sample u[k] acts.
-            Under a zero-order hold x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] +
-            G(dt-late) u[k].
+        delays: how late the inputs are; whole samples are left to who reads the arrays. With
+            `late` [s] the part of each interval before the delayed sample u[k] acts, under a
+            zero-order hold x[k+1] = Ad x[k] + e^{A (dt-late)} G(late) u[k-1] + G(dt-late) u[k].
         linear: of each input whether it is linear between samples; () holds all.
     """
     A, B, _, _ = jacobians(model, params)
     dt = jnp.asarray(dt, A.dtype)
+    if delays is None:
+        return _once(_discretize(A, B, dt, None, linear))
+    if set(delays.groups) == {0}:
+        return _once(_discretize(A, B, dt, delays.rest[0] * dt, linear))
+    return _once(_by_group(A, B, dt, delays, linear))
+
+
+def _by_group(A: Array, B: Array, dt: Array, delays: Delays, linear: tuple[bool, ...]) -> Discrete:
+    """`discretize` where inputs are late by different times: what they add is superposed, so each
+    group's columns are those of a model with these inputs alone."""
+    zeros = jnp.zeros_like(B)
+    Ad, Bd, Bp, Bn = None, zeros, zeros, zeros if linear else None
+    for group in sorted(set(delays.groups), key=lambda g: -1 if g is None else g):
+        i = np.asarray(delays.members(group))
+        late = None if group is None else delays.rest[group] * dt
+        moving = tuple(linear[j] for j in i) if linear else ()
+        part = _discretize(A, B[:, i], dt, late, moving if any(moving) else ())
+        Ad = part.Ad if Ad is None else Ad
+        Bd = Bd.at[:, i].set(part.Bd)
+        if part.Bp is not None:
+            Bp = Bp.at[:, i].set(part.Bp)
+        if part.Bn is not None and Bn is not None:
+            Bn = Bn.at[:, i].set(part.Bn)
+    return Discrete(Ad, Bd, Bp, Bn)
+
+
+def _discretize(A: Array, B: Array, dt: Array, late: Any, linear: tuple[bool, ...]) -> Discrete:
+    """The matrices for inputs that are late by the same part of a sample, `late` [s]."""
     if linear:
-        return _once(_discretize_ramps(A, B, dt, late, linear))
+        return _discretize_ramps(A, B, dt, late, linear)
     if late is None:
-        return _once(Discrete(*_zero_order_hold(A, B, dt), None))
+        return Discrete(*_zero_order_hold(A, B, dt), None)
     late = jnp.asarray(late, A.dtype)
     # Two exact steps, u[k-1] over the first and u[k] over the second.
     first, second = _zero_order_hold(A, B, late), _zero_order_hold(A, B, dt - late)
-    return _once(Discrete(second[0] @ first[0], second[1], second[0] @ first[1]))
+    return Discrete(second[0] @ first[0], second[1], second[0] @ first[1])
 
 
 def _discretize_ramps(

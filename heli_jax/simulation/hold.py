@@ -4,7 +4,8 @@ A stick that is commanded in steps stays; one that was sampled while it moved do
 an input delays it by half a sample on average.
 """
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import nearest
 from heli_jax.naming import Number, Record
+from heli_jax.simulation.delays import Delays, at
 
 HOLDS = ("zero-order", "linear")
 """The names of what an input may do between samples."""
@@ -68,13 +70,6 @@ def check_hold(value: PyTree, where: str = "hold") -> None:
         raise ValueError(f"{where}: expected one of {', '.join(HOLDS)}, got {value!r:.60}")
 
 
-def at(inputs: PyTree, k: Int[Array, "..."] | int) -> PyTree:
-    """The inputs of sample k; before the first the first, after the last the last."""
-    # Clipped on purpose and in sight: JAX would clip an index past the end, and wrap one below
-    # zero.
-    return jax.tree.map(lambda u: u[jnp.clip(k, 0, u.shape[0] - 1)], inputs)
-
-
 def at_end(inputs: Record, k: Int[Array, "..."] | int, linear: tuple[bool, ...]) -> Record:
     """The inputs at the end of the interval from sample k on, before any of them jumps.
 
@@ -101,7 +96,7 @@ class Segment(NamedTuple):
 def segments(
     inputs: Record,
     dt: Number,
-    delay: tuple[Array, Array] | None,
+    delays: Delays | None,
     k: Int[Array, "..."] | int,
     linear: tuple[bool, ...],
 ) -> list[Segment]:
@@ -110,56 +105,103 @@ def segments(
     Args:
         inputs: arrays (N,).
         dt: [s].
-        delay: None, or the whole samples and the rest in [0, 1) by which the inputs are late: the
-            interval then has two parts, before and after the sample that falls into it.
-        linear: of each input whether it moves between samples.
+        delays: None, or how late the inputs are: the interval then has a part more for each group
+            of them, divided where its sample falls into it.
+        linear: of each input whether it moves between samples; () holds all.
     """
-    if delay is None:
+    linear = linear or (False,) * len(jax.tree.leaves(inputs))
+    if delays is None:
         now = at(inputs, k)
-        return [Segment(dt, now, _slope(linear, now, at(inputs, k + 1), dt))]
-    whole, rest = delay
-    before, now, after = (at(inputs, k - whole + i) for i in (-1, 0, 1))
-    # The interval begins `rest` before sample k - whole: on the line towards it for what moves,
-    # still at the sample before for what is held.
-    begin = _by_hold(linear, lambda a, b: rest * a + (1.0 - rest) * b, before, now)
-    return [
-        Segment(rest * dt, begin, _slope(linear, before, now, dt)),
-        Segment((1.0 - rest) * dt, now, _slope(linear, now, after, dt)),
-    ]
+        return [Segment(jnp.asarray(dt), now, _slope(linear, now, at(inputs, k + 1), dt))]
+    before, now, after = (at(inputs, k + i, delays) for i in (-1, 0, 1))
+    ends, ranks = _divided(delays)
+    parts = []
+    for j, (begin, end) in enumerate(itertools.pairwise(ends)):
+        values, slopes = [], []
+        for i, u in enumerate(
+            zip(*(jax.tree.leaves(v) for v in (before, now, after)), strict=True)
+        ):
+            corner, following, since = _line(delays, i, u, ranks, j)
+            rise = following - corner
+            moves = linear[i]
+            values.append(corner + rise * (begin - since) if moves else corner)
+            slopes.append(rise / dt if moves else jnp.zeros_like(corner))
+        structure = jax.tree.structure(inputs)
+        parts.append(
+            Segment(
+                (end - begin) * dt,
+                jax.tree.unflatten(structure, values),
+                jax.tree.unflatten(structure, slopes),
+            )
+        )
+    return parts
+
+
+def _divided(delays: Delays) -> tuple[list[Any], list[Any]]:
+    """Where an interval is divided [samples], its two ends with it, and the place of each group
+    among the divisions."""
+    if len(delays.rest) == 1:  # nothing to sort, and nothing that depends on a value
+        return [0.0, delays.rest[0], 1.0], [0]
+    rest = jnp.stack(delays.rest)
+    order = jnp.argsort(jax.lax.stop_gradient(rest))
+    inner = rest[order]
+    ranks = jnp.argsort(order)
+    ends = [0.0, *(inner[i] for i in range(len(delays.rest))), 1.0]
+    return ends, [ranks[g] for g in range(len(delays.rest))]
+
+
+def _line(delays: Delays, i: int, u: Any, ranks: list[Any], j: int) -> tuple[Any, Any, Any]:
+    """The two corners of the line that the i-th input follows in the j-th part, and when the first
+    of them was reached [samples, from the begin of the interval].
+
+    By the rank and not by the time: two delays may be the same number.
+    """
+    before, now, after = u
+    group = delays.group(i)
+    if group is None:
+        return now, after, 0.0
+    rest, rank = delays.rest[group], ranks[group]
+    if isinstance(rank, int):
+        return (now, after, rest) if rank < j else (before, now, rest - 1.0)
+    reached = rank < j
+    return (
+        jnp.where(reached, now, before),
+        jnp.where(reached, after, now),
+        jnp.where(reached, rest, rest - 1.0),
+    )
 
 
 def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) -> Record:
-    slopes = _by_hold(linear, lambda a, b: (b - a) / dt, first, second)
-    held = jax.tree.map(jnp.zeros_like, first)
-    return _chosen(linear, slopes, held)
+    slopes = jax.tree.map(lambda a, b: (b - a) / dt, first, second)
+    return _chosen(linear, slopes, jax.tree.map(jnp.zeros_like, first))
 
 
-def delayed(inputs: Record, whole: Array, rest: Array, n: int, linear: tuple[bool, ...]) -> Record:
-    """The inputs that act at the n samples when they are late.
+def delayed(
+    inputs: Record, delays: Delays, k: Int[Array, "..."] | int, linear: tuple[bool, ...]
+) -> Record:
+    """The inputs that act at sample k (an integer or an array of them) when they are late.
 
     Args:
-        inputs: arrays (N,).
-        whole: samples, an integer.
-        rest: the rest of a sample, in [0, 1).
-        n: how many samples.
+        inputs: a pytree of arrays (N,).
+        delays: how late each of them is.
+        k: the samples.
         linear: of each input whether it moves between samples; () holds all.
     """
-    # At the sample itself one that is late by a part of a sample has not arrived: the one before
-    # still acts.
-    k = jnp.arange(n) - whole
-    held = at(inputs, k - (rest > 0).astype(int))
-    if not linear:
-        return held
-    before, now = at(inputs, k - 1), at(inputs, k)
-    between = jax.tree.map(lambda a, b: rest * a + (1.0 - rest) * b, before, now)
-    return _chosen(linear, between, held)
-
-
-def _by_hold(
-    linear: tuple[bool, ...], moving: Callable[..., Any], first: Record, second: Record
-) -> Record:
-    """moving(first, second) for the inputs that are linear, the first for the others."""
-    return _chosen(linear, jax.tree.map(moving, first, second), first)
+    before, now = at(inputs, k - 1, delays), at(inputs, k, delays)
+    acting = []
+    leaves = zip(jax.tree.leaves(before), jax.tree.leaves(now), strict=True)
+    for i, (earlier, current) in enumerate(leaves):
+        group = delays.group(i)
+        if group is None:
+            acting.append(current)
+            continue
+        rest = delays.rest[group]
+        if linear and linear[i]:
+            acting.append(rest * earlier + (1.0 - rest) * current)
+        else:
+            # One that is late by a part of a sample has not arrived at the sample itself.
+            acting.append(jnp.where(rest > 0, earlier, current))
+    return jax.tree.unflatten(jax.tree.structure(inputs), acting)
 
 
 def _chosen(linear: tuple[bool, ...], moving: Record, held: Record) -> Record:

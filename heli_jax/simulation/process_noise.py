@@ -11,9 +11,11 @@ from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
-from heli_jax.naming import Number, Record, Scalar
+from heli_jax.naming import Record, Scalar
 from heli_jax.numerics.matrix_exponential import van_loan
-from heli_jax.simulation.discretize import process_noise, square_root
+from heli_jax.simulation.discretize import Discrete, process_noise, square_root
+from heli_jax.simulation.hold import delayed
+from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.solvers import Exact, ZeroOrderHoldArgs
 from heli_jax.simulation.wrappers import StateFeedback, WithProcessNoise
 
@@ -22,8 +24,8 @@ def with_process_noise(
     model: Model,
     args: ZeroOrderHoldArgs,
     method: dfx.AbstractSolver,
-    dt: Number,
-    key: Array,
+    options: SimulationOptions,
+    linear: tuple[bool, ...],
 ) -> tuple[dfx.AbstractSolver, ZeroOrderHoldArgs]:
     """Standard normal numbers as further inputs, multiplied by a root of the process noise.
 
@@ -31,19 +33,20 @@ def with_process_noise(
         model: one with a noise intensity, n states.
         args: of the run without noise.
         method: the solver of a sample.
-        dt: [s].
-        key: a JAX random key.
+        options: of which dt, delay and key count.
+        linear: of each input whether it moves between samples; () holds all.
 
     Raises:
-        ValueError: the model has no noise, or the run a delay.
+        ValueError: the model has no noise, or the options a delay.
     """
+    assert options.key is not None
     if model.noise_intensity is None:
         raise ValueError(
             f"key: expected a model with process noise, as with_disturbance makes one, got "
             f"{model.name!r}"
         )
-    # A delay cuts an interval in two, and both parts would have to have noise of their own.
-    if args.delay is not None:
+    # A delay of all inputs is for records: nothing is drawn for them.
+    if options.delay is not None:
         raise ValueError(
             "key: expected a run without a delay to draw noise for, got one with delay"
         )
@@ -52,19 +55,26 @@ def with_process_noise(
     # Drawn for all samples at once: the same key gives the same record, whatever the solver does.
     if not isinstance(method, Exact) or args.discrete is None:
         feedback = method.feedback if isinstance(method, StateFeedback) else None
-        draws = jax.random.normal(key, (n, states), dtype)
-        args = args._replace(inputs=(args.inputs, tuple(draws.T)))
+        draws = jax.random.normal(options.key, (n, states), dtype)
+        acting = args.inputs
+        if args.delays is not None:
+            # The model is linearised about the inputs as they act, which are read from here.
+            acting = delayed(args.inputs, args.delays, jnp.arange(n), linear)
+        args = args._replace(inputs=(args.inputs, acting, tuple(draws.T)))
         return WithProcessNoise(
             method, functools.partial(add_process_noise, model, args, feedback)
         ), args
     # The recurrence of a linear model takes draws as it takes inputs: L beside Bd, no step more.
-    L = square_root(process_noise(model, args.params, dt))
-    draws = jax.random.normal(key, (n, L.shape[0]), L.dtype)
-    discrete = args.discrete._replace(Bd=jnp.concatenate([args.discrete.Bd, L], axis=1))
-    if discrete.Bn is not None:
-        # The draws are no inputs: nothing of them comes from the next sample.
-        Bn = jnp.concatenate([discrete.Bn, jnp.zeros_like(L)], axis=1)
-        discrete = discrete._replace(Bn=Bn)
+    L = square_root(process_noise(model, args.params, options.dt))
+    draws = jax.random.normal(options.key, (n, L.shape[0]), L.dtype)
+    # The draws are no inputs: nothing of them comes late or from the next sample.
+    none, discrete = jnp.zeros_like(L), args.discrete
+    discrete = Discrete(
+        discrete.Ad,
+        jnp.concatenate([discrete.Bd, L], axis=1),
+        None if discrete.Bp is None else jnp.concatenate([discrete.Bp, none], axis=1),
+        None if discrete.Bn is None else jnp.concatenate([discrete.Bn, none], axis=1),
+    )
     return method, args._replace(inputs=(args.inputs, tuple(draws.T)), discrete=discrete)
 
 

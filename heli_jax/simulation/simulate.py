@@ -14,17 +14,17 @@ from heli_jax.dynamics.check_model import explained
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import blockwise
+from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.events import NO_END, Event, any_over, stopped
-from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
+from heli_jax.simulation.hold import FlightOrInputs, delayed, linear_inputs
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.process_noise import with_process_noise
 from heli_jax.simulation.solvers import (
     Adaptive,
     Exact,
     ZeroOrderHoldArgs,
-    at,
 )
-from heli_jax.simulation.stepping import acting_inputs, held_inputs, per_sample, start_state
+from heli_jax.simulation.stepping import held_inputs, per_sample, start_state
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.simulation.wrappers import StateFeedback, Stopping
 
@@ -74,7 +74,7 @@ def simulate(
     x0 = start_state(model, params, options.initial_state, inputs)
     run = _method_with_extras(model, params, inputs, options, linear)
     states, result = _states(run, x0, inputs, options, linear)
-    acting = _acting(inputs, states, options, linear)
+    acting = _acting(inputs, states, options, run[1].delays, linear)
     times = _times(inputs, dt)
     end = NO_END
     if options.events:
@@ -102,18 +102,18 @@ def _method_with_extras(
         # A step of the controller's choice would have noise of another covariance.
         raise ValueError("key: expected fixed steps to draw noise with, got a step-size controller")
     if options.feedback is not None:
-        _check_feedback(options, linear)
+        _check_feedback(args.delays, linear)
         method = StateFeedback(method, options.feedback)
     # Around the feedback, not within: the noise comes after the step that the feedback drove.
     if options.key is not None:
-        method, args = with_process_noise(model, args, method, options.dt, options.key)
+        method, args = with_process_noise(model, args, method, options, linear)
     return method, args, term
 
 
-def _check_feedback(options: SimulationOptions, linear: tuple[bool, ...]) -> None:
+def _check_feedback(delays: Delays | None, linear: tuple[bool, ...]) -> None:
     # Feedback is a function of the state at the sample and is held from there: a late input, or one
     # on its way to the next sample's, would need a state that is not there yet.
-    if options.delay is not None:
+    if delays is not None:
         raise ValueError("feedback: expected a run without a delay, got one with delay")
     if linear:
         raise ValueError(
@@ -149,16 +149,19 @@ def _states(
 
 
 def _acting(
-    inputs: Record, states: Record, options: SimulationOptions, linear: tuple[bool, ...]
+    inputs: Record,
+    states: Record,
+    options: SimulationOptions,
+    delays: Delays | None,
+    linear: tuple[bool, ...],
 ) -> Any:
     """The inputs (N,) as they acted: late, or with the feedback's part."""
     # Computed again from the states, which is cheaper than to carry them through the loop.
     if options.feedback is not None:
         return jax.vmap(options.feedback)(states, inputs)
-    if options.delay is None:
+    if delays is None:
         return inputs
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    return acting_inputs(inputs, options.dt, options.delay, n, linear)
+    return delayed(inputs, delays, jnp.arange(jax.tree.leaves(inputs)[0].shape[0]), linear)
 
 
 def _times(inputs: Record, dt: Number) -> Float[Array, " N"]:

@@ -12,26 +12,30 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from heli_jax.errors import nearest
-from heli_jax.naming import Number, Record, Scalar
+from heli_jax.naming import Record, Scalar
+from heli_jax.simulation.delays import Delays, at
 from heli_jax.simulation.discretize import Discrete
-from heli_jax.simulation.hold import at, segments
+from heli_jax.simulation.hold import delayed, segments
+
+type Time = Real[Array, ""] | Real[np.ndarray, ""] | int | float
+"""as diffrax takes it, which has no NumPy scalars among its types"""
 
 
 class ZeroOrderHoldArgs(NamedTuple):
     """What a step needs to know: the parameters and the inputs, sample by sample.
 
-    `inputs` holds arrays (N,). `delay` is None, or the whole samples (integer) and the rest
-    (fraction of a sample in [0, 1)) by which the inputs act later than given. `dt` [s] is the
-    sample time.
+    `inputs` holds arrays (N,). `delays` is None, or by how many samples each of them acts later
+    than given. `dt` [s] is the sample time.
     """
 
     params: Record
     inputs: Record
     dt: Array
-    delay: tuple[Array, Array] | None
+    delays: Delays | None
     discrete: Discrete | None
 
     def in_scalars(self) -> "ZeroOrderHoldArgs":
@@ -39,6 +43,19 @@ class ZeroOrderHoldArgs(NamedTuple):
         if self.discrete is None:
             return self
         return self._replace(discrete=self.discrete.in_scalars())
+
+
+def acting_at(args: ZeroOrderHoldArgs, k: Int[Array, ""] | int, linear: tuple[bool, ...]) -> Record:
+    """The inputs as they act at sample k.
+
+    Args:
+        args: with the model's inputs, nothing beside them.
+        k: the sample.
+        linear: of each input whether it is linear between samples; () holds all.
+    """
+    if args.delays is None:
+        return at(args.inputs, k)
+    return delayed(args.inputs, args.delays, k, linear)
 
 
 class IntervalArgs(NamedTuple):
@@ -56,13 +73,13 @@ class RampArgs(NamedTuple):
     inputs: Record
     slope: Record
 
-    def after(self, t: Number) -> "RampArgs":
+    def after(self, t: Time) -> "RampArgs":
         """As of t [s] later."""
         inputs = jax.tree.map(lambda u, slope: u + slope * t, self.inputs, self.slope)
         return self._replace(inputs=inputs)
 
 
-def sample_index(t: Number) -> Int[Array, ""]:
+def sample_index(t: Time) -> Int[Array, ""]:
     """The sample that an interval begins with, from its time in samples."""
     # Time is counted in samples: a rounding error short of a whole number is that number.
     return jnp.floor(t + 1e-3).astype(int)
@@ -81,9 +98,7 @@ class _Stateless(dfx.AbstractSolver):
         dfx.LocalLinearInterpolation
     )
 
-    def init(
-        self, terms: dfx.AbstractTerm, t0: Number, t1: Number, y0: PyTree, args: PyTree
-    ) -> None:
+    def init(self, terms: dfx.AbstractTerm, t0: Time, t1: Time, y0: PyTree, args: PyTree) -> None:
         return None
 
 
@@ -95,7 +110,7 @@ class SolverWrapper(_Stateless):
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         return self.solver.order(terms)
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return y0
 
 
@@ -106,14 +121,14 @@ class Exact(_Stateless):
         # No error to have an order: diffrax takes None where nobody asks for one.
         return None
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0))))
 
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -121,12 +136,11 @@ class Exact(_Stateless):
     ) -> Any:
         assert args.discrete is not None
         # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
-        k = sample_index(t0)
-        if args.delay is not None:
-            k = k - args.delay[0]
-        before = None if args.delay is None else jax.tree.leaves(at(args.inputs, k - 1))
-        after = None if args.discrete.Bn is None else jax.tree.leaves(at(args.inputs, k + 1))
-        u = jax.tree.leaves(at(args.inputs, k))
+        k, late = sample_index(t0), args.delays
+        ahead = args.discrete.Bn is not None
+        before = None if late is None else jax.tree.leaves(at(args.inputs, k - 1, late))
+        after = jax.tree.leaves(at(args.inputs, k + 1, late)) if ahead else None
+        u = jax.tree.leaves(at(args.inputs, k, late))
         new = advance(args.discrete, jax.tree.leaves(y0), u, before, after)
         y1 = jax.tree.unflatten(jax.tree.structure(y0), new)
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
@@ -180,14 +194,14 @@ class RK4(_Stateless):
     def order(self, terms: dfx.AbstractTerm) -> int:
         return 4
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: PyTree,
         solver_state: PyTree,
@@ -197,12 +211,12 @@ class RK4(_Stateless):
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
         # which XLA does not fuse into one loop over a batch of vehicles.
-        def f(t: Number, y: PyTree) -> Any:
+        def f(t: Time, y: PyTree) -> Any:
             # Behind a barrier each slope is computed once: without it XLA computes all of them
             # again for every state variable.
             return jax.lax.optimization_barrier(terms.vf(t, y, args))
 
-        def along(y: PyTree, slope: PyTree, step: Number) -> PyTree:
+        def along(y: PyTree, slope: PyTree, step: Time) -> PyTree:
             return jax.tree.map(lambda a, b: a + step * b, y, slope)
 
         # The slopes at t0, twice halfway and at t1; weights 1, 2, 2, 1 over 6.
@@ -220,7 +234,7 @@ class RK4(_Stateless):
 
     @staticmethod
     def _rolled(
-        f: Callable[..., Any], along: Callable[..., Any], t0: Number, h: Array, y0: PyTree
+        f: Callable[..., Any], along: Callable[..., Any], t0: Time, h: Array, y0: PyTree
     ) -> PyTree:
         # Stage i stands on the slope of stage i - 1 alone, so a loop can carry it; the first has a
         # reach of zero, and any slope will do.
@@ -251,7 +265,7 @@ class PerSample(SolverWrapper):
     linear: tuple[bool, ...] = eqx.field(static=True, default=(), kw_only=True)
     """of each input whether it is linear between samples; () holds all"""
 
-    def func(self, terms: dfx.AbstractTerm, t0: Number, y0: PyTree, args: PyTree) -> Any:
+    def func(self, terms: dfx.AbstractTerm, t0: Time, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(
             terms, t0, y0, IntervalArgs(args.params, at(args.inputs, sample_index(t0)))
         )
@@ -259,8 +273,8 @@ class PerSample(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -275,19 +289,13 @@ class PerSample(SolverWrapper):
 
     def _parts(self, args: ZeroOrderHoldArgs, k: Int[Array, ""]) -> list[_Part]:
         """The parts of the interval from sample k on: how long [s], and with which inputs."""
-        # A line across a sample is one part; late by a fraction, it bends within the interval.
+        # A line across a sample is one part; late by a fraction, it bends within the interval. Each
+        # part has its own steps and ends where an input jumps: a step across the jump would be of
+        # first order, whatever the method's.
+        parts = segments(args.inputs, args.dt, args.delays, k, self.linear)
         if self.linear:
-            parts = segments(args.inputs, args.dt, args.delay, k, self.linear)
             return [(p.length, RampArgs(args.params, p.inputs, p.slope)) for p in parts]
-        if args.delay is None:
-            return [(args.dt, IntervalArgs(args.params, at(args.inputs, k)))]
-        # Each part has its own steps and ends where the input jumps: a step across the jump would
-        # be of first order, whatever the method's.
-        whole, rest = args.delay
-        return [
-            (rest * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole - 1))),
-            ((1.0 - rest) * args.dt, IntervalArgs(args.params, at(args.inputs, k - whole))),
-        ]
+        return [(p.length, IntervalArgs(args.params, p.inputs)) for p in parts]
 
     def _steps(
         self, terms: dfx.AbstractTerm, h: Array, y0: PyTree, now: IntervalArgs | RampArgs

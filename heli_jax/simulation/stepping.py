@@ -13,10 +13,19 @@ from heli_jax import naming
 from heli_jax.dynamics.model import Model
 from heli_jax.naming import Number, Record
 from heli_jax.simulation.blocks import columns
+from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import discretize
 from heli_jax.simulation.hold import FlightOrInputs, delayed
 from heli_jax.simulation.options import SimulationOptions
-from heli_jax.simulation.solvers import RK4, Adaptive, Exact, PerSample, RampArgs, ZeroOrderHoldArgs
+from heli_jax.simulation.solvers import (
+    RK4,
+    Adaptive,
+    Exact,
+    PerSample,
+    RampArgs,
+    Time,
+    ZeroOrderHoldArgs,
+)
 
 
 def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tuple[Record, Number]:
@@ -116,18 +125,17 @@ def per_sample(
             "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
             f"{options.solver!r}"
         )
-    parts = None if options.delay is None else split_delay(options.delay, options.dt)
+    delays = delays_of(model, params, options.delay, options.dt)
 
     term = field_term(model, model.vector_field)
     dt = jnp.asarray(options.dt, jax.tree.leaves(inputs)[0].dtype)
     if isinstance(method, Exact):
         # Discretised once, outside the loop: the parameters do not change during a run.
-        late = None if parts is None else parts[1] * dt
-        discrete = discretize(model, params, dt, late, linear)
-        return method, ZeroOrderHoldArgs(params, inputs, dt, parts, discrete), term
+        discrete = discretize(model, params, dt, delays, linear)
+        return method, ZeroOrderHoldArgs(params, inputs, dt, delays, discrete), term
     if options.substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {options.substeps}")
-    args = ZeroOrderHoldArgs(params, inputs, dt, parts, None)
+    args = ZeroOrderHoldArgs(params, inputs, dt, delays, None)
     if controller is None:
         return PerSample(method, options.substeps, linear=linear), args, term
     adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
@@ -141,7 +149,7 @@ class _Field(eqx.Module):
     State: type = eqx.field(static=True)
     vector_field: Callable[[Any, Any, Any], Any] = eqx.field(static=True)
 
-    def __call__(self, t: Number, x: PyTree, now: PyTree) -> PyTree:
+    def __call__(self, t: Time, x: PyTree, now: PyTree) -> PyTree:
         # What is beside the state (a running value, whether it goes on) does not change with time.
         if not isinstance(x, self.State):
             return jax.tree.map(jnp.zeros_like, x)
@@ -185,30 +193,7 @@ def held_columns(
     _, args, _ = per_sample(model, params, inputs, options, linear)
     assert args.discrete is not None
     B, U = columns(args)
-    n = U.shape[0]
-    acting = inputs if delay is None else acting_inputs(inputs, dt, delay, n, linear)
+    acting = inputs
+    if args.delays is not None:
+        acting = delayed(inputs, args.delays, jnp.arange(U.shape[0]), linear)
     return args.discrete.Ad, U @ B.T, jnp.stack(jax.tree.leaves(acting), axis=1)
-
-
-def split_delay(delay: Number, dt: Number) -> tuple[Array, Array]:
-    """A delay as whole samples and the rest as a fraction of a sample in [0, 1)."""
-    # The whole samples are an index and have no derivative; all of it is in the rest, so that a fit
-    # can find a delay of several samples.
-    samples = jnp.asarray(delay) / dt
-    whole = jnp.floor(jax.lax.stop_gradient(samples))
-    return whole.astype(int), samples - whole
-
-
-def acting_inputs(
-    inputs: Record, dt: Number, delay: Number, n: int, linear: tuple[bool, ...] = ()
-) -> Record:
-    """The inputs that act at the n samples when they come late.
-
-    Args:
-        inputs: arrays (N,).
-        dt: [s].
-        delay: [s], also negative.
-        n: how many samples.
-        linear: of each input whether it is linear between samples; () holds all.
-    """
-    return delayed(inputs, *split_delay(delay, dt), n, linear)

@@ -13,9 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from heli_jax.naming import Number
-from heli_jax.simulation.hold import at, at_end
-from heli_jax.simulation.solvers import SolverWrapper, ZeroOrderHoldArgs, sample_index
+from heli_jax.simulation.delays import at
+from heli_jax.simulation.hold import at_end
+from heli_jax.simulation.solvers import (
+    SolverWrapper,
+    Time,
+    ZeroOrderHoldArgs,
+    acting_at,
+    sample_index,
+)
 
 # The arguments of `step` are diffrax's: terms, the interval [t0, t1] in samples, the state at its
 # begin, and what is known beside it; none of the solvers here keeps a state between steps.
@@ -32,8 +38,8 @@ class StateFeedback(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -57,8 +63,8 @@ class Stopping(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
@@ -78,8 +84,8 @@ class Stopping(SolverWrapper):
 class WithProcessNoise(SolverWrapper):
     """A per-sample solver whose state gets its process noise after every sample.
 
-    The inputs are (the model's, standard normal numbers); add_noise(state, held inputs, numbers
-    of that sample) gives the new state.
+    The inputs are (the model's, the same as they act, standard normal numbers); add_noise(state,
+    acting inputs, numbers of that sample) gives the new state.
     """
 
     add_noise: Callable[..., Any]
@@ -87,19 +93,19 @@ class WithProcessNoise(SolverWrapper):
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: ZeroOrderHoldArgs,
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
         # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
-        inputs, draws = args.inputs
+        inputs, acting, draws = args.inputs
         held = args._replace(inputs=inputs)
         y, _, _, _, result = self.solver.step(terms, t0, t1, y0, held, None, made_jump)
         k = sample_index(t0)
-        y1 = self.add_noise(y, at(inputs, k), at(draws, k))
+        y1 = self.add_noise(y, at(acting, k), at(draws, k))
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
 
@@ -111,12 +117,14 @@ class Accumulating(SolverWrapper):
     """
 
     update: Callable[..., Any] = eqx.field(static=True)
+    linear: tuple[bool, ...] = eqx.field(static=True, default=())
+    """of each input whether it moves between samples; () holds all"""
 
     def step(
         self,
         terms: dfx.AbstractTerm,
-        t0: Number,
-        t1: Number,
+        t0: Time,
+        t1: Time,
         y0: PyTree,
         args: PyTree,
         solver_state: PyTree,
@@ -127,7 +135,7 @@ class Accumulating(SolverWrapper):
         # Before the step: the outputs of a sample belong to the state at its beginning. Whoever
         # runs this has to add the last sample, which no step begins with.
         k = sample_index(t0)
-        value = self.update(value, state, at(held.inputs, k), at(data, k))
+        value = self.update(value, state, acting_at(held, k, self.linear), at(data, k))
         state, _, _, _, result = self.solver.step(terms, t0, t1, state, held, None, made_jump)
         y1 = (state, value)
         return y1, None, {"y0": y0, "y1": y1}, None, result

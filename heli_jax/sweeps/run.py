@@ -153,7 +153,7 @@ def _notes(job: Job) -> list[str]:
     delayed = [
         f"reduce.{n}: the margins are those of the loop without the delay"
         for n, r in job.reduce.items()
-        if r.how == "margins" and "delay" in job.design.names
+        if r.how == "margins" and ("delay" in job.design.names or job.model.delays)
     ]
     return [*without_effect, *delayed]
 

@@ -253,10 +253,11 @@ class Worker:
         return results
 
     def _impossible(self, columns: dict[str, np.ndarray]) -> np.ndarray:
-        """Which elements are no helicopter that can be, by their parameters alone."""
+        """Which elements are no machine that can be, by their parameters alone."""
         count = len(next(iter(columns.values())))
         if not of_helicopter(self.job.model.Params):
-            return np.zeros(count, bool)
+            positive = [columns[n] for n in self.job.model.positive if n in columns]
+            return np.any([~(v > 0) for v in positive], axis=0) | np.zeros(count, bool)
         swept = {n: columns[n] for n in columns if n in self.job.params}
         # The ends of the paddle are judged together.
         both = {n: self.job.params[n] for n in ("R1", "R2") if swept.keys() & {"R1", "R2"}}

@@ -124,10 +124,10 @@ WRONG = [
     ([np.inf], [1.0, 2.0], 0.1, "finite numbers"),
     ([[1.0, 2.0]], [1.0, 2.0], 0.1, "lists of finite numbers"),
     ([1.0], [[1.0], [2.0]], 0.1, "lists of finite numbers"),
-    ([1.0], [1.0, 2.0], 0.0, "dt is 0.0, wanted is a sample time"),
-    ([1.0], [1.0, 2.0], -0.1, "dt is -0.1"),
-    ([1.0], [1.0, 2.0], np.nan, "dt is nan"),
-    ([1.0], [1.0, 2.0], np.inf, "dt is inf"),
+    ([1.0], [1.0, 2.0], 0.0, "dt must be above zero, .* got 0.0"),
+    ([1.0], [1.0, 2.0], -0.1, "dt must be .* got -0.1"),
+    ([1.0], [1.0, 2.0], np.nan, "dt must be .* got nan"),
+    ([1.0], [1.0, 2.0], np.inf, "dt must be .* got inf"),
 ]
 
 
@@ -139,7 +139,7 @@ def test_wrong_arguments(go, num, den, dt, said):
 
 
 def test_wrong_method():
-    with pytest.raises(ValueError, match="unknown method 'tustin': use 'zoh' or 'real-log'"):
+    with pytest.raises(ValueError, match="method: expected 'zoh' or 'real-log', got 'tustin'"):
         d2c([1.0], [1.0, -0.5], 0.1, method="tustin")
 
 

@@ -337,11 +337,11 @@ def test_an_integrator_that_the_loop_sees_with_the_wrong_sign():
 
 def test_shapes_are_named():
     A, B, C, D = loop([1.0], [1.0, 1.0, 1.0])
-    with pytest.raises(ValueError, match="A has shape"):
+    with pytest.raises(ValueError, match="A: expected shape"):
         margins(A[0], B, C, D)
-    with pytest.raises(ValueError, match="B has shape"):
+    with pytest.raises(ValueError, match="B: expected shape"):
         margins(A, B[..., None], C, D)
-    with pytest.raises(ValueError, match="D has shape"):
+    with pytest.raises(ValueError, match="D: expected shape"):
         margins(A, B, C, 0.0)
-    with pytest.raises(ValueError, match="gain has shape"):
+    with pytest.raises(ValueError, match="gain: expected a number or shape"):
         margins(A, B, C, D, [1.0, 2.0])

@@ -87,8 +87,14 @@ def test_coloured_residuals_are_told(white):
 
 
 def test_a_name_that_is_not_free_is_refused(white):
-    with pytest.raises(ValueError, match="profile of mass: wanted is one of Ixx, If, kappa"):
+    with pytest.raises(ValueError, match="profile: expected one of Ixx, If, kappa, got mass"):
         intervals(white, profiles=["mass"])
+
+
+def test_the_old_names_of_a_fits_properties_warn(white):
+    for old, new in (("lost", "not_identifiable"), ("narrow", "overconfident")):
+        with pytest.warns(DeprecationWarning, match=f"Fit: {old} is deprecated, expected {new}"):
+            assert getattr(white, old) == getattr(white, new)
 
 
 def test_nothing_is_computed_where_the_data_leave_a_parameter_open(white):

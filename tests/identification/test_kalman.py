@@ -153,3 +153,14 @@ def test_the_extended_filter_of_a_linear_model_is_the_linear_one(bench30, poles,
     for n, sd in SD.items():
         np.testing.assert_allclose(extended.error[n], exact.error[n], rtol=1e-10, atol=1e-10 * sd)
         np.testing.assert_allclose(extended.variance[n], exact.variance[n], rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({}, "expected dt, .* got None"), ({"dt": DT, "solver": "rk4"}, "expected no solver")],
+)
+def test_an_option_of_simulations_alone_is_refused(bench30, options, message):
+    model, params, u, y = case(bench30, 1)
+    inputs = model.Inputs(x_roll=jnp.asarray(u))
+    with pytest.raises(TypeError, match=message):
+        innovations(model, params, inputs, y, SD, **options)

@@ -8,7 +8,7 @@ import pytest
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit, models
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
 from heli_jax.identification.unknowns.layout import layout_of
@@ -57,7 +57,7 @@ def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
         assert e.value == pytest.approx(offset, abs=4 * e.sd)
     # The derivatives of many windows at once are the derivatives.
     at = found.reached
-    J = np.asarray(slopes(at.layout, at.data, at.noise, at.z).J)
+    J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
     column = at.layout.size - 1
     h = 1e-4
     low, high = (rows_of(at.layout, at.data, at.noise, at.z.at[column].add(s)) for s in (-h, h))

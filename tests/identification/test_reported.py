@@ -5,8 +5,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
-from heli_jax.identification.identifiability.analysis import analyse
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 from heli_jax.identification.uncertainty.autocorrelated_residuals import residual_curvature
 from tests.identification.bench import BENCH, response, steps, vehicle
@@ -67,10 +66,12 @@ def test_the_residuals_part_of_the_hessian_is_that_of_finite_differences(found):
 
     def cost(i, j, a, b):
         z = at.z.at[i].add(a).at[j].add(b)
-        return 0.5 * float(np.sum(np.square(slopes(at.layout, at.data, at.noise, z).r)))
+        return 0.5 * float(
+            np.sum(np.square(residual_and_jacobian(at.layout, at.data, at.noise, z).r))
+        )
 
     h = 2e-3
-    J = np.asarray(slopes(at.layout, at.data, at.noise, at.z).J)
+    J = np.asarray(residual_and_jacobian(at.layout, at.data, at.noise, at.z).J)
     hessian = J.T @ J + residual_curvature(at.layout, at.data, at.noise, at.z)
     scale = np.linalg.norm(J, axis=0)
     for i, j in ((0, 0), (0, 2), (1, 2), (2, 4)):

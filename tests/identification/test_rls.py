@@ -190,10 +190,10 @@ def test_many_at_once_equal_one_by_one():
 @pytest.mark.parametrize(
     ("u", "y", "order", "said"),
     [
-        (np.ones(50), np.ones(50), 0, "order is 0, wanted is at least 1"),
-        (np.ones(50), np.ones(49), 4, r"u has shape \(50,\) and y \(49,\)"),
-        (np.ones((50, 1)), np.ones((50, 1)), 4, r"wanted is \(N,\)"),
-        (np.ones(8), np.ones(8), 4, "8 samples for order 4, wanted are 9"),
+        (np.ones(50), np.ones(50), 0, "order must be at least 1, got 0"),
+        (np.ones(50), np.ones(49), 4, r"for both, got \(50,\) and \(49,\)"),
+        (np.ones((50, 1)), np.ones((50, 1)), 4, r"expected shape \(N,\)"),
+        (np.ones(8), np.ones(8), 4, "at least 9 samples for order 4, got 8"),
     ],
 )
 def test_wrong_arguments(u, y, order, said):

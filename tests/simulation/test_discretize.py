@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from heli_jax import Helicopter, models, naming
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.numerics.matrix_exponential import expm, van_loan
+from heli_jax.simulation.delays import Delays
 from heli_jax.simulation.discretize import (
     discretize,
     process_noise,
@@ -151,7 +152,9 @@ def test_derivative_is_frechets(directional, size, spread):
 
 @pytest.fixture(scope="module")
 def stand_discrete():
-    return jax.jit(lambda p, dt, late: discretize(models.roll_on_stand, p, dt, late))
+    return jax.jit(
+        lambda p, dt, rest: discretize(models.roll_on_stand, p, dt, Delays((0,), (0,), (rest,)))
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -159,7 +162,7 @@ def stand_discrete():
 def test_discretisation_with_a_late_input(stand_discrete, seed, late):
     v, dt = scattered(seed), 0.02
     A, B = matrices(v, True)
-    found = stand_discrete(Helicopter(**v), jnp.asarray(dt), jnp.asarray(late * dt))
+    found = stand_discrete(Helicopter(**v), jnp.asarray(dt), jnp.asarray(late))
 
     def held(t):
         M = np.zeros((5, 5))

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import get_lapack_funcs
 
 from heli_jax import naming
@@ -17,7 +18,22 @@ from heli_jax.identification.equation_error.rls import rls, transfer_function
 from heli_jax.identification.validation.metrics import NO_METRICS, Metrics, metrics, whiteness
 from heli_jax.vehicle import of_helicopter
 
+# scipy.linalg.solve_banded knows no triangular case and would factorise; this one only substitutes.
 _solve_banded: Any = get_lapack_funcs("tbtrs")
+
+_P0 = 1e12
+"""initial variance of every coefficient, of signals scaled to unit rms: nothing is known of it"""
+_PER_ORDER = 10
+"""samples in a row for each order that a record needs at least"""
+_MEANT = 0.05
+"""part by which the coefficient of s^2 may miss what the structure of eq. 23 asks for"""
+_STARTING = 100
+"""first samples, at most, whose errors are those of a P that has not yet fallen"""
+_WORSE = 1.5
+"""times the error of one step ahead from which on a simulation's error tells of a bias"""
+
+
+# The parameters of a model are a class of the user's: `Any` here stands for them alone.
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,36 +73,27 @@ def baseline(
 ) -> Baseline:
     """RLS of one flight: its first output (an angle before its rate) from its first input.
 
-    Both signals are scaled to unit rms, so that P(0) = 1e12 I means the same whatever the units;
-    Theta is scaled back. The first samples, whose past was not recorded, only serve as past.
+    The first samples, whose past was not recorded, only serve as past.
+
+    Args:
+        model: names the signals, and says whether physical parameters can be read off.
+        params: the vehicle, for its geometry and rotor speed.
+        flight: the record.
+        order: n of Hd(z); the paper's is 4.
+        forgetting: in (0, 1]; a sample j steps ago weighs forgetting^j.
 
     Raises:
         ValueError: too few samples in a row.
     """
     output = _output(model, flight)
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
-    part = _longest_whole(flight.outputs[output])
-    if part.stop - part.start < 10 * order:
-        raise ValueError(
-            f"the longest stretch of {output} without a missing sample has {part.stop - part.start}"
-            f", wanted for order {order} are {10 * order}"
-        )
+    part = _whole_part(flight, output, order)
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
-    u_scale, y_scale = _rms(u), _rms(y)
-    run = rls(
-        jnp.asarray(u / u_scale),
-        jnp.asarray(y / y_scale),
-        order=order,
-        forgetting=jnp.asarray(forgetting),
-        p0=jnp.asarray(1e12),
-    )
-    back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
-    history = np.asarray(run.history) * back
+    history, errors = _scaled_rls(u, y, order, forgetting)
     theta = history[-1]
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
     poles = np.roots(den)
-    with np.errstate(all="ignore"):
-        simulated = _simulate(num, den, u, y)
+    simulated = _simulate(num, den, u, y)
     continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     agreement = _metrics(y, simulated)
@@ -95,7 +102,7 @@ def baseline(
         *_stability(poles),
         *([note] if note else []),
         *doubts,
-        *_bias(np.asarray(run.error)[order:] * y_scale, simulated, y, agreement),
+        *_bias(errors, y, agreement),
     ]
     return Baseline(
         flight=flight.name or "flight 1",
@@ -123,8 +130,39 @@ def baseline(
     )
 
 
-def _longest_whole(y: np.ndarray) -> slice:
+def _scaled_rls(
+    u: Float[np.ndarray, " N"], y: Float[np.ndarray, " N"], order: int, forgetting: float
+) -> tuple[Float[np.ndarray, "N q"], Float[np.ndarray, " k"]]:
+    """The history of Theta, and the errors of one step ahead in the unit of y."""
+    # To unit rms, so that P(0) means the same whatever the units.
+    u_scale, y_scale = _rms(u), _rms(y)
+    run = rls(
+        jnp.asarray(u / u_scale),
+        jnp.asarray(y / y_scale),
+        order=order,
+        # As arrays: as numbers they would be constants of a program for each value.
+        forgetting=jnp.asarray(forgetting),
+        p0=jnp.asarray(_P0),
+    )
+    # Coefficients of past outputs have no unit, those of inputs that of y over u.
+    back = np.r_[np.ones(order), np.full(order + 1, y_scale / u_scale)]
+    return np.asarray(run.history) * back, np.asarray(run.error)[order:] * y_scale
+
+
+def _whole_part(flight: Flight, output: str, order: int) -> slice:
+    """The samples that RLS can use: it needs every one of its regressor."""
+    part = _longest_whole(flight.outputs[output])
+    count, least = part.stop - part.start, _PER_ORDER * order
+    if count < least:
+        raise ValueError(
+            f"{output}: expected at least {least} samples in a row for order {order}, got {count}"
+        )
+    return part
+
+
+def _longest_whole(y: Float[np.ndarray, " N"]) -> slice:
     """The longest stretch without a missing sample."""
+    # A missing sample before the first and after the last: each stretch then has both its ends.
     edges = np.flatnonzero(np.diff(np.concatenate([[True], np.isnan(y), [True]]).astype(int)))
     if not edges.size:
         return slice(0, 0)
@@ -143,29 +181,38 @@ def _gaps(flight: Flight, output: str, part: slice) -> list[str]:
     ]
 
 
-def _rms(signal: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(signal**2))) or 1.0
+def _rms(signal: Float[np.ndarray, " N"]) -> float:
+    return float(np.sqrt(np.mean(signal**2))) or 1.0  # a silent signal is left as it is
 
 
-def _simulate(num: np.ndarray, den: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _simulate(
+    num: Float[np.ndarray, " n"],
+    den: Float[np.ndarray, " n"],
+    u: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, " N"],
+) -> Float[np.ndarray, " N"]:
     """Hd driven by the whole input, started from the first measured outputs."""
     n = den.size - 1
     forced = np.convolve(u, num / den[0])[n : u.size]
     band = np.tile(np.asarray(den / den[0])[:, None], u.size - n)
     past = np.convolve(np.concatenate([y[:n], np.zeros(n)]), den / den[0])[n : 2 * n]
     forced[:n] -= past[: forced.size]
-    # den(q) y = num(q) u row by row is a triangular banded system.
-    rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
+    # den(q) y = num(q) u row by row is a triangular banded system: solved in compiled code, where
+    # a recursion in Python would take longer than RLS, and scipy.signal's lfilter imports it all.
+    with np.errstate(all="ignore"):  # an unstable Hd overflows, which its sentences say
+        rest, _ = _solve_banded(band, forced, uplo="L", diag="U")
     return np.concatenate([y[:n], np.ravel(rest)])
 
 
 def _output(model: Model, flight: Flight) -> str:
+    # eq. 23, from which physical parameters are read, is that of an angle.
     present = [n for n in naming.names(model.Outputs) if n in flight.outputs]
     angles = [n for n in present if naming.unit(model.Outputs, n) == "rad"]
     return (angles or present)[0]
 
 
-def _metrics(y: np.ndarray, simulated: np.ndarray) -> Metrics:
+def _metrics(y: Float[np.ndarray, " N"], simulated: Float[np.ndarray, " N"]) -> Metrics:
+    # Of a simulation that diverges a metric says nothing.
     if not np.isfinite(simulated).all() or np.abs(simulated).max() > 1e6 * np.abs(y).max():
         return NO_METRICS
     return metrics(y, simulated)
@@ -178,6 +225,7 @@ def _continuous(
     try:
         return *d2c(num, den, dt, "zoh"), True, ""
     except ValueError as e:
+        # Only what is wrong: the remedy behind the semicolon is what follows here.
         refused = str(e).split(";")[0]
     try:
         continuous = d2c(num, den, dt, "real-log")
@@ -211,7 +259,7 @@ def _combinations(
             f"Order {order} is not the fourth order of eq. 23: no physical parameters "
             "can be read from it."
         ]
-    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+    known = {n: jnp.asarray(v) for n, v in flight.known.items()}  # of this flight alone
     p = naming.replace(params, **known)
     # The vehicle may state a stand that this model does not stand on.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
@@ -222,7 +270,8 @@ def _combinations(
     if wrong:
         doubts.append(f"It gives {' and '.join(wrong)}, which no helicopter has.")
     off = float(ratios.p2) / float(ratios.p2_expected) - 1.0
-    if abs(off) > 0.05:
+    # p2 is not used for the ratios, so that it can contradict them.
+    if abs(off) > _MEANT:
         doubts.append(
             f"Its coefficient of s^2 is {float(ratios.p2):.4g} where its other coefficients and "
             f"the rotor speed ask for {float(ratios.p2_expected):.4g}: it does not have the "
@@ -240,29 +289,34 @@ def _stability(poles: np.ndarray) -> list[str]:
     return []
 
 
-_STARTING = 100
-
-
 def _bias(
-    errors: np.ndarray, simulated: np.ndarray, y: np.ndarray, agreement: Metrics
+    errors: Float[np.ndarray, " k"], y: Float[np.ndarray, " N"], agreement: Metrics
 ) -> list[str]:
-    """Noise biases equation error: told by coloured errors or a poor simulation."""
-    said = []
+    """Noise biases equation error: coloured errors or a poor simulation show it.
+
+    Args:
+        errors: of one step ahead, in the unit of y.
+        y: as measured.
+        agreement: of the simulation with y.
+    """
+    sentences = []
     # While P falls from its start the errors are those of no model.
     errors = errors[min(_STARTING, errors.size // 4) :]
     one_step = float(np.sqrt(np.mean(errors**2)))
     if one_step < 1e-8 * float(np.sqrt(np.mean(y**2))):
-        return said  # no noise at all: what is left is rounding
+        return sentences  # no noise at all: what is left is rounding
     if math.isnan(agreement.rmse):
-        said.append("Its simulation diverges from the measured output; no metrics are given.")
-    elif agreement.rmse > 1.5 * one_step:
-        said.append(
+        sentences.append("Its simulation diverges from the measured output; no metrics are given.")
+    # Without a bias both errors are the same noise; past outputs in the regressor hide it from the
+    # error of one step, not from the simulation.
+    elif agreement.rmse > _WORSE * one_step:
+        sentences.append(
             f"It predicts one sample ahead to {one_step:.2g} but simulates to {agreement.rmse:.2g} "
             "only: least squares on past measured outputs is biased by their noise."
         )
     if not whiteness(errors).white:
-        said.append(
+        sentences.append(
             "Its one-step errors are not white: noise on the measured output or disturbances bias "
             "its coefficients."
         )
-    return said
+    return sentences

@@ -1,6 +1,4 @@
-"""The numbers of a problem over its flights, as the residual wants them."""
-
-from typing import Any
+"""The numbers of a problem over its flights, as arrays that the residual is traced with."""
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +36,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...]) -> Data:
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
         flights=tuple(_flight_data(problem, f, dtype) for f in flights),
     )
+    # Once, instead of with every call of a compiled program.
     numbers = jax.device_put(numbers)
     if not nuisance.initial_state:
         return numbers
@@ -54,25 +53,28 @@ def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightDat
         inputs=model.Inputs(**inputs),
         outputs=outputs,
         known={n: np.asarray(v, dtype) for n, v in flight.known.items()},
+        # Ones until a run from the start values has shown what the states do: see below.
         state_scale={n: np.ones((), dtype) for n in naming.names(model.State)},
+        # Ten times the signal: so weak a prior says no more than the order of magnitude, but keeps
+        # an unknown that has no effect from drifting off.
         bias_scale={
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
-        offset_scale={n: np.asarray(10.0 * _moved(u), dtype) for n, u in inputs.items()},
+        offset_scale={n: np.asarray(10.0 * _motion(u), dtype) for n, u in inputs.items()},
     )
 
 
-def _size(values: Any) -> float:
+def _size(values: jax.Array | np.ndarray) -> float:
     """rms of a signal, 1 where that says nothing."""
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(np.square(np.asarray(values)))))
     return rms if np.isfinite(rms) and rms > 0 else 1.0
 
 
-def _moved(u: np.ndarray) -> float:
+def _motion(u: np.ndarray) -> float:
     """How far an input moves (rms about its mean), or its size where it never does."""
-    moved = float(np.std(u))
-    return moved if np.isfinite(moved) and moved > 0 else _size(u)
+    motion = float(np.std(u))
+    return motion if np.isfinite(motion) and motion > 0 else _size(u)
 
 
 def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
@@ -80,6 +82,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
 
     The run is brought to the size of the measured outputs first, since a gain may be unknown.
     """
+    # Initial states are zero in it whatever their scales are, which may be the ones still.
     z = start_vector(layout, data, problem)
     at_start = jax.device_get(simulated_at(layout, data, z))
     simulated = with_biases(layout, at_start)
@@ -87,6 +90,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
         y = {n: v[np.isfinite(v)] for n, v in y.items()}
+        # On average over the outputs: one gain that is off scales them all.
         ratio = 10.0 * float(np.mean([_size(v) / _size(runs[n]) for n, v in y.items()]))
         scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
         scaled.append(flight._replace(state_scale=jax.device_put(scale)))

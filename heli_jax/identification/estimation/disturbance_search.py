@@ -32,17 +32,19 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
     """
     layout, data = search.layout, search.data
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
+    # First what costs one evaluation: the search without a disturbance takes as long as a fit.
     if _sure(layout, optimum, e) and _far_better(search, optimum, e):
         return optimum
-    none = without_disturbance(search, optimum)
-    alone = evaluate(layout, data, none.noise, none.best.z)
-    if bool(np.isfinite(alone.r).all()) and not _corrects(alone, none.noise):
-        without = layout.estimator.log_likelihood(layout, data, none.noise, alone)
-        ratio = 2.0 * (layout.estimator.log_likelihood(layout, data, optimum.noise, e) - without)
+    without = without_disturbance(search, optimum)
+    alone = evaluate(layout, data, without.noise, without.best.z)
+    if bool(np.isfinite(alone.r).all()) and not _corrects(alone, without.noise):
+        likelihood = layout.estimator.log_likelihood(layout, data, without.noise, alone)
+        ratio = 2.0 * (layout.estimator.log_likelihood(layout, data, optimum.noise, e) - likelihood)
+        # Negated comparisons: a ratio that is NaN is none that speaks for a disturbance.
         if not ratio > NO_DISTURBANCE:
-            optimum, ratio = _from_nested(search, optimum, ratio, none, without)
-        if bool(none.best.converged) and not ratio > NO_DISTURBANCE:
-            return none._replace(trace=optimum.trace, ratio=ratio)
+            optimum, ratio = _from_nested(search, optimum, ratio, without, likelihood)
+        if bool(without.best.converged) and not ratio > NO_DISTURBANCE:
+            return without._replace(trace=optimum.trace, ratio=ratio)
         optimum = optimum._replace(ratio=ratio)
     if not bool(optimum.best.converged):
         # The search was cut short before it was known that there is something to find.
@@ -57,6 +59,7 @@ def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     layout, data = search.layout, search.data
     if "tau_w" not in layout.disturbance:
         return optimum
+    # At the limits `unpack` clips, so that the likelihood is flat and no optimiser comes back.
     low, high = (float(v) for v in disturbance_limits(data)["tau_w"])
     if low < float(optimum.best.z[layout.disturbance_at("tau_w")]) < high:
         return optimum
@@ -72,6 +75,7 @@ def _sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     """Whether a disturbance was found and all of it is determined."""
     if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
         return False
+    # In z the disturbance follows the named unknowns.
     at = len(layout.of_interest)
     sds = deviations(e.J)
     known = np.isfinite(sds[at : at + len(layout.disturbance)]).all()
@@ -84,7 +88,9 @@ def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     One evaluation at the same parameters, and the gain of the Gauss-Newton step from there.
 
     Args:
-        e: at the optimum.
+        search: the optimiser over the problem.
+        optimum: with a disturbance.
+        e: at that optimum.
     """
     layout, data, noise = search.layout, search.data, optimum.noise
     alone = evaluate(layout, data, noise, _silenced(search, optimum))
@@ -92,32 +98,44 @@ def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
     if not np.isfinite(gained):
         return False
     n = measured_count(data)
+    # In float64 whatever the rows are: the gain is a small difference of large sums.
     before = float(np.sum(np.square(np.asarray(alone.r, np.float64))))
     after = max(before - gained, 1e-300)
-    gain = 0.5 * float(layout.estimator.log_likelihood_lost(layout, before / n, after / n, n))
+    gain = 0.5 * float(layout.estimator.deviance(layout, before / n, after / n, n))
     without = layout.estimator.log_likelihood(layout, data, noise, alone) + gain
+    # By one a measured number: far past what the linear model of the residuals may be wrong by.
     return bool(layout.estimator.log_likelihood(layout, data, noise, e) - without > n)
 
 
 def _from_nested(
-    search: Search, optimum: RelaxedOptimum, ratio: float, none: RelaxedOptimum, without: float
+    search: Search,
+    optimum: RelaxedOptimum,
+    ratio: float,
+    without: RelaxedOptimum,
+    likelihood: float,
 ) -> tuple[RelaxedOptimum, float]:
     """The better of an optimum and of a search from that without disturbance, and its ratio.
 
     Args:
-        ratio: twice the log-likelihood that `optimum` gains over `none`.
-        without: the log-likelihood of `none`.
+        search: the optimiser over the problem.
+        optimum: with a disturbance.
+        ratio: twice the log-likelihood that it gains over `without`.
+        without: the optimum without one.
+        likelihood: the logarithm of that of `without`.
     """
     layout, data = search.layout, search.data
-    z = with_noise_guess(search, none)
-    guess = evaluate(layout, data, none.noise, z)
-    noise = layout.estimator.with_level(data, guess, none.noise)
+    z = with_noise_guess(search, without)
+    guess = evaluate(layout, data, without.noise, z)
+    # The rows are laid out about the level of their own innovations; that of a filter that never
+    # corrects is far from it.
+    noise = layout.estimator.with_level(data, guess, without.noise)
     with_guess = layout.estimator.log_likelihood(layout, data, noise, guess)
-    promising = with_guess > without + NO_DISTURBANCE
+    promising = with_guess > likelihood + NO_DISTURBANCE
+    # A nested model cannot fit better: where it does, the first search ended in a worse optimum.
     if not (promising or ratio < -NO_DISTURBANCE or not np.isfinite(ratio)):
         return optimum, ratio
     again = relaxed_from(search, noise, z)
-    other = 2.0 * (log_likelihood_of(search, again) - without)
+    other = 2.0 * (log_likelihood_of(search, again) - likelihood)
     if not np.isfinite(other) or other <= ratio:
         return optimum, ratio
     notes = ()
@@ -133,6 +151,7 @@ def with_noise_guess(search: Search, optimum: RelaxedOptimum) -> Float[Array, " 
     """z at the parameters of an optimum, the disturbance from a coarse search."""
     layout, at = search.layout, len(search.layout.of_interest)
     starts = [np.log(search.problem.noise[n].start) for n in layout.disturbance]
+    # From the problem's own start values: those of the optimum have run off to a limit.
     z = optimum.best.z
     z = z.at[at : at + len(starts)].set(jnp.asarray(starts, z.dtype))
     return noise_guess_at(layout, search.data, optimum.noise, z)
@@ -143,10 +162,11 @@ def _corrects(e: Evaluation, noise: Noise) -> bool:
 
     It does in an unstable model, whose error grows from nothing: that is no output error.
     """
+    # Without a state to correct the innovation's variance is that of the measurement.
     return any(
         float(np.nanmax(s / sd[n] ** 2)) > 1.01
-        for one, sd in zip(e.innovations, noise.sd, strict=True)
-        for n, s in one.variance.items()
+        for flight, sd in zip(e.innovations, noise.sd, strict=True)
+        for n, s in flight.variance.items()
     )
 
 
@@ -156,6 +176,8 @@ def without_disturbance(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
 
 
 def _silenced(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
+    """z of an optimum with a sigma_w that is all but zero."""
+    # Far below the smallest noise rather than zero, whose logarithm no z holds.
     at = search.layout.disturbance_at("sigma_w")
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
     return optimum.best.z.at[at].set(np.log(smallest) - _NONE)

@@ -9,13 +9,14 @@ rows are something else says what follows from them.
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.kalman import Innovations
+from heli_jax.identification.estimation.simulated_flights import Run
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
@@ -23,18 +24,20 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solutio
 class Evaluation(NamedTuple):
     """Everything that one point tells, as NumPy arrays."""
 
-    simulated: tuple[dict[str, Any], ...]
-    """with the bias, SI, by flight and output"""
-    raw: tuple[dict[str, Any], ...]
-    """measured - simulated, SI, by flight and output; NaN where nothing is measured"""
-    state_rms: Any
+    simulated: tuple[dict[str, np.ndarray], ...]
+    """with the bias, SI, by flight and output (N,)"""
+    raw: tuple[dict[str, np.ndarray], ...]
+    """measured - simulated, SI, by flight and output (N,); NaN where nothing is measured"""
+    state_rms: np.ndarray
     """(flights, states) root mean square of each simulated state"""
     innovations: tuple[Innovations, ...]
-    r: Any
-    J: Any
-    named: Any
-    """values of the named unknowns"""
-    slopes: Any
+    r: np.ndarray
+    """(n,) whitened residuals with the rows of the priors"""
+    J: np.ndarray
+    """(n, q) derivative of r by z"""
+    named: np.ndarray
+    """values of the named unknowns, in their units"""
+    slopes: np.ndarray
     """their derivatives by their own coordinates"""
 
 
@@ -43,7 +46,7 @@ class Residuals(NamedTuple):
 
     rows: Float[Array, " n"]
     """whitened; zero where nothing is measured. Those of the priors are added to them"""
-    runs: Any
+    runs: tuple[Run, ...] | None
     """by flight the simulated `Run`s on whose way the rows came; None where none was simulated"""
     innovations: tuple[Innovations, ...] = ()
     """by flight, where predictions one step ahead are what is compared"""
@@ -52,6 +55,8 @@ class Residuals(NamedTuple):
 class Estimator(abc.ABC):
     """A method of estimation. Without a state of its own: there is one object of each."""
 
+    # What others have to know of a method stands here as a fact about its rows: code that asked
+    # which method it is would have to be changed for a third one.
     errors: ClassVar[str] = "residuals"
     """what the method asks to be white"""
     process_noise: ClassVar[bool] = False
@@ -70,7 +75,14 @@ class Estimator(abc.ABC):
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The rows of the measurements at the unknowns; traced, and differentiated forwards."""
+        """The rows of the measurements at the unknowns; traced, and differentiated forwards.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: of the measurements, by which the rows are divided.
+            u: the unknowns, in the units of the model.
+        """
 
     def row_signals(self, layout: Layout, data: Data) -> np.ndarray:
         """Of the first rows (n,) the signal that each belongs to, as `signals` numbers them."""
@@ -79,6 +91,7 @@ class Estimator(abc.ABC):
     def one_program(self, layout: Layout) -> bool:
         """Whether a whole run of the optimiser is compiled as one program: worth it where the
         rows take no longer to evaluate than a step takes to be called for."""
+        # The rows of a linear model are one short recurrence; a simulation in steps takes longer.
         return layout.model.linear
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
@@ -87,7 +100,13 @@ class Estimator(abc.ABC):
         return (), False
 
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
-        """The noise with the level about which the likelihood is laid out in rows."""
+        """The noise with the level about which the likelihood is laid out in rows.
+
+        Args:
+            data: the numbers of the problem.
+            e: at any point, with `noise`.
+            noise: so far.
+        """
         return noise
 
     def relax(
@@ -96,11 +115,16 @@ class Estimator(abc.ABC):
         """The noise that the rows show, degrees of freedom taken off in proportion, and z.
 
         Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
             e: at z with `noise`.
+            noise: so far.
+            z: the unknowns.
         """
         n = measured_count(data)
+        # What the unknowns could fit of the noise is missing in the rows of every signal.
         freedom = n / max(n - layout.determined, 1)
-        sd = [dict(one) for one in noise.sd]
+        sd = [dict(by_output) for by_output in noise.sd]
         for (i, name), r in zip(
             signals(layout), self.errors_of(layout, data, noise, e), strict=True
         ):
@@ -112,44 +136,84 @@ class Estimator(abc.ABC):
         return z, Noise(tuple(sd), noise.log_variance_ratio)
 
     def noise_matters(self, problem: Problem, layout: Layout, fall: float) -> bool:
-        """Whether the optimum moves with the noise; `fall` is that of its level."""
+        """Whether the optimum moves with the noise, so that it has to be searched again.
+
+        Args:
+            problem: what is fitted.
+            layout: what the unknowns are.
+            fall: of the noise's level in the last relaxation.
+        """
         return True
 
     def errors_of(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation
     ) -> list[np.ndarray]:
-        """By signal what the rows are made of, SI, where something is measured."""
+        """By signal what the rows are made of, SI, where something is measured.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that the rows were divided by.
+            e: the evaluation that holds the rows.
+        """
         numbers, rows = self.row_signals(layout, data), np.asarray(e.r)
         errors = []
         for k, (i, name) in enumerate(signals(layout)):
+            # The row of a missing sample is zero, which is no error of that size.
             seen = np.isfinite(np.asarray(data.flights[i].outputs[name]))
-            mine = rows[: numbers.size][numbers == k]
-            errors.append(mine[seen] * np.asarray(noise.sd[i][name]))
+            # The first rows alone: defects and priors follow.
+            of_signal = rows[: numbers.size][numbers == k]
+            errors.append(of_signal[seen] * np.asarray(noise.sd[i][name]))
         return errors
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that
-        is not given."""
+        is not given.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that `e` was evaluated with.
+            e: the evaluation.
+        """
         errors = self.errors_of(layout, data, noise, e)
+        # With the noise at its optimum the squares over the variance are as many as there are rows:
+        # hence the 1.
         return sum(-0.5 * r.size * float(np.log(2.0 * np.pi * np.mean(r**2)) + 1.0) for r in errors)
 
     def noise_unknowns(self, layout: Layout) -> int:
         """How many standard deviations of measurement noise are estimated beside z."""
         return len(signals(layout))
 
-    def log_likelihood_lost(
+    def deviance(
         self, layout: Layout, cost: np.ndarray | float, first: float, n: int
-    ) -> Any:
-        """Twice the log-likelihood between two costs (sums of squares of all rows over n)."""
+    ) -> np.ndarray | float:
+        """Twice the log-likelihood that is lost between two costs.
+
+        Args:
+            layout: what the unknowns are.
+            cost: sum of squares of all rows over n, any shape.
+            first: the cost that is compared with.
+            n: how many numbers are measured.
+        """
         return n * (cost - first)
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
         """Of the rows of the measurements, but for a constant; the scale of the noise is integrated
-        out under Jeffreys' prior, of each signal by itself."""
+        out under Jeffreys' prior, of each signal by itself.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            rows: those of the measurements, traced.
+        """
+        # Rows where nothing was measured are zero: they add nothing to the sum, and n leaves them
+        # out.
         total, at = jnp.zeros((), rows.dtype), 0
         for i, name in signals(layout):
             y = data.flights[i].outputs[name]
             n = jnp.sum(jnp.isfinite(y).astype(rows.dtype))
+            # The integral over sd of sd^-(n+1) exp(-S / (2 sd^2)) is proportional to S^(-n/2).
             total -= 0.5 * n * jnp.log(jnp.sum(rows[at : at + y.shape[0]] ** 2))
             at += y.shape[0]
         return total
@@ -157,23 +221,52 @@ class Estimator(abc.ABC):
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """By flight and output what is measured but for bias and noise, (N,), or (runs, N) where
-        chance moves the machine too."""
+        chance moves the machine too.
+
+        Args:
+            reached: where the fit ended.
+            u: the unknowns there.
+            runs: how many records are drawn.
+            seed: of the draw.
+        """
 
     def against_expected(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, z: Array
     ) -> dict[str, float] | None:
         """By output, the power of the simulation's error over that which disturbance and noise
-        let expect; None where the simulation has to explain the record by itself."""
+        let expect; None where the simulation has to explain the record by itself.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that `e` was evaluated with.
+            e: at z.
+            z: the unknowns.
+        """
         return None
 
     def ill_conditioned(self, problem: Problem, e: Evaluation, sd: dict[str, float]) -> bool:
-        """Whether the numbers at the optimum are rounding; sd by 'flight/output'."""
+        """Whether the numbers at the optimum are rounding.
+
+        Args:
+            problem: what was fitted.
+            e: at the optimum.
+            sd: of the measurement noise, SI, by 'flight/output'.
+        """
         return False
 
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
     ) -> list[str]:
-        """What a reader should know of the method's own assumptions; `ill` as above."""
+        """What a reader should know of the method's own assumptions.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that `e` was evaluated with.
+            e: at the optimum.
+            ill: whether it is ill-conditioned.
+        """
         return []
 
 
@@ -184,12 +277,20 @@ def signals(layout: Layout) -> list[tuple[int, str]]:
 
 def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
     """Of every measured number its signal."""
+    # From shapes alone: a constant to whatever is traced.
     sizes = [data.flights[i].outputs[n].shape[0] for i, n in signals(layout)]
     return np.repeat(np.arange(len(sizes)), sizes)
 
 
 def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
-    """All that is measured, and its sd. Joined: XLA makes kernels of signals one by one."""
+    """All that is measured, and its sd, each (n,).
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements, by flight and output.
+    """
+    # Joined, since XLA makes a kernel of every signal that is treated by itself.
     at = signals(layout)
     sd = jnp.stack([noise.sd[i][n] for i, n in at])
     y = jnp.concatenate([data.flights[i].outputs[n] for i, n in at])
@@ -198,6 +299,7 @@ def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, A
 
 def measured_count(data: Data) -> int:
     """How many measured numbers there are."""
+    # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
     return sum(
         int(np.isfinite(np.asarray(y)).sum())
         for flight in data.flights

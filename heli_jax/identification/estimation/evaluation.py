@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack
 
@@ -16,11 +16,19 @@ _TAKES_PART = 1e-3
 
 
 def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Evaluation:
-    """The slopes, the simulation, and the named unknowns."""
-    at = slopes(layout, data, noise, z)
-    shown = simulated_at(layout, data, z) if at.shown is None else at.shown
-    found = jax.device_get((shown, at.innovations, at.r, at.J, *_named(layout, data, z)))
-    outputs, *rest = found
+    """Residuals and their Jacobian, the simulation, and the named unknowns.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements, by which the rows are divided.
+        z: the unknowns.
+    """
+    at = residual_and_jacobian(layout, data, noise, z)
+    # Output error has simulated on its way; a filter predicts one step ahead, which is no run.
+    outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
+    # Fetched all at once: every fetch by itself would wait for the device.
+    outputs, *rest = jax.device_get((outputs, at.innovations, at.r, at.J, *_named(layout, data, z)))
     simulated = with_biases(layout, outputs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
@@ -32,7 +40,13 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
 def simulated_outputs(
     layout: Layout, data: Data, z: Float[Array, " q"]
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """By flight and output the simulation (N,) with the bias, SI."""
+    """By flight and output the simulation (N,) with the bias, SI.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
     return with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
 
 
@@ -43,6 +57,7 @@ def _named(layout: Layout, data: Data, z: Array) -> tuple[Array, Array]:
         shift = () if u.shift is None else (u.shift,)
         return jnp.stack([*u.params.values(), *u.gains.values(), *shift])
 
+    # Each depends on its own coordinate alone: the rest of the Jacobian is zero.
     return named(z), jnp.diagonal(jax.jacfwd(named)(z))
 
 
@@ -54,11 +69,16 @@ def deviations(J: np.ndarray) -> np.ndarray:
     """
     J = np.asarray(J, dtype=np.float64)
     q = J.shape[1]
+    # A simulation that diverged tells nothing.
     if not np.isfinite(J).all():
         return np.full(q, np.inf)
+    # Columns of one size, so that what counts as no effect does not hang on units.
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)
+    # Singular values of J itself and not of J'J, whose small ones, their squares, are rounding.
+    # Those of its triangle are the same, and it has q rows instead of n.
     _, sizes, right = np.linalg.svd(np.linalg.qr(J / norms, mode="r"))
+    # Fewer rows than unknowns: what is missing are directions without effect.
     sizes = np.concatenate([sizes, np.zeros(q - sizes.size)])
     kept = sizes > 1e-10 * sizes[0]
     sds = np.sqrt(np.sum((right[kept] / sizes[kept, None]) ** 2, axis=0)) / norms

@@ -5,7 +5,7 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -25,7 +25,7 @@ from heli_jax.identification.estimation.estimator import (
 )
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.kalman import Innovations, innovations
-from heli_jax.identification.estimation.simulated_flights import driven
+from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -55,10 +55,14 @@ _BATCH = 8
 class FilterError(Estimator):
     """One-step predictions of an (extended) Kalman filter against the measured outputs."""
 
+    # Arguments of the methods: see `Estimator`.
+
     errors = "innovations"
     process_noise = True
     shared_noise = True
+    # Each holds the common factor of all samples, and the variances have rows of their own.
     rows_are_samples = False
+    # Small innovations alone are no fit: the variances that they are held against count too.
     least_squares = False
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -75,6 +79,7 @@ class FilterError(Estimator):
         output but the first has a factor of its own; with sigma_w given all outputs have one."""
         if "sigma_y" in problem.fixed_noise:
             return (), False
+        # Only with all of them unknown: a factor common to noises of which one is given is none.
         concentrated = "sigma_w" not in problem.fixed_noise
         outputs = tuple(sorted({n for f in problem.training for n in f.outputs}))
         return outputs[concentrated:], concentrated
@@ -82,6 +87,7 @@ class FilterError(Estimator):
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level that the innovations show."""
         level = innovation_sums(e, noise)[1] / measured_count(data)
+        # An unstable start: the optimiser has to find out of it by the rows themselves.
         level = level if np.isfinite(level) else 0.0
         return noise._replace(log_variance_ratio=np.asarray(level, noise.log_variance_ratio.dtype))
 
@@ -96,11 +102,17 @@ class FilterError(Estimator):
         level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
             return z, noise._replace(log_variance_ratio=level)
+        # The scale of the greatest likelihood, and what the unknowns took from the squares.
         factor = np.sqrt(squares / n * freedom)
         if "sigma_w" in layout.disturbance:
+            # The filter knows only ratios of noises: with all of them times one factor its gains,
+            # and with them the optimum, stay.
             at = layout.disturbance_at("sigma_w")
             z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
-        sd = tuple({k: np.asarray(s * factor, s.dtype) for k, s in one.items()} for one in noise.sd)
+        sd = tuple(
+            {name: np.asarray(s * factor, s.dtype) for name, s in by_output.items()}
+            for by_output in noise.sd
+        )
         return z, Noise(sd, level)
 
     def noise_matters(self, problem: Problem, layout: Layout, fall: float) -> bool:
@@ -115,6 +127,7 @@ class FilterError(Estimator):
         is concentrated out."""
         n = measured_count(data)
         squares, logs = innovation_sums(e, noise)
+        # The sums hold log(s / sd^2): the sd bring the units of the outputs back.
         for flight, sd in zip(data.flights, noise.sd, strict=True):
             for k, y in flight.outputs.items():
                 logs += 2.0 * float(np.log(sd[k])) * int(np.isfinite(np.asarray(y)).sum())
@@ -126,9 +139,7 @@ class FilterError(Estimator):
         """The common factor; the others stand in z."""
         return int(layout.concentrated)
 
-    def log_likelihood_lost(
-        self, layout: Layout, cost: np.ndarray | float, first: float, n: int
-    ) -> Any:
+    def deviance(self, layout: Layout, cost: np.ndarray | float, first: float, n: int) -> Any:
         """With the scale concentrated out the cost is the variance, whose logarithm counts."""
         return n * (np.log(cost / first) if layout.concentrated else cost - first)
 
@@ -136,6 +147,7 @@ class FilterError(Estimator):
         """The scale of all noise is integrated out together, unless it was given."""
         if not layout.concentrated:
             return -0.5 * jnp.sum(rows**2)
+        # As in `Estimator.log_density`, but with one scale for all rows together.
         counted = [jnp.isfinite(y) for f in data.flights for y in f.outputs.values()]
         n = jnp.sum(jnp.concatenate(counted).astype(rows.dtype))
         return -0.5 * n * jnp.log(jnp.sum(rows**2))
@@ -169,10 +181,12 @@ class FilterError(Estimator):
         scales = unpack(layout, data, z).scales
         missed: dict[str, float] = {}
         expected: dict[str, float] = {}
-        for error, one, big, sd in zip(e.raw, blind.innovations, blinding, noise.sd, strict=True):
-            for n, s in one.variance.items():
+        each = zip(e.raw, blind.innovations, blinding, noise.sd, strict=True)
+        for error, innovation, blind_sd, sd in each:
+            for n, s in innovation.variance.items():
                 factor = float(scales.get(n, 1.0)) ** 2
-                of_state = np.maximum(np.asarray(s) - float(big[n]) ** 2 * factor, 0.0)
+                # Less the noise that was put in; what rounding leaves below zero is none.
+                of_state = np.maximum(np.asarray(s) - float(blind_sd[n]) ** 2 * factor, 0.0)
                 seen = np.isfinite(error[n])
                 with np.errstate(all="ignore"):
                     power = float(np.var(error[n][seen])) * int(seen.sum())
@@ -189,14 +203,17 @@ class FilterError(Estimator):
         ratios = np.concatenate(
             [
                 np.asarray(s) / sd[f"{label}/{n}"] ** 2
-                for label, one in zip(labels(problem.training), e.innovations, strict=True)
-                for n, s in one.variance.items()
+                for label, flight in zip(labels(problem.training), e.innovations, strict=True)
+                for n, s in flight.variance.items()
             ]
         )
+        # NaN marks a missing sample, unless the filter itself went wrong.
         ratios = ratios[~np.isnan(ratios)] if np.isfinite(e.r).all() else ratios
         return bool(
             not ratios.size
             or not np.isfinite(ratios).all()
+            # An innovation's variance holds that of its measurement: with less the covariance of
+            # the state is none.
             or ratios.min() < 1.0 - _TOLERANCE
             or ratios.max() > _DIGITS
         )
@@ -215,6 +232,7 @@ class FilterError(Estimator):
         if layout.concentrated:
             return []
         size = float(np.sqrt(innovation_sums(e, noise)[0] / measured_count(data)))
+        # The intervals are too narrow, or too wide, by the same factor.
         if 0.8 < size < 1.25:
             return []
         return [
@@ -226,26 +244,31 @@ class FilterError(Estimator):
 def filtered_flights(
     layout: Layout, data: Data, noise: Noise, u: Unknowns
 ) -> tuple[Innovations, ...]:
-    """The innovations of every flight."""
-    out = []
-    each = zip(data.flights, u.states, u.biases, noise.sd, strict=True)
-    for i, (flight, state, bias, sd) in enumerate(each):
-        params, inputs = driven(layout, data, u, i)
-        out.append(
-            innovations(
-                layout.model,
-                params,
-                inputs,
-                {n: y - bias[n] for n, y in flight.outputs.items()},
-                {n: s * u.scales[n] if n in u.scales else s for n, s in sd.items()},
-                dt=flight.dt,
-                initial_state=state,
-                delay=u.shift,
-                substeps=layout.substeps,
-                hold=layout.hold(i),
-            )
-        )
-    return tuple(out)
+    """The innovations of every flight.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements, by flight and output.
+        u: the unknowns, in the units of the model.
+    """
+    return tuple(_filtered(layout, data, noise, u, i) for i in range(len(data.flights)))
+
+
+def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> Innovations:
+    drive = driven(layout, data, u, i)
+    return innovations(
+        layout.model,
+        drive.params,
+        drive.inputs,
+        {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()},
+        {n: s * u.scales[n] if n in u.scales else s for n, s in noise.sd[i].items()},
+        dt=drive.dt,
+        initial_state=drive.state,
+        delay=u.shift,
+        substeps=layout.substeps,
+        hold=layout.hold(i),
+    )
 
 
 def _likelihood_rows(
@@ -268,6 +291,7 @@ def _likelihood_rows(
     y, sd = measured_signals(layout, data, noise)
     at = signals(layout)
     seen = jnp.isfinite(y)
+    # One where nothing is measured, so that no derivative of a root or a logarithm is NaN.
     s = jnp.where(seen, jnp.concatenate([by_flight[i].variance[n] for i, n in at]), 1.0)
     error = jnp.concatenate([by_flight[i].error[n] for i, n in at])
     rows = jnp.where(seen, error, 0.0) / jnp.sqrt(s)
@@ -275,11 +299,14 @@ def _likelihood_rows(
     count = jnp.sum(seen.astype(rows.dtype))
     mean = jnp.sum(log_s) / count
     above = mean - noise.log_variance_ratio
+    # The level, that of the last relaxation, brings the factor near 1 and the rows to variance 1.
     if layout.concentrated:
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
+        # N mean(log s) as a square: the 1 keeps it above zero, where the root has a derivative.
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
     log_s = jnp.where(seen, log_s - mean, 0.0)
+    # The last rows are zero themselves, with the derivative of what is subtracted left out.
     return jnp.concatenate([rows, *last, 0.5 * (log_s - jax.lax.stop_gradient(log_s))])
 
 
@@ -287,49 +314,57 @@ def innovation_sums(e: Evaluation, noise: Noise) -> tuple[float, float]:
     """Sums over all measurements of e^2/s and of log(s/sd^2)."""
     squares, logs = 0.0, 0.0
     with np.errstate(all="ignore"):  # an unstable start gives what it gives, and is judged later
-        for one, sd in zip(e.innovations, noise.sd, strict=True):
-            for n, s in one.variance.items():
-                squares += float(np.nansum(one.error[n] ** 2 / s))
+        for flight, sd in zip(e.innovations, noise.sd, strict=True):
+            for n, s in flight.variance.items():
+                squares += float(np.nansum(flight.error[n] ** 2 / s))
                 logs += float(np.nansum(np.log(s / sd[n] ** 2)))
     return squares, logs
 
 
-def _root_mean_square(y: Any) -> float:
+def _root_mean_square(y: Array | np.ndarray) -> float:
     """Of what is measured (N,), never zero."""
     y = np.asarray(y)
     return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
 
 
-def _disturbed(reached: Solution, u: Any, i: int, keys: Array) -> dict[str, Array]:
+def _disturbed(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
     """By name the outputs (runs, N) with a disturbance drawn for each key."""
-    flight, layout = reached.data.flights[i], reached.layout
-    params, inputs = driven(layout, reached.data, u, i)
-    start = u.states[i] if u.states[i] is not None else layout.model.initial_state(params)
-    names, random = naming.names(layout.model.State), layout.model.random_states
-    sds = initial_sd_of(layout.model, params, reached.z.dtype)
-    # Factored without the sds, which may be zero.
-    correlation = correlation_of(layout.model, params, reached.z.dtype)
-    factor = sds[:, None] * jnp.linalg.cholesky(correlation)
+    layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
+    drawn_state = _random_first_state(layout, drive, reached.z.dtype)
 
     @jax.jit
     def run(key: Array) -> Any:
-        first, second = jax.random.split(key)
-        drawn = jnp.sum(factor * jax.random.normal(first, (1, len(names)), reached.z.dtype), axis=1)
-        values = {n: getattr(start, n) + drawn[names.index(n)] for n in random}
-        begin = naming.replace(start, **values)
+        of_first, of_noise = jax.random.split(key)
         return simulate(
             layout.model,
-            params,
-            inputs,
-            dt=flight.dt,
-            initial_state=begin,
+            drive.params,
+            drive.inputs,
+            dt=drive.dt,
+            initial_state=drawn_state(of_first),
             solver=layout.solver,
             substeps=layout.substeps,
-            key=second,
+            key=of_noise,
             hold=layout.hold(i),
         ).outputs
 
     return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
+
+
+def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
+    """Of a key the State at the first sample, with what is random there drawn."""
+    model, params = layout.model, drive.params
+    first = drive.state if drive.state is not None else model.initial_state(params)
+    names = naming.names(model.State)
+    sds = initial_sd_of(model, params, dtype)
+    # Factored without the sds, which may be zero.
+    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
+
+    def draw(key: Array) -> Any:
+        drawn = jnp.sum(factor * jax.random.normal(key, (1, len(names)), dtype), axis=1)
+        values = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
+        return naming.replace(first, **values)
+
+    return draw
 
 
 ESTIMATOR = FilterError()

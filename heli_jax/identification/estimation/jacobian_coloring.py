@@ -26,6 +26,8 @@ class _Columns(NamedTuple):
 
 def seeded(layout: Layout) -> np.ndarray | None:
     """The directions (q, colours) in which to differentiate; None where each is one unknown's."""
+    # One window has no neighbour to share directions with. A filter's rows, through the scale that
+    # is concentrated out, feel every unknown.
     if not layout.estimator.rows_are_samples or sum(count for count, _ in layout.windows) < 2:
         return None
     colour = _columns(layout).colour
@@ -42,13 +44,14 @@ def _columns(layout: Layout) -> _Columns:
     number, first_bias = 0, 0
     for f, ((count, _), names) in enumerate(zip(layout.windows, layout.outputs, strict=True)):
         for k in range(count):
-            # A jump is felt by the window before and the one after: two sets of directions.
+            # A defect feels the window before it and the one after: two sets of directions.
             side = k % 2 if layout.continuity is not None else 0
             colour += [shared + side * states + i for i in range(states)]
             window += [number] * states
             bias += [-1] * states
             flight += [-1] * states
             number += 1
+        # Another flight's windows and outputs use the same directions again: no row feels both.
         if layout.bias:
             colour += [shared + 2 * states + outputs.index(n) for n in names]
             window += [-1] * len(names)
@@ -65,45 +68,65 @@ def _columns(layout: Layout) -> _Columns:
     return _Columns(packed, np.array(window), np.array(bias), np.array(flight))
 
 
-def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[Array, "n q"]:
-    """The whole Jacobian from the derivatives along the colours."""
-    columns = _columns(layout)
-    window, after, bias, by_flight = [], [], [], []
+class _Reach(NamedTuple):
+    """Of each row of the measurements what it belongs to (-2 for a defect where it is none's)."""
+
+    window: np.ndarray
+    next_window: np.ndarray
+    """of a defect the window after it, else -2"""
+    signal: np.ndarray
+    flight: np.ndarray
+
+
+def _reach(layout: Layout, data: Data) -> _Reach:
+    """In the order of `OutputError.residuals`: signal after signal, then the defects."""
+    window, signals, flights = [], [], []
     first, signal = 0, 0
-    for f, (flight, (count, m), names) in enumerate(
-        zip(data.flights, layout.windows, layout.outputs, strict=True)
-    ):
+    each = zip(data.flights, layout.windows, layout.outputs, strict=True)
+    for f, (flight, (count, m), names) in enumerate(each):
         for name in names:
             n = flight.outputs[name].shape[0]
-            by_flight.append(np.full(n, f))
+            flights.append(np.full(n, f))
             window.append(first + np.arange(n) // m)
-            bias.append(np.full(n, signal))
+            signals.append(np.full(n, signal))
             signal += 1
         first += count
-    after = [np.full(w.size, -2) for w in window]
+    following = [np.full(w.size, -2) for w in window]
     first = 0
     for f, (count, _) in enumerate(layout.windows):
         if layout.continuity is not None and count > 1:
-            jumps = np.repeat(first + np.arange(count - 1), len(layout.states))
-            window.append(jumps)
-            after.append(jumps + 1)
-            bias.append(np.full(jumps.size, -2))
-            by_flight.append(np.full(jumps.size, f))
+            defects = np.repeat(first + np.arange(count - 1), len(layout.states))
+            window.append(defects)
+            following.append(defects + 1)
+            # Biases are of outputs: no defect of the states feels them.
+            signals.append(np.full(defects.size, -2))
+            flights.append(np.full(defects.size, f))
         first += count
-    rows, follows, signals, flights = (np.concatenate(v) for v in (window, after, bias, by_flight))
-    k, p = rows.size, len(layout.free)
+    return _Reach(*(np.concatenate(v) for v in (window, following, signals, flights)))
+
+
+def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[Array, "n q"]:
+    """The whole Jacobian from the derivatives along the colours.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        along: the derivatives of all rows, a column a colour.
+    """
+    columns, reach = _columns(layout), _reach(layout, data)
     shared = (columns.window < 0) & (columns.bias < 0) & (columns.flight < 0)
+    # Numbers below zero never meet: rows have -2 where unknowns have -1.
     felt = (
         jnp.asarray(shared)[None, :]
-        | (jnp.asarray(rows)[:, None] == jnp.asarray(columns.window)[None, :])
-        | (jnp.asarray(follows)[:, None] == jnp.asarray(columns.window)[None, :])
-        | (jnp.asarray(signals)[:, None] == jnp.asarray(columns.bias)[None, :])
-        | (jnp.asarray(flights)[:, None] == jnp.asarray(columns.flight)[None, :])
+        | (jnp.asarray(reach.window)[:, None] == jnp.asarray(columns.window)[None, :])
+        | (jnp.asarray(reach.next_window)[:, None] == jnp.asarray(columns.window)[None, :])
+        | (jnp.asarray(reach.signal)[:, None] == jnp.asarray(columns.bias)[None, :])
+        | (jnp.asarray(reach.flight)[:, None] == jnp.asarray(columns.flight)[None, :])
     )
     # Priors are of the parameters; each weak prior is of its own unknown.
-    weak = jnp.arange(layout.size - layout.first_nuisance)[:, None] + layout.first_nuisance
-    own = weak == jnp.arange(layout.size)[None, :]
-    prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (p, layout.size))
-    kept = jnp.concatenate([felt, prior, own])
-    assert kept.shape[0] == along.shape[0], (k, along.shape)
+    nuisances = jnp.arange(layout.size - layout.first_nuisance)[:, None] + layout.first_nuisance
+    of_itself = nuisances == jnp.arange(layout.size)[None, :]
+    prior = jnp.broadcast_to(jnp.asarray(shared)[None, :], (len(layout.free), layout.size))
+    kept = jnp.concatenate([felt, prior, of_itself])
+    assert kept.shape[0] == along.shape[0], (kept.shape, along.shape)
     return jnp.where(kept, along[:, jnp.asarray(columns.colour)], 0.0)

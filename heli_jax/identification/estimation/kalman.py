@@ -9,32 +9,44 @@ another, so nothing is inverted. A measurement that is NaN is skipped.
 
 import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
+from heli_jax.naming import Scalar
 from heli_jax.numerics.matrix_exponential import product, van_loan
+from heli_jax.simulation.delays import delays_of
 from heli_jax.simulation.discretize import process_noise
-from heli_jax.simulation.hold import Hold, linear_inputs, segments
-from heli_jax.simulation.solvers import at
-from heli_jax.simulation.stepping import acting_inputs, held_columns, split_delay
+from heli_jax.simulation.hold import Segment, delayed, linear_inputs, segments
+from heli_jax.simulation.options import DEFAULT, SimulationOptions
+from heli_jax.simulation.stepping import held_columns
+
+# Params, Inputs and State are a model's own classes: they are annotated Any.
 
 _SMALL = 8
 """States up to which the filter of a linear model is written out in rows"""
+_ONLY_SIMULATE = (
+    "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
+)  # fmt: skip
+"""options of a simulation that mean nothing to a filter"""
+
+type _Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
+"""a state and its covariance"""
 
 
 class Innovations(NamedTuple):
     """One-step predictions against measurements, by output; arrays (N,), NaN where none is."""
 
-    error: dict[str, Any]
+    error: dict[str, Float[Array, " N"] | np.ndarray]
     """measured - predicted from all samples before, SI"""
-    variance: dict[str, Any]
+    variance: dict[str, Float[Array, " N"] | np.ndarray]
     """of that error, as the filter has it"""
 
 
@@ -42,48 +54,72 @@ def innovations(
     model: Model,
     params: Any,
     inputs: Any,
-    measured: dict[str, Float[Array, " N"]],
-    sd: dict[str, Any],
-    *,
-    dt: Any,
-    initial_state: Any = None,
-    delay: Any = None,
-    substeps: int = 4,
-    hold: Hold = None,
+    measured: Mapping[str, Float[Array, " N"]],
+    sd: Mapping[str, Scalar],
+    options: SimulationOptions = DEFAULT,
+    **keywords: Any,
 ) -> Innovations:
     """Run the (extended) Kalman filter of a model over one record.
 
     Args:
+        model: of n states; those that `model.initial_sd` names are uncertain at the first sample by
+            that standard deviation (and `model.correlation`), the others not at all.
+        params: the model's Params, SI.
         inputs: the model's Inputs, arrays (N,).
-        measured: outputs (N,); NaN where there is none.
+        measured: outputs (N,), SI; NaN where there is none.
         sd: standard deviation of the white measurement noise, by output, SI.
-        initial_state: the model's State at the first sample; the states that `model.initial_sd`
-            names are uncertain about it by that standard deviation (and `model.correlation`), the
-            others not at all.
-        delay: as in `simulate`.
-        substeps: linearisations a sample, for models that are not linear.
-        hold: as in `simulate`.
+        options: of which dt [s], initial_state, delay [s], hold and substeps (linearisations a
+            sample, for models that are not linear) count.
+        **keywords: these fields, in place of those of `options`.
+
+    Raises:
+        TypeError: dt is missing, or an option that only `simulate` has.
 
     Source: Kalman (1960); the covariance's integral in Van Loan (1978); local linearisation by
     Ozaki (1985).
     """
-    linear = linear_inputs(model, inputs, hold)
-    x0 = model.initial_state(params) if initial_state is None else initial_state
+    options = _checked(options.changed(keywords))
+    linear = linear_inputs(model, inputs, options.hold)
+    begin = options.initial_state
+    x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
     x = naming.ravel(x0, dtype)
     sds = initial_sd_of(model, params, dtype)
     P = correlation_of(model, params, dtype) * sds[:, None] * sds[None, :]
+    # Only what is measured: an output more would cost a correction a sample.
     names = list(measured)
     rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
     y = jnp.stack(list(measured.values()), axis=1)
     R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
+    drive = _Drive(model, params, inputs, options, linear, rows)
     if model.linear:
-        system = _linear(model, params, inputs, rows, dt, delay, linear)
-        e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(system, x, P, y, R)
+        e, s = (_by_rows if x.shape[0] <= _SMALL else _by_arrays)(_linear(drive), x, P, y, R)
     else:
-        filter_ = _local(model, params, inputs, rows, dt, delay, substeps, linear)
-        e, s = _run(filter_, x, P, y, R)
+        e, s = _run(_local(drive), x, P, y, R)
     return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
+
+
+def _checked(options: SimulationOptions) -> SimulationOptions:
+    if options.dt is None:
+        raise TypeError("innovations: expected dt, the sample time in seconds, got None")
+    for name in _ONLY_SIMULATE:
+        if getattr(options, name) is not getattr(DEFAULT, name):
+            raise TypeError(f"innovations: expected no {name}, which only simulate has")
+    return options
+
+
+class _Drive(NamedTuple):
+    """A model, what drives it along one record, and what is measured of it."""
+
+    model: Model
+    params: Any
+    inputs: Any
+    """the model's Inputs, arrays (N,)"""
+    options: SimulationOptions
+    linear: tuple[bool, ...]
+    """of each input whether it moves between samples; () where none does"""
+    rows: Array
+    """where the measured outputs stand among the model's (p,)"""
 
 
 class _Linear(NamedTuple):
@@ -96,18 +132,14 @@ class _Linear(NamedTuple):
     feed: Float[Array, "N p"]
 
 
-def _linear(
-    model: Model,
-    params: Any,
-    inputs: Any,
-    rows: Array,
-    dt: Any,
-    delay: Any,
-    linear: tuple[bool, ...],
-) -> _Linear:
+def _linear(drive: _Drive) -> _Linear:
+    model, params, options = drive.model, drive.params, drive.options
     _, _, C, D = jacobians(model, params)
-    Ad, drive, acting = held_columns(model, params, inputs, dt, delay, linear)
-    return _Linear(Ad, process_noise(model, params, dt), C[rows], drive, acting @ D[rows].T)
+    Ad, column, acting = held_columns(
+        model, params, drive.inputs, options.dt, options.delay, drive.linear
+    )
+    Q = process_noise(model, params, options.dt)
+    return _Linear(Ad, Q, C[drive.rows], column, acting @ D[drive.rows].T)
 
 
 def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
@@ -120,6 +152,8 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
     once = jax.lax.optimization_barrier
     Ad, Q, C, R = once((system.Ad, system.Q, system.C, R))
 
+    # Rows of P as a list, and the entries of A and C as scalars: products of whole matrices this
+    # small would cost more in calls than in arithmetic.
     def step(carry: tuple[Array, Any], sample: tuple[Any, Array]) -> tuple[Any, Any]:
         x, P = carry
         y, w = sample
@@ -127,9 +161,12 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
         c = [[C[k, j] for j in range(n)] for k in range(p)]
         errors, variances = [], []
         for k in range(p):
+            # Outputs of one sample are taken one after another, which white noise that is
+            # independent between them allows: s is a number, and no matrix is inverted.
             h = _sum(P[i] * c[k][i] for i in range(n))
             s = _sum(h[i] * c[k][i] for i in range(n)) + R[k]
             seen = jnp.isfinite(y[k])
+            # NaN times a gain of zero is NaN: it must not reach the state.
             e = jnp.where(seen, y[k], 0.0) - _sum(x[i] * c[k][i] for i in range(n))
             g = jnp.where(seen, 1.0 / s, 0.0)
             h, s, e, g = once((h, s, e, g))
@@ -153,10 +190,13 @@ def _sum(terms: Iterable[Any]) -> Any:
 
 
 def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
-    def move(x: Array, P: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+    # Rows written out one by one are a program whose length grows with the square of the states.
+    def move(x: Array, P: Array, now: tuple[Array, Array]) -> _Estimate:
+        # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
         x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
         return x, product(product(system.Ad, P), system.Ad.T) + system.Q
 
+    # C stays, so that no step differentiates the outputs.
     samples = (system.drive, system.feed)
     return _run(_Filter(samples, lambda x, now: (system.C, now[1]), move), x0, P0, y, R)
 
@@ -167,15 +207,15 @@ class _Filter(NamedTuple):
     samples: Any
     measure: Callable[[Array, Any], tuple[Array, Array]]
     """(state, sample) -> C (p, n) and what C x leaves of the predicted outputs (p,)"""
-    move: Callable[[Array, Array, Any], tuple[Array, Array]]
+    move: Callable[[Array, Array, Any], _Estimate]
     """(state, its covariance, sample) -> both at the next sample"""
 
 
 def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
     """Errors and variances (N, p)."""
 
-    def correct(carry: tuple[Array, Array], measured: tuple[Array, ...]) -> tuple[Any, Any]:
-        """The state and its covariance after one output."""
+    def correct(carry: _Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:
+        """The state and its covariance after one output, as in `_by_rows`."""
         (x, P), (c, rest, r, y) = carry, measured
         p = jnp.sum(P * c[None, :], axis=1)
         s = jnp.sum(c * p) + r
@@ -185,34 +225,35 @@ def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Arra
         x, P = x + p * (gain * e), P - p[:, None] * (gain * p)[None, :]
         return (x, P), (jnp.where(seen, e, jnp.nan), jnp.where(seen, s, jnp.nan))
 
-    def step(carry: tuple[Array, Array], sample: tuple[Array, Any]) -> tuple[Any, Any]:
+    def step(carry: _Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
         x, P = carry
         y, now = sample
         C, rest = filter_.measure(x, now)
-        (x, P), found = jax.lax.scan(correct, (x, P), (C, rest, R, y))
+        (x, P), innovation = jax.lax.scan(correct, (x, P), (C, rest, R, y))
         x, P = filter_.move(x, P, now)
-        return (x, 0.5 * (P + P.T)), found
+        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
+        # never take the difference away again.
+        return (x, 0.5 * (P + P.T)), innovation
 
-    _, (e, s) = jax.lax.scan(step, (x, P), (y, filter_.samples))
-    return e, s
+    return jax.lax.scan(step, (x, P), (y, filter_.samples))[1]
 
 
-def _local(
-    model: Model,
-    params: Any,
-    inputs: Any,
-    rows: Array,
-    dt: Any,
-    delay: Any,
-    substeps: int,
-    linear: tuple[bool, ...],
-) -> _Filter:
-    names = naming.names(model.State)
-    dtype = jax.tree.leaves(inputs)[0].dtype
-    dt = jnp.asarray(dt, dtype)
+class _Equations(NamedTuple):
+    """A model's equations over vectors, to be linearised anew at every estimate."""
 
-    g = (
-        jnp.zeros(len(names), dtype)
+    rates: Callable[[Array, Any], Array]
+    """(state (n,), Inputs) -> (n,), per second"""
+    outputs: Callable[[Array, Any], Array]
+    """(state (n,), Inputs) -> what is measured (p,)"""
+    intensity: Float[Array, " n"]
+    """of the process noise, see `Model.noise_intensity`"""
+
+
+def _equations(drive: _Drive) -> _Equations:
+    model, params = drive.model, drive.params
+    dtype = jax.tree.leaves(drive.inputs)[0].dtype
+    intensity = (
+        jnp.zeros(len(naming.names(model.State)), dtype)
         if model.noise_intensity is None
         else naming.ravel(model.noise_intensity(params), dtype)
     )
@@ -221,66 +262,101 @@ def _local(
         return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u), dtype)
 
     def outputs(x: Array, u: Any) -> Array:
-        return naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)[rows]
+        y = naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)
+        return y[drive.rows]
 
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    parts, held, acting, slopes = (dt,), (inputs,), inputs, None
-    if delay is not None:
-        acting = acting_inputs(inputs, dt, delay, n, linear)
-    if linear:
-        late = None if delay is None else split_delay(delay, dt)
-        parts, held, slopes = zip(*segments(inputs, dt, late, jnp.arange(n), linear), strict=True)
-    elif delay is not None:
-        whole, late = split_delay(delay, dt)
-        k = jnp.arange(n) - whole
-        parts, held = (late * dt, (1.0 - late) * dt), (at(inputs, k - 1), at(inputs, k))
+    return _Equations(rates, outputs, intensity)
+
+
+class _Intervals(NamedTuple):
+    """The sample intervals, in parts within which every input stays or follows a straight line."""
+
+    lengths: tuple[Any, ...]
+    """of each part [s]; the same in all intervals, so no part of a sample"""
+    inputs: tuple[Any, ...]
+    """at the begin of each part, the model's Inputs with arrays (N,)"""
+    slopes: tuple[Any, ...] | None
+    """of the inputs in each part, per second; None where all of them stay"""
+    acting: Any
+    """the Inputs (N,) at the samples themselves, when what is measured is measured"""
+
+
+def _intervals(drive: _Drive) -> _Intervals:
+    inputs, linear = drive.inputs, drive.linear
+    # The linear filter has its drive from `held_columns`; here steps need the inputs themselves.
+    first = jax.tree.leaves(inputs)[0]
+    k, dt = jnp.arange(first.shape[0]), jnp.asarray(drive.options.dt, first.dtype)
+    delays = delays_of(drive.model, drive.params, drive.options.delay, dt)
+    acting = inputs if delays is None else delayed(inputs, delays, k, linear)
+    # A late sample arrives within an interval: before it the one before it still acts.
+    lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
+    return _Intervals(lengths, held, slopes if linear else None, acting)
+
+
+def _local(drive: _Drive) -> _Filter:
+    """The extended filter: the model linearised at every estimate (Ozaki, 1985)."""
+    equations, intervals = _equations(drive), _intervals(drive)
 
     def measure(x: Array, sample: Any) -> tuple[Array, Array]:
+        # With the inputs that act at the sample, which no part of an interval begins with when they
+        # are late.
         u = sample[1]
-        C = jax.jacfwd(outputs)(x, u)
-        return C, outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
+        C = jax.jacfwd(equations.outputs)(x, u)
+        return C, equations.outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
 
-    def along(carry: tuple[Array, Array], h: Array, u: Any) -> tuple[Array, Array]:
-        x, P = carry
-        step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), g, h)
-        return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
+    def move(x: Array, P: Array, sample: Any) -> _Estimate:
+        held, _, slopes = sample
+        estimate = (x, P)
+        slopes = (None,) * len(held) if slopes is None else slopes
+        for part in zip(intervals.lengths, held, slopes, strict=True):
+            estimate = _along(equations, estimate, Segment(*part), drive.options.substeps)
+        return estimate
 
-    def ramped(carry: tuple[Array, Array], h: Array, u: Any, slope: Any) -> tuple[Array, Array]:
-        """`along` where the inputs move: time is a state more, so that a linear model's step is
-        exact (local linearisation of an equation that depends on time)."""
-        x, P = carry
-        m = len(names)
-        _, b = jax.jvp(lambda u: rates(x, u), (u,), (slope,))
-        one, none = jnp.ones(1, dtype), jnp.zeros(1, dtype)
-        A = jnp.zeros((m + 1, m + 1), dtype).at[:m, :m].set(jax.jacfwd(rates)(x, u))
-        step = van_loan(
-            A.at[:m, m].set(b), jnp.concatenate([rates(x, u), one]), jnp.concatenate([g, none]), h
-        )
-        Phi = step.Phi[:m, :m]
-        return x + step.shift[:m], product(product(Phi, P), Phi.T) + step.Q[:m, :m]
+    samples = (intervals.inputs, intervals.acting, intervals.slopes)
+    return _Filter(samples, measure, move)
 
-    def follow(carry: tuple[Array, Array], length: Array, u: Any, slope: Any) -> Any:
-        h = length / substeps
 
-        def one(carry: tuple[Array, Array], j: Array) -> tuple[Any, None]:
-            here = jax.tree.map(lambda u, slope: u + slope * (j * h), u, slope)
-            return ramped(carry, h, here, slope), None
+def _along(equations: _Equations, estimate: _Estimate, part: Segment, substeps: int) -> _Estimate:
+    """The estimate after a part of an interval, linearised anew in each of its substeps."""
+    # With no slope nothing in the loop depends on time, and it needs no counter.
+    h = part.length / substeps
+    if part.slope is None:
+        return jax.lax.scan(
+            lambda estimate, _: (_held_step(equations, estimate, h, part.inputs), None),
+            estimate,
+            None,
+            length=substeps,
+        )[0]
 
-        return jax.lax.scan(one, carry, jnp.arange(substeps, dtype=dtype))[0]
+    def step(estimate: _Estimate, j: Array) -> tuple[_Estimate, None]:
+        now = jax.tree.map(lambda u, slope: u + slope * (j * h), part.inputs, part.slope)
+        return _ramped_step(equations, estimate, part._replace(length=h, inputs=now)), None
 
-    def move(x: Array, P: Array, sample: Any) -> tuple[Array, Array]:
-        carry = (x, P)
-        if slopes is not None:
-            for length, u, slope in zip(parts, sample[0], sample[2], strict=True):
-                carry = follow(carry, length, u, slope)
-            return carry
-        for length, u in zip(parts, sample[0], strict=True):
-            carry, _ = jax.lax.scan(
-                lambda c, _, h=length / substeps, u=u: (along(c, h, u), None),
-                carry,
-                None,
-                length=substeps,
-            )
-        return carry
+    return jax.lax.scan(step, estimate, jnp.arange(substeps, dtype=estimate[0].dtype))[0]
 
-    return _Filter((held, acting, slopes), measure, move)
+
+def _held_step(equations: _Equations, estimate: _Estimate, h: Array, u: Any) -> _Estimate:
+    (x, P), rates = estimate, equations.rates
+    # With J and f at x itself: shift is the whole step of the linearised equation from there.
+    step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), equations.intensity, h)
+    return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
+
+
+def _ramped_step(equations: _Equations, estimate: _Estimate, part: Segment) -> _Estimate:
+    """`_held_step` where the inputs move."""
+    (x, P), rates = estimate, equations.rates
+    n, dtype = x.shape[0], x.dtype
+    # Time is a state more, whose rate is 1: the column of derivatives by time then makes the step
+    # of a linear model exact (local linearisation of an equation that depends on time).
+    _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
+    unit, zero = jnp.ones(1, dtype), jnp.zeros(1, dtype)
+    A = jnp.zeros((n + 1, n + 1), dtype).at[:n, :n].set(jax.jacfwd(rates)(x, part.inputs))
+    step = van_loan(
+        A.at[:n, n].set(by_time),
+        jnp.concatenate([rates(x, part.inputs), unit]),
+        # Time itself is certain: no noise acts on it.
+        jnp.concatenate([equations.intensity, zero]),
+        part.length,
+    )
+    Phi = step.Phi[:n, :n]
+    return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]

@@ -1,7 +1,7 @@
 """Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
     optimise,
-    slopes,
+    residual_and_jacobian,
 )
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.estimation.simulated_flights import predict
@@ -37,6 +37,7 @@ class StartRow(NamedTuple):
 
 
 _SHIFTS = 41
+"""time shifts tried first, 20 ms apart"""
 _NEAR = 0.1
 """standard deviations from the optimum at which it counts as reached"""
 
@@ -45,11 +46,20 @@ def first_guess(
     layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
 ) -> Float[Array, " q"]:
     """z0 with the disturbance and the time shift from a coarse search each, and a single gain by
-    linear least squares; what is not among the unknowns stays."""
+    linear least squares; what is not among the unknowns stays.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: the start values.
+    """
     z0 = noise_guess_at(layout, data, noise, z0) if layout.disturbance else z0
     if not (layout.shift or len(layout.gains) == 1):
         return z0
     grid = np.linspace(-0.8, 0.8, _SHIFTS) * MAX_TIME_SHIFT if layout.shift else np.zeros(1)
+    # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
+    # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
     coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
     costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
     costs = np.where(np.isfinite(costs), costs, np.inf)
@@ -64,8 +74,18 @@ def first_guess(
     return z0
 
 
-def noise_guess_at(layout: Layout, data: Data, noise: Noise, z0: Array) -> Array:
-    """sigma_w and tau_w of the greatest likelihood on a coarse grid about the start."""
+def noise_guess_at(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+    """
+    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
     at = len(layout.of_interest)
     steps = {
         "sigma_w": np.log(10.0) * np.arange(-3.0, 2.5),
@@ -89,7 +109,10 @@ def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
 def _scan(
     layout: Layout, data: Data, noise: Noise, z0: Array, shifts: Array
 ) -> tuple[Array, Array]:
-    """Cost and best single gain for each time shift, with means taken off both signals."""
+    """Cost and best single gain for each time shift.
+
+    Means are taken off both signals: biases are not known yet.
+    """
     q = len(layout.free)
 
     def at(shift: Array) -> tuple[Array, Array]:
@@ -103,6 +126,7 @@ def _scan(
                 ys.append(_centred(y, seen) / s[n])
                 ms.append(_centred(m, seen) / s[n])
         y, m = jnp.concatenate(ys), jnp.concatenate(ms)
+        # The simulation is linear in a single gain, so that its best value is a quotient.
         gain = jnp.ones_like(y[0])
         if len(layout.gains) == 1:
             power = jnp.sum(m * m)
@@ -114,8 +138,8 @@ def _scan(
 
 def _centred(signal: Array, seen: Array) -> Array:
     """Less its mean over the samples seen; zero elsewhere."""
-    share = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
-    return jnp.where(seen, signal - share, 0.0)
+    mean = jnp.sum(jnp.where(seen, signal, 0.0)) / jnp.sum(seen.astype(signal.dtype))
+    return jnp.where(seen, signal - mean, 0.0)
 
 
 def draw(
@@ -126,31 +150,41 @@ def draw(
     Between two bounds of one sign the draw is uniform in log, between two of different sign
     uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
     and of either sign where that may be any.
+
+    Args:
+        layout: what the unknowns are.
+        problem: with the free parameters' bounds and priors.
+        z0: the first start.
+        starts: how many, the first included.
+        seed: of the draw.
     """
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
     dtype = z0.dtype
-    for i, (free, how) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
+    for i, (free, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
         values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
         sign = jnp.asarray(coordinates.sign_or_scale(free), dtype)
         low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
-        rows[1:, i] = np.asarray(coordinates.to_coordinate(how, values, sign, low, high))
+        rows[1:, i] = np.asarray(coordinates.to_coordinate(kind, values, sign, low, high))
     return jnp.asarray(rows, dtype)
 
 
 def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
+    # Off the bounds, where a bounded coordinate has no slope left.
     share = rng.uniform(0.02, 0.98, size)
     low, high = free.lower, free.upper
     if low is not None and high is not None:
         if low * high > 0:
             return low * (high / low) ** share
         return low + (high - low) * share
-    width = 1.1
+    width = 1.1  # e^1.1 is a factor of three
     if free.prior is not None and free.prior.mean:
+        # Twice the prior: a start beyond would only be pulled back.
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
     values = free.start * np.exp(width * rng.standard_normal(size))
     if coordinates.changes_sign(free):
         values = _either_sign(free, width, rng.standard_normal((2, size)))
+    # A single bound does not shape the draw: what lies beyond it begins at the start value instead.
     return np.where([coordinates.inside(free, float(v)) for v in values], values, free.start)
 
 
@@ -174,34 +208,43 @@ class Search:
         self.bounded = layout_of(problem, problem.training, bounded=True)
 
     def run(
-        self, noise: Noise, points: Float[Array, "s q"], tell: Progress | None = None
+        self, noise: Noise, points: Float[Array, "s q"], progress: Progress | None = None
     ) -> list[Optimum]:
-        """An optimum for each start, all in the coordinates of `layout`."""
-        runs = [self._worth(run, noise) for run in self._run(self.layout, noise, points, tell)]
+        """An optimum for each start, all in the coordinates of `layout`.
+
+        Args:
+            noise: of the measurements, by which the rows are divided.
+            points: the starts.
+            progress: called with a sentence after each of several starts.
+        """
+        runs = self._run(self.layout, noise, points, progress)
+        runs = [self._better_than_nothing(run, noise) for run in runs]
         if self.bounded.kinds == self.layout.kinds:
             return runs
+        # What left its bounds begins anew from its start, in coordinates that cannot leave them.
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
             starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
-            for i, run in zip(left, self._run(self.bounded, noise, starts, tell), strict=True):
+            for i, run in zip(left, self._run(self.bounded, noise, starts, progress), strict=True):
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
         return runs
 
     def _run(
-        self, layout: Layout, noise: Noise, points: Array, tell: Progress | None
+        self, layout: Layout, noise: Noise, points: Array, progress: Progress | None
     ) -> list[Optimum]:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i in range(points.shape[0]):
-            found = optimise(layout, self.data, noise, points[i], self.max_steps)
-            run = jax.device_get(found)._replace(z=found.z)
+            optimum = optimise(layout, self.data, noise, points[i], self.max_steps)
+            # z stays on the device, from where the next program takes it.
+            run = jax.device_get(optimum)._replace(z=optimum.z)
             if not bool(run.converged) and layout.estimator.least_squares:
                 near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
                 run = run._replace(converged=np.asarray(near))
             runs.append(run)
-            if tell is not None and points.shape[0] > 1:
-                tell(f"{i + 1} of {points.shape[0]} starts done")
+            if progress is not None and points.shape[0] > 1:
+                progress(f"{i + 1} of {points.shape[0]} starts done")
         return runs
 
     def _is_near(self, layout: Layout, noise: Noise, z: Array) -> bool:
@@ -211,11 +254,11 @@ class Search:
         likelihood. What a Gauss-Newton step would gain there is the squared distance to the
         optimum in standard deviations of whichever unknown lies furthest.
         """
-        at = slopes(layout, self.data, noise, z)
+        at = residual_and_jacobian(layout, self.data, noise, z)
         gain = gauss_newton_gain(at.r, at.J)
         return bool(np.isfinite(gain) and gain < _NEAR**2)
 
-    def _worth(self, run: Optimum, noise: Noise) -> Optimum:
+    def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
         nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
@@ -243,42 +286,58 @@ class Search:
         ):
             low, high = (float(b) for b in coordinates.limits(free))
             if np.isfinite(low) and np.isfinite(high):
+                # At a bound itself the bounded coordinate is infinite.
                 edge = 1e-9 * (high - low)
                 value = min(max(value, low + edge), high - edge)
-            args = (self.data.sign[i], self.data.low[i], self.data.high[i])
+            limits = (self.data.sign[i], self.data.low[i], self.data.high[i])
             x = jnp.asarray(value, z.dtype)
-            z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *args))
+            z = z.at[i].set(coordinates.to_coordinate(new.kinds[i], x, *limits))
         return z
 
 
-def gauss_newton_gain(r: Any, J: Any) -> float:
+def gauss_newton_gain(r: Array | np.ndarray, J: Array | np.ndarray) -> float:
     """By how much a Gauss-Newton step lowers the sum of squares of residuals r (n,) with the
     Jacobian J (n, q), as the linear model of them has it; NaN where either is not finite."""
     r, J = np.asarray(r, np.float64), np.asarray(J, np.float64)
     if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return float("nan")
+    # The step takes away the part of r that lies in the span of J's columns.
     norms = np.linalg.norm(J, axis=0)
     Q, _ = np.linalg.qr(J / np.where(norms > 0, norms, 1.0))
     return float(np.sum((Q.T @ r) ** 2))
 
 
-def named_values(layout: Layout, data: Data, z: Array) -> dict[str, float]:
-    """The free parameters' values at z."""
+def named_values(layout: Layout, data: Data, z: Float[Array, " q"]) -> dict[str, float]:
+    """The free parameters' values at z, by name, SI.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
     at, sign, low, high = (np.asarray(v) for v in (z, data.sign, data.low, data.high))
     return {
-        n: float(coordinates.to_value(how, at[i], sign[i], low[i], high[i]))
-        for i, (n, how) in enumerate(zip(layout.free, layout.kinds, strict=True))
+        n: float(coordinates.to_value(kind, at[i], sign[i], low[i], high[i]))
+        for i, (n, kind) in enumerate(zip(layout.free, layout.kinds, strict=True))
     }
 
 
 def table(
     layout: Layout, data: Data, points: Float[Array, "s q"], runs: list[Optimum]
 ) -> tuple[StartRow, ...]:
-    """Start, end and cost of every run, best first; equal optima share a number."""
+    """Start, end and cost of every run, best first; equal optima share a number.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        points: where the runs began.
+        runs: their ends, in the same order.
+    """
     order = sorted(range(len(runs)), key=lambda i: rank(runs[i]))
     rows, optimum, last = [], 0, None
     for i in order:
         cost, converged = _cost(runs[i]), bool(runs[i].converged)
+        # By their costs: along a direction that the data leave open, equal optima differ in place.
         if converged and (last is None or cost > last * (1.0 + 1e-6) + 1e-300):
             optimum, last = optimum + 1, cost
         rows.append(
@@ -296,9 +355,11 @@ def table(
 
 def rank(run: Optimum) -> tuple[bool, float]:
     """Sorts runs: those that converged first, then by cost."""
+    # False sorts before True.
     return not bool(run.converged), _cost(run)
 
 
 def _cost(run: Optimum) -> float:
+    # NaN would compare as neither better nor worse, and sort at random.
     cost = float(run.cost)
     return cost if np.isfinite(cost) else float("inf")

@@ -16,6 +16,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 _ROUNDS = 8
+"""of the optimiser at most"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
 _EXPLAINED = 2.0
@@ -51,9 +52,12 @@ def noise_guess(signal: np.ndarray) -> float:
     """
     d = np.diff(signal, 3)
     d, signal = d[np.isfinite(d)], signal[np.isfinite(signal)]
+    # Where gaps leave no four samples in a row, the signal itself bounds its noise.
     if not d.size:
         d = signal - np.median(signal)
+    # The median of |x| of a normal x is 0.674 sd; 1 + 9 + 9 + 1 = 20.
     guess = float(np.median(np.abs(d)) / 0.6744897501960817 / np.sqrt(20.0))
+    # A record without noise: rows divided by zero would be infinite.
     floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
     return max(guess, floor, 1e-300)
 
@@ -65,10 +69,12 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
     """
     dtype = np.dtype(jnp.result_type(float))
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
+    # The median: one flight in which an output hardly moves, or jumps, has no say.
     if estimator_of(problem.method).shared_noise:
         outputs = {n for guess in guesses for n in guess}
         pooled = {n: float(np.median([g[n] for g in guesses if n in g])) for n in outputs}
         guesses = [{n: pooled[n] for n in guess} for guess in guesses]
+    # Sorted, as `data_of` has the outputs: JAX sorts the names in what it compiles.
     sd = tuple(
         {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in sorted(flight.outputs)}
         for flight, guess in zip(flights, guesses, strict=True)
@@ -82,7 +88,9 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     Source: relaxation of the noise covariance, Jategaonkar (2006), section 4.4.
 
     Args:
+        search: the optimiser over the problem.
         noise: that `best` was found with.
+        best: the optimum to begin with.
     """
     layout, estimator = search.layout, search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
@@ -95,9 +103,11 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
             for sd, before in zip(new.sd, noise.sd, strict=True)
             for n in before
         )
+        # Residuals that overflowed show no noise.
         if not np.isfinite(change):
             break
         best, noise = best._replace(z=z), new
+        # A search that failed with one noise is not repeated with another.
         if change < _UNCHANGED or not bool(best.converged):
             break
         if not estimator.noise_matters(search.problem, layout, fall):
@@ -108,7 +118,13 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:
-    """The optimum that a search from z leads to, its noise relaxed from `noise`."""
+    """The optimum that a search from z leads to, its noise relaxed from `noise`.
+
+    Args:
+        search: the optimiser over the problem.
+        noise: to begin with.
+        z: where to begin.
+    """
     [best] = search.run(noise, z[None, :])
     return relax_noise_covariance(search, noise, best)
 
@@ -134,12 +150,14 @@ def better_of_two_guesses(
     the say, and outputs weighed by their own size may lead elsewhere. One output has no weights.
 
     Args:
+        search: the optimiser over the problem.
         points: the starts; the first is begun from again.
         optimum: that the guess from differences led to.
         flights: those fitted.
     """
     layout = search.layout
     guesses = [{n: noise_guess(y) for n, y in f.outputs.items()} for f in flights]
+    # One output has no weights, and a filter's noise is not relaxed output by output.
     several = sum(len(o) for o in layout.outputs) > 1
     if not layout.estimator.least_squares or not several or _explained(optimum.noise, guesses):
         return optimum
@@ -149,7 +167,8 @@ def better_of_two_guesses(
         for f, guess in zip(flights, guesses, strict=True)
     )
     other = relaxed_from(search, Noise(sd, optimum.noise.log_variance_ratio), points[0])
-    first, second = (_log_posterior(layout, search.data, one) for one in (optimum, other))
+    first, second = (_log_posterior(layout, search.data, o) for o in (optimum, other))
+    # An optimum is not given up for a point on the way to one, however likely that is.
     worse = bool(optimum.best.converged) and not bool(other.best.converged)
     if worse or not second > first + _WORTH_TELLING:
         return optimum._replace(trace=(*optimum.trace, *other.trace))
@@ -179,5 +198,5 @@ def _log_posterior(layout: Layout, data: Data, optimum: RelaxedOptimum) -> float
         for by_name, sd in zip(e.raw, optimum.noise.sd, strict=True)
         for n, r in by_name.items()
     )
-    beside = float(np.sum(np.square(np.asarray(e.r, np.float64)))) - measured
-    return layout.estimator.log_likelihood(layout, data, optimum.noise, e) - 0.5 * beside
+    of_priors = float(np.sum(np.square(np.asarray(e.r, np.float64)))) - measured
+    return layout.estimator.log_likelihood(layout, data, optimum.noise, e) - 0.5 * of_priors

@@ -26,17 +26,32 @@ class OutputError(Estimator):
     windows = True
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """Signal after signal; with windows what the states jump between them follows."""
+        """Signal after signal; with windows the defects between them follow.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: of the measurements, by which the rows are divided.
+            u: the unknowns, in the units of the model.
+        """
         runs = predict(layout, data, u)
         y, sd = measured_signals(layout, data, noise)
         simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])
         error = y - joined_biases(u)[signal_numbers(layout, data)] - simulated
-        # A missing sample says nothing: its row is zero, and so is its derivative.
+        # A missing sample says nothing: its row is zero, and so is its derivative. Left out it
+        # would change the shapes, and with them the program, from record to record.
         rows = jnp.where(jnp.isfinite(y), error, 0.0) / sd
         return Residuals(jnp.concatenate([rows, *_defects(layout, data, u, runs)]), runs)
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
-        """The simulated flights: with no disturbance all runs are the same."""
+        """The simulated flights: with no disturbance all runs are the same.
+
+        Args:
+            reached: where the fit ended.
+            u: the unknowns there.
+            runs: how many records; one simulation serves them all.
+            seed: of nothing here, since nothing is drawn.
+        """
         layout = reached.layout
         simulated = predict(layout, reached.data, u)
         return [
@@ -50,9 +65,10 @@ def _defects(layout: Layout, data: Data, u: Unknowns, runs: tuple[Run, ...]) -> 
     their sd, window by window."""
     rows = []
     for flight, run, begun in zip(data.flights, runs, u.states, strict=True):
+        # Without continuity each window has an initial state that nothing ties to its neighbours.
         if layout.continuity is None or run.ends is None:
             continue
-        # The scale is ten times what the state does.
+        # The scale is ten times what the state does, and continuity a part of what it does.
         jumps = [
             (getattr(run.ends, n)[:-1] - getattr(begun, n)[1:])
             / (0.1 * layout.continuity * flight.state_scale[n])

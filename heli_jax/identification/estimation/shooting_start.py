@@ -19,14 +19,16 @@ from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
-from heli_jax.identification.unknowns.layout import Noise, layout_of
+from heli_jax.identification.unknowns.layout import Layout, Noise, layout_of
 
 FAR_WORSE = 10.0
 """times the misfit of no model at all from which a start is taken for one that diverges"""
 _WINDOWS = 16
+"""of the shortest flight, unless they had too few samples each"""
 _PER_STATE = 5
 """samples that a window has at least for each initial state that it brings"""
 _STEPS = 60
+"""of the optimiser over the windows: what has not arrived by then is only a start"""
 
 SAID = (
     "The simulation diverges at the start values, so the parameters were first fitted to short "
@@ -41,36 +43,48 @@ def by_windows(
     and the simulation diverges there; None where that is not so or windows do not help.
 
     Args:
+        problem: what is fitted.
+        search: the optimiser over the whole record.
+        noise: that it searches with.
         e: at z0.
+        z0: the start.
         best: the best optimum so far.
     """
     if bool(best.converged) or not _applies(problem) or not _diverges(search, noise, e):
         return None
     cut = _cut(problem)
-    if cut is None:
+    short = None if cut is None else _fit_of_windows(cut, search.layout, noise, z0)
+    if short is None:
         return None
-    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
-    z = start_vector(layout, data, cut)
-    z = z.at[: layout.first_nuisance].set(z0[: layout.first_nuisance])
-    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
-    if not (np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))):
-        return None
-    begin = z0.at[: layout.first_nuisance].set(short.z[: layout.first_nuisance])
-    [run] = search.run(noise, begin[None, :])
+    # The windows' initial states stay behind: they were free to take up what the parameters missed.
+    [run] = search.run(noise, z0.at[: short.size].set(short)[None, :])
     return run if starting.rank(run) < starting.rank(best) else None
 
 
+def _fit_of_windows(cut: Problem, whole: Layout, noise: Noise, z0: Array) -> Array | None:
+    """What the flights share, fitted to the windows; None where that is not finite."""
+    layout, data = layout_of(cut, cut.training), data_of(cut, cut.training)
+    # It stands first in z in either layout; behind it windows have more.
+    z = start_vector(layout, data, cut)
+    z = z.at[: whole.first_nuisance].set(z0[: whole.first_nuisance])
+    [short] = starting.Search(cut, layout, data, _STEPS).run(noise, z[None, :])
+    # Not whether it converged: half a way out of the growth is enough to begin from.
+    finite = np.isfinite(short.cost) and bool(jnp.all(jnp.isfinite(short.z)))
+    return short.z[: whole.first_nuisance] if finite else None
+
+
 def _applies(problem: Problem) -> bool:
+    # What `Problem` accepts with windows, and has none yet.
     return (
         estimator_of(problem.method).windows
         and problem.window is None
         and problem.nuisance.initial_state
-        and not problem.nuisance.time_shift
     )
 
 
 def _diverges(search: starting.Search, noise: Noise, e: Evaluation) -> bool:
     """Whether the misfit is far larger than that of no model at all."""
+    # Squares of a run that diverged may overflow: infinity is past the limit too.
     with np.errstate(all="ignore"):
         misfit = float(np.sum(np.square(np.asarray(e.r, np.float64))))
     return misfit > FAR_WORSE * search.misfit_of_nothing(noise)
@@ -82,5 +96,6 @@ def _cut(problem: Problem) -> Problem | None:
     flights = problem.training
     dt = max(f.dt for f in flights)
     shortest = min(f.n_samples * f.dt for f in flights)
+    # Short enough that nothing grows, long enough that a window's samples outnumber its unknowns.
     window = max(shortest / _WINDOWS, max(8, _PER_STATE * states) * dt)
     return replace(problem, window=window) if window < 0.5 * shortest else None

@@ -11,17 +11,42 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
+from heli_jax.simulation.delays import Delays, at, delays_of
 from heli_jax.simulation.simulate import Trajectory, simulate
 
+# Params, State and Inputs are a model's own classes: they are annotated Any.
 
-def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> tuple[Any, Any]:
-    """Parameters and inputs of the i-th flight at the unknowns: (logged + offset) * gain."""
+
+class Drive(NamedTuple):
+    """What moves the model through one flight."""
+
+    params: Any
+    """the model's Params, SI"""
+    inputs: Any
+    """the model's Inputs, arrays (N,)"""
+    dt: Any
+    """[s]"""
+    state: Any
+    """the model's State at the first sample; None where it is the model's own"""
+
+
+def driven(layout: Layout, data: Data, u: Unknowns, i: int) -> Drive:
+    """What moves the model through the i-th flight: inputs are (logged + offset) * gain.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        u: the unknowns.
+        i: the flight's number.
+    """
     flight, offsets = data.flights[i], u.offsets[i]
+    # The later wins: what was known of this flight alone stands above what is estimated of all.
     params = layout.model.Params(**{**data.base, **u.params, **u.noise, **flight.known})
     inputs = naming.asdict(flight.inputs)
+    # The offset in the log's own numbers, so that it does not change with the gain.
     inputs = {n: v + offsets[n] if n in offsets else v for n, v in inputs.items()}
     inputs = {n: v * u.gains[n] if n in u.gains else v for n, v in inputs.items()}
-    return params, layout.model.Inputs(**inputs)
+    return Drive(params, layout.model.Inputs(**inputs), flight.dt, u.states[i])
 
 
 class SimulatedOutputs(NamedTuple):
@@ -50,86 +75,126 @@ def predict(layout: Layout, data: Data, u: Unknowns) -> tuple[Run, ...]:
     """The simulated flights (without bias).
 
     Windows of one length are simulated together, whichever flight they belong to.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        u: the unknowns.
     """
-    alone, groups = {}, {}
+    by_flight, groups = {}, {}
     for i, flight in enumerate(data.flights):
+        # What is compiled differs with each of these: only equal ones run side by side.
         key = (layout.windows[i][1], tuple(flight.known), layout.holds[i])
         groups.setdefault(key, []).append(i)
     for (m, *_), members in groups.items():
         if len(members) == 1 and layout.windows[members[0]][0] == 1:
             i = members[0]
-            params, inputs = driven(layout, data, u, i)
-            dt, state = data.flights[i].dt, u.states[i]
-            run = _simulated_one(layout, i, params, inputs, dt, state, u.shift)
+            run = _simulated(layout, i, driven(layout, data, u, i), u.shift)
             measured = [getattr(run.outputs, n) for n in layout.outputs[i]]
-            alone[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
+            by_flight[i] = Run(jnp.stack(jax.tree.leaves(run.states)), jnp.stack(measured), None)
         else:
-            alone |= _together(layout, data, u, members, m)
-    return tuple(alone[i] for i in range(len(data.flights)))
+            by_flight |= _side_by_side(layout, data, u, members, m)
+    return tuple(by_flight[i] for i in range(len(data.flights)))
 
 
-def _simulated_one(
-    layout: Layout, i: int, params: Any, inputs: Any, dt: Any, state: Any, shift: Any
-) -> Trajectory:
+def _simulated(layout: Layout, i: int, drive: Drive, shift: Any) -> Trajectory:
     """A run with inputs that move between samples as those of the i-th flight."""
     return simulate(
         layout.model,
-        params,
-        inputs,
-        dt=dt,
-        initial_state=state,
+        drive.params,
+        drive.inputs,
+        dt=drive.dt,
+        initial_state=drive.state,
         solver=layout.solver,
         substeps=layout.substeps,
         delay=shift,
         block=layout.block,
+        # Least squares differentiates forwards alone, and this compiles faster than both modes.
         adjoint=dfx.ForwardMode(),
         hold=layout.hold(i),
     )
 
 
-def _together(
+def _side_by_side(
     layout: Layout, data: Data, u: Unknowns, members: list[int], m: int
 ) -> dict[int, Run]:
     """The runs of several windows of m samples, by vmap."""
     chained = any(layout.windows[i][0] > 1 for i in members)
-    each = []
-    for i in members:
-        flight, count = data.flights[i], layout.windows[i][0]
-        _, inputs = driven(layout, data, u, i)
-        n = jax.tree.leaves(inputs)[0].shape[0]
-        # With several windows one sample more, at which the next begins.
-        at = np.minimum(m * np.arange(count)[:, None] + np.arange(m + chained)[None, :], n - 1)
-        state = u.states[i]
-        if state is not None:
-            state = jax.tree.map(lambda v, c=count: jnp.broadcast_to(v, (c,)), state)
-        known = {k: jnp.broadcast_to(v, (count,)) for k, v in flight.known.items()}
-        cut = jax.tree.map(lambda v, at=at: v[at], inputs)
-        each.append((cut, known, jnp.broadcast_to(flight.dt, (count,)), state))
+    # With several windows one sample more, at which the next begins.
+    each = [_cut(layout, data, u, i, m + chained) for i in members]
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
-    def one(inputs: Any, known: Any, dt: Any, state: Any) -> Any:
+    def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
-        run = _simulated_one(layout, members[0], params, inputs, dt, state, u.shift)
-        return run.states, run.outputs
+        # Any member's number will do: the inputs of all of them move alike between samples.
+        late = delays_of(layout.model, params, u.shift, dt)
+        if late is not None:
+            # The whole samples were taken off when the windows were cut, but for the one before.
+            late = Delays(late.groups, tuple(-1 for _ in late.whole), late.rest)
+        run = _simulated(layout, members[0], Drive(params, inputs, dt, state), late)
+        return jax.tree.map(lambda v: v[: m + chained], (run.states, run.outputs))
 
-    states, outputs = jax.vmap(one)(*stacked)
+    states, outputs = jax.vmap(window)(*stacked)
     names = naming.names(layout.model.Outputs)
     # All of them in one array, since XLA makes a kernel of every part that is cut out of another.
     x, y = (jnp.stack(jax.tree.leaves(v)) for v in (states, outputs))
-    found, first = {}, 0
+    runs, first = {}, 0
     for i in members:
+        # The windows lie flight after flight along the batch.
         count = layout.windows[i][0]
         n = jax.tree.leaves(data.flights[i].inputs)[0].shape[0]
-        mine = slice(first, first + count)
+        windows = slice(first, first + count)
 
-        def joined(v: Array, mine: slice = mine, n: int = n) -> Array:
-            return v[:, mine, :m].reshape(v.shape[0], -1)[:, :n]
+        def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
+            # The sample after these m is the next window's first; past n stand repetitions.
+            return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 
-        ends = jax.tree.map(lambda v, mine=mine: v[mine, -1], states) if count > 1 else None
+        ends = None
+        if count > 1:
+            ends = jax.tree.map(lambda v, windows=windows: v[windows, -1], states)
         rows = np.array([names.index(name) for name in layout.outputs[i]])
-        found[i] = Run(joined(x), joined(y[rows]), ends)
+        runs[i] = Run(joined(x), joined(y[rows]), ends)
         first += count
-    return found
+    return runs
+
+
+def _cut(
+    layout: Layout, data: Data, u: Unknowns, i: int, samples: int
+) -> tuple[Any, dict[str, Array], Array, Any]:
+    """Inputs (windows, samples), known parameters, sample time and initial states (windows,)."""
+    flight, (count, m) = data.flights[i], layout.windows[i]
+    drive = driven(layout, data, u, i)
+    late = delays_of(layout.model, drive.params, u.shift, flight.dt)
+    # The last window may reach past the record: it is filled up with the last sample.
+    of_window = m * np.arange(count)[:, None] + np.arange(samples)[None, :]
+    state = u.states[i]
+    if state is not None:
+        state = jax.tree.map(lambda v: jnp.broadcast_to(v, (count,)), state)
+    known = {k: jnp.broadcast_to(v, (count,)) for k, v in flight.known.items()}
+    cut = _with_lead(drive.inputs, of_window, late)
+    return cut, known, jnp.broadcast_to(flight.dt, (count,)), state
+
+
+def _with_lead(inputs: Any, samples: np.ndarray, late: Delays | None) -> Any:
+    """The inputs (windows, m) of windows, read as late as they act.
+
+    Where inputs are late each window has the sample before its first in front, which acts there
+    until the first one does: (windows, m + 1).
+
+    Args:
+        inputs: arrays (N,).
+        samples: those of each window (windows, m).
+        late: None where no input is.
+    """
+    if late is None:
+        return at(inputs, samples)
+    lead = np.concatenate([samples[:, :1] - 1, samples], axis=1)
+    leaves, structure = jax.tree.flatten(at(inputs, lead, late))
+    for i, v in enumerate(jax.tree.leaves(inputs)):
+        # One that acts at once is read without a shift, and needs nothing in front.
+        if late.group(i) is None:
+            leaves[i] = at(v, np.concatenate([samples, samples[:, -1:] + 1], axis=1))
+    return jax.tree.unflatten(structure, leaves)
 
 
 def joined_biases(u: Unknowns) -> Array:
@@ -137,17 +202,23 @@ def joined_biases(u: Unknowns) -> Array:
     return jnp.stack([b for bias in u.biases for b in bias.values()])
 
 
-def shown_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
-    """Of the simulated flights what is shown."""
+def outputs_of(u: Unknowns, runs: tuple[Run, ...]) -> SimulatedOutputs:
+    """What reports show of the simulated flights."""
     rms = [jnp.sqrt(jnp.mean(jnp.square(run.states), axis=1)) for run in runs]
     return SimulatedOutputs(tuple(run.outputs for run in runs), joined_biases(u), jnp.stack(rms))
 
 
 @eqx.filter_jit
-def simulated_at(layout: Layout, data: Data, z: Array) -> SimulatedOutputs:
-    """What is simulated at z, without any derivative."""
+def simulated_at(layout: Layout, data: Data, z: Float[Array, " q"]) -> SimulatedOutputs:
+    """What is simulated at z, without any derivative.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
     u = unpack(layout, data, z)
-    return shown_of(u, predict(layout, data, u))
+    return outputs_of(u, predict(layout, data, u))
 
 
 def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, np.ndarray], ...]:
@@ -156,6 +227,7 @@ def with_biases(layout: Layout, simulated: SimulatedOutputs) -> tuple[dict[str, 
     Args:
         simulated: as NumPy arrays.
     """
+    # In the order of `joined_biases`.
     bias = iter(simulated.biases)
     return tuple(
         {n: np.asarray(y + next(bias)) for n, y in zip(names, run, strict=True)}

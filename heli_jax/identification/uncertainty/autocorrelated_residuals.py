@@ -18,10 +18,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import slopes
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 _LENGTH = 6.0
@@ -39,16 +39,16 @@ _FLATTEST = 0.05
 class Sandwich(NamedTuple):
     """The covariance of all unknowns z (q,) with autocorrelated residuals, in parts."""
 
-    norms: np.ndarray
-    """(q,) of the columns of J, by which all else is scaled"""
-    white: np.ndarray
-    """(q, q) inverse of J'J"""
-    bread: np.ndarray
-    """(q, q) inverse of the Hessian"""
+    norms: Float[np.ndarray, " q"]
+    """of the columns of J, by which all else is scaled"""
+    white: Float[np.ndarray, "q q"]
+    """inverse of J'J"""
+    bread: Float[np.ndarray, "q q"]
+    """inverse of the Hessian"""
     parts: tuple["_Part", ...]
     """by flight"""
-    rest: np.ndarray
-    """(q, q) J'J of the rows that are no measurements (priors), whose variance is known"""
+    rest: Float[np.ndarray, "q q"]
+    """J'J of the rows that are no measurements (priors), whose variance is known"""
 
     def inflation(self, along: np.ndarray | None = None) -> np.ndarray:
         """How much wider than white noise says the standard deviations of the combinations
@@ -62,6 +62,7 @@ class Sandwich(NamedTuple):
     def quantile(self, along: np.ndarray | None = None) -> np.ndarray:
         """Student's 97.5 % quantile of each combination, as `inflation` has them."""
         _, freedom = self._variance(self._scaled(along))
+        # Below one degree of freedom the quantile has no use: 12.7 standard deviations are enough.
         return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
     def covariance(self, along: np.ndarray) -> np.ndarray:
@@ -71,6 +72,7 @@ class Sandwich(NamedTuple):
         whole = D @ (self.rest + sum(p.meat for p in self.parts)) @ D.T
         variance, _ = self._variance(along)
         plain = np.diag(whole)
+        # `_variance` allows on each variance for what the fit took; the correlations stay.
         factor = np.sqrt(np.divide(variance, plain, out=np.ones_like(plain), where=plain > 0))
         return whole * np.outer(factor, factor)
 
@@ -84,9 +86,11 @@ class Sandwich(NamedTuple):
         variance = np.sum(D * (self.rest @ D), axis=0)
         uncertainty = np.zeros_like(variance)
         for part in self.parts:
-            own, freedom = part.variance(D)
-            variance = variance + own
-            uncertainty += own**2 / freedom
+            of_flight, freedom = part.variance(D)
+            variance = variance + of_flight
+            uncertainty += of_flight**2 / freedom
+        # Satterthwaite: the degrees of freedom of a sum. Where priors alone speak, their variance
+        # is known, and the quotient would be one of zeros.
         known = uncertainty <= 1e-12 * variance**2
         return variance, np.where(known, 1e12, variance**2 / np.where(known, 1.0, uncertainty))
 
@@ -94,18 +98,17 @@ class Sandwich(NamedTuple):
 class _Part(NamedTuple):
     """What one flight adds: sensitivities and residuals as spectra over f frequencies."""
 
-    J: np.ndarray
-    """(f, outputs, q)"""
-    S: np.ndarray
-    """(f, outputs, outputs) spectrum of the residuals"""
-    meat: np.ndarray
-    """(q, q) J' R J"""
-    plain: np.ndarray
-    """(q, q) J'J"""
-    taken: np.ndarray
-    """(q, q) what the fit takes from J' R J, were R one"""
-    window: np.ndarray
-    """over all lags, (2 f - 2,)"""
+    J: Complex[np.ndarray, "f outputs q"]
+    S: Complex[np.ndarray, "f outputs outputs"]
+    """spectrum of the residuals"""
+    meat: Float[np.ndarray, "q q"]
+    """J' R J"""
+    plain: Float[np.ndarray, "q q"]
+    """J'J"""
+    taken: Float[np.ndarray, "q q"]
+    """what the fit takes from J' R J, were R one"""
+    window: Float[np.ndarray, " 2*f-2"]
+    """over all lags"""
     seen: int
     """samples, of the output that has most"""
 
@@ -113,22 +116,29 @@ class _Part(NamedTuple):
         """Of D' J' r for the columns of D (q, k), and its degrees of freedom."""
         W = self.J @ D
         power = np.sum(np.real(W.conj() * (self.S @ W)), axis=1)
+        # Its value at lag zero is the variance; what the window passes of its square says from how
+        # many independent parts of the spectrum that was made.
         p = np.fft.irfft(power, self.window.size, axis=0)
         spent = np.sum(np.square(self.window[:, None] * p), axis=0)
         freedom = self.seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
         white = np.sum(D * (self.plain @ D), axis=0)
         taken = np.sum(D * (self.taken @ D), axis=0) / np.where(white > 0, white, 1.0)
+        # HC2 divides by what the fit leaves. Where it leaves next to nothing that is rounding, so
+        # the variance grows by a factor of four at most.
         return np.maximum(p[0], 0.0) / (1.0 - np.clip(taken, 0.0, 0.75)), np.maximum(freedom, 1.0)
 
 
 def sandwich(
-    layout: Layout, data: Data, e: Evaluation, curvature: np.ndarray | None = None
+    layout: Layout, data: Data, e: Evaluation, curvature: Float[np.ndarray, "q q"] | None = None
 ) -> Sandwich:
     """The covariance of the unknowns at an optimum of output error.
 
     Several outputs of a flight enter with their cross-covariances, flights are independent.
 
     Args:
+        layout: of the unknowns z (q,).
+        data: says which samples are missing.
+        e: residuals and Jacobian at the optimum.
         curvature: (q, q) what the residuals add to J'J in the Hessian (`residual_curvature`);
             nothing unless given.
     """
@@ -136,12 +146,14 @@ def sandwich(
     norms = np.linalg.norm(J, axis=0)
     scale = np.where(norms > 0, norms, 1.0)
     J = J / scale
+    # The singular values of J are those of its triangle, which is (q, q) however long the record.
     _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
     kept = singular > 1e-10 * max(singular[0], 1e-300)
     T = right[kept].T / singular[kept]
     bread = white = T @ T.T
     if curvature is not None:
         bread = _bread(T, singular[kept], curvature / np.outer(scale, scale))
+    # Rows stand flight after flight, output after output; those of the priors come last.
     at, parts = 0, []
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):
         measured = np.stack([np.asarray(flight.outputs[n]) for n in outputs])
@@ -157,51 +169,73 @@ def sandwich(
 
 def residual_curvature(
     layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> np.ndarray:
+) -> Float[np.ndarray, "q q"]:
     """What the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
-    By central differences of J'r along the named unknowns; the others (initial states, biases)
-    enter linearly, or are so near to it that they are left at J'J. Zero where it is not finite.
+    By central differences of J'r along the unknowns of interest. Zero where it is not finite.
+
+    Args:
+        layout: of the unknowns.
+        data: the flights.
+        noise: that whitens the residuals.
+        z: the optimum (q,), in the optimiser's coordinates.
     """
+    # The fit has compiled `slopes`; second derivatives would be another program, and a longer one.
     step = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
-    at = slopes(layout, data, noise, z)
+    at = residual_and_jacobian(layout, data, noise, z)
     J = np.asarray(at.J, np.float64)
     q, k = J.shape[1], len(layout.of_interest)
-    found = np.zeros((q, q))
+    curvature = np.zeros((q, q))
     with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
+        # Initial states and biases enter linearly, or so nearly that they are left at J'J.
         for i in range(k):
             ends = []
             for sign in (1.0, -1.0):
-                near = slopes(layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype)))
+                near = residual_and_jacobian(
+                    layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype))
+                )
                 ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
-            found[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
-    found[:k, :k] = 0.5 * (found[:k, :k] + found[:k, :k].T)
-    found[:k, k:] = found[k:, :k].T
-    return found if np.all(np.isfinite(found)) else np.zeros((q, q))
+            curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
+    # A Hessian is symmetric, its differences only nearly so.
+    curvature[:k, :k] = 0.5 * (curvature[:k, :k] + curvature[:k, :k].T)
+    curvature[:k, k:] = curvature[k:, :k].T
+    return curvature if np.all(np.isfinite(curvature)) else np.zeros((q, q))
 
 
-def _bread(T: np.ndarray, singular: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+def _bread(
+    T: Float[np.ndarray, "q k"], singular: Float[np.ndarray, " k"], curvature: np.ndarray
+) -> Float[np.ndarray, "q q"]:
     """Inverse of J'J + curvature, where T'(J'J)T = 1."""
+    # Along the flattest directions the differences are rounding, divided by a small number.
     resolved = singular > _RESOLVED * singular[0]
     added = T.T @ curvature @ T
     added[~resolved] = 0.0
     added[:, ~resolved] = 0.0
     values, vectors = np.linalg.eigh(np.eye(singular.size) + added)
     V = T @ vectors
+    # Residuals as large as the response can make the Hessian all but singular or indefinite, and
+    # the inverse of that says nothing.
     return V / np.maximum(values, _FLATTEST) @ V.T
 
 
 def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Part:
-    """Of sensitivities (outputs, N, q) and residuals (outputs, N), zero where not seen."""
+    """Of sensitivities (outputs, N, q) and residuals (outputs, N), zero where not seen.
+
+    Args:
+        seen: (outputs, N) where something is measured.
+        T: (q, k) that whitens J'J.
+    """
     S, apart, window = _spectrum(r, seen)
     size = window.size
     J = np.moveaxis(np.fft.rfft(J, size, axis=1), 0, 1)
     U = J @ T
-    lost = np.fft.irfft(U @ U.conj().swapaxes(1, 2), size, axis=0) * apart
-    L = np.fft.rfft(lost * window[:, None, None], axis=0)
+    # U U' is the projection on the sensitivities: its autocovariance is what a fit to white noise
+    # takes from that of the residuals.
+    fitted = np.fft.irfft(U @ U.conj().swapaxes(1, 2), size, axis=0) * apart
+    L = np.fft.rfft(fitted * window[:, None, None], axis=0)
     most = int(seen.sum(axis=1).max())
-    one = np.broadcast_to(np.eye(J.shape[1]), S.shape)
-    meat, plain, taken = (_weighed(J, x, size) for x in (S, one, L))
+    white = np.broadcast_to(np.eye(J.shape[1]), S.shape)
+    meat, plain, taken = (_weighed(J, x, size) for x in (S, white, L))
     return _Part(J, S, meat, plain, taken, window, most)
 
 
@@ -209,13 +243,15 @@ def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     """Spectrum (f, outputs, outputs) of residuals (outputs, N), zero where not seen; one over the
     number of pairs (2 f - 2, outputs, outputs), and the lag window (2 f - 2,)."""
     k, n = r.shape
+    # A power of two, and twice the record at least: circular products then wrap onto zeros alone.
     size = 2 << (n - 1).bit_length()
     pairs, R = _pairs(seen, size), _pairs(r, size)
+    # Over the pairs that are seen, so that gaps do not count as residuals of zero.
     apart = np.divide(1.0, pairs, where=pairs > 0.5, out=np.zeros_like(pairs))
     R *= apart
-    window = _window(n, size, [_memory(R[:, a, a], pairs[:, a, a], n) for a in range(k)])
+    window = _window(n, size, [_correlation_time(R[:, a, a], pairs[:, a, a], n) for a in range(k)])
     S = np.fft.rfft(R * window[:, None, None], axis=0)
-    # Counting pairs, a spectrum may come out below zero somewhere.
+    # With pairs counted, a spectrum may come out below zero somewhere.
     values, vectors = np.linalg.eigh(0.5 * (S + S.conj().swapaxes(1, 2)))
     S = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.conj().swapaxes(1, 2)
     return S, apart, window
@@ -226,6 +262,11 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
     outputs, of residuals (outputs, N) that are NaN where nothing is measured.
 
     By circulant embedding (Dietrich and Newsam, 1997).
+
+    Args:
+        residual: (outputs, N), NaN where nothing is measured.
+        runs: how many to draw.
+        rng: drawn from, so that a seed gives the same again.
     """
     seen = ~np.isnan(residual)
     r = np.where(seen, residual, 0.0)
@@ -234,23 +275,25 @@ def drawn(residual: np.ndarray, runs: int, rng: np.random.Generator) -> np.ndarr
     values, vectors = np.linalg.eigh(S)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     noise = np.empty((runs, n, k))
-    for made in noise:
+    # One run at a time: the transforms are two to four times as long as what is kept of them.
+    for run in noise:
         white = np.fft.rfft(rng.standard_normal((size, k)), axis=0)
-        made[:] = np.fft.irfft((root @ white[..., None])[..., 0], size, axis=0)[:n]
+        run[:] = np.fft.irfft((root @ white[..., None])[..., 0], size, axis=0)[:n]
     # The variance is that of the residuals, whatever was held at zero in the spectrum.
-    have = np.fft.irfft(np.real(np.diagonal(S, axis1=1, axis2=2)), size, axis=0)[0]
-    want = np.sum(r**2, axis=1) / np.maximum(seen.sum(axis=1), 1)
-    scale = np.sqrt(np.divide(want, have, out=np.zeros(k), where=have > 0))
+    variance = np.fft.irfft(np.real(np.diagonal(S, axis1=1, axis2=2)), size, axis=0)[0]
+    expected = np.sum(r**2, axis=1) / np.maximum(seen.sum(axis=1), 1)
+    scale = np.sqrt(np.divide(expected, variance, out=np.zeros(k), where=variance > 0))
     return np.moveaxis(noise * scale, 1, 2)
 
 
 def _weighed(J: np.ndarray, S: np.ndarray, size: int) -> np.ndarray:
     """The sum over samples i, k of J_i R(i - k) J_k' by spectra, (q, q)."""
+    # Real signals: each frequency stands for its negative too, but for zero and Nyquist's.
     twice = np.full(S.shape[0], 2.0 / size)
     twice[[0, -1]] = 1.0 / size
     left = (J * twice[:, None, None]).reshape(-1, J.shape[2])
-    found = np.real(left.conj().T @ (S @ J).reshape(-1, J.shape[2]))
-    return 0.5 * (found + found.T)
+    total = np.real(left.conj().T @ (S @ J).reshape(-1, J.shape[2]))
+    return 0.5 * (total + total.T)  # symmetric but for rounding
 
 
 def _pairs(x: np.ndarray, size: int) -> np.ndarray:
@@ -259,23 +302,24 @@ def _pairs(x: np.ndarray, size: int) -> np.ndarray:
     return np.fft.irfft(spectra[:, :, None] * spectra[:, None, :].conj(), size, axis=0)
 
 
-def _memory(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
-    """The sum of squared autocorrelations over all lags, in samples; 1 for white noise.
-
-    What the noise of the autocorrelations adds to it is taken off again.
-    """
+def _correlation_time(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
+    """The sum of squared autocorrelations over all lags, in samples; 1 for white noise."""
+    # A fifth of the record: beyond, autocorrelations have too few pairs that are independent.
     lags = np.arange(1, max(n // 5, 1) + 1)
     lags = lags[pairs[lags] > 0.5]
     if lags.size == 0 or not R[0] > 0:
         return 1.0
     # Lags at which no pair is seen count as those between which they lie.
     whole = 1.0 + 2.0 * (n // 5) * float(np.mean((R[lags] / R[0]) ** 2))
+    # The noise of an autocorrelation has the variance 1 / n: its square adds that at each lag.
     return max(1.0, whole / (1.0 + 2.0 * (n // 5) / n))
 
 
-def _window(n: int, size: int, memories: list[float]) -> np.ndarray:
-    """Parzen's lag window over all lags (size,)."""
-    length = max(_LENGTH * m * (n / m) ** 0.2 for m in memories)
+def _window(n: int, size: int, times: list[float]) -> Float[np.ndarray, " size"]:
+    """Parzen's lag window over all lags (size,), as long as the correlation times [samples] ask."""
+    # One window for all outputs, the longest: with one each, the matrix of windowed spectra need
+    # not be a covariance.
+    length = max(_LENGTH * time * (n / time) ** 0.2 for time in times)
     x = np.minimum(np.arange(size // 2 + 1) / min(max(length, 2.0), max(_LONGEST * n, 2.0)), 1.0)
     half = np.where(x < 0.5, 1.0 - 6.0 * x**2 * (1.0 - x), 2.0 * (1.0 - x) ** 3)
     return np.concatenate([half, half[-2:0:-1]])

@@ -1,6 +1,6 @@
-"""Parametric bootstrap: the machine found is simulated and identified again, many times."""
+"""Parametric bootstrap: the estimated machine is simulated and identified again, many times."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,14 +12,16 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of
 
 _BATCH = 8
+"""records refitted together: more wait for the slowest of them, and take its memory"""
 
 
 class Bootstrap(NamedTuple):
-    """Estimates of made records."""
+    """Estimates from simulated records."""
 
     values: dict[str, np.ndarray]
     """by free parameter, (runs that converged,)"""
     failures: int
+    """runs that did not converge"""
 
     def interval(self, name: str) -> tuple[float, float]:
         """2.5 and 97.5 % of the values."""
@@ -28,11 +30,15 @@ class Bootstrap(NamedTuple):
 
 
 def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
-    """Refit `runs` records made with the estimates: same inputs, same missing samples, new noise.
+    """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
-    are autocorrelated, noise with their covariance over time and between outputs. Means of priors
-    are drawn anew too.
+    are autocorrelated, noise with their covariance over time and between outputs.
+
+    Args:
+        fit: with the estimates, and the optimum that all refits begin from.
+        runs: how many records.
+        seed: of noise and disturbance.
 
     Raises:
         ValueError: the time shift is free, or the data do not determine every parameter.
@@ -40,30 +46,32 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     at = fit.reached
     if at.layout.shift:
         raise ValueError("bootstrap: not available with a free time shift")
-    if fit.lost:
-        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.lost)}")
+    if fit.not_identifiable:
+        raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
     rng = np.random.default_rng(seed)
     outputs = _records(fit, at, runs, seed, rng)
     values = np.array([fit.estimates[n].value for n in at.layout.free])
-    spread = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
-    means = values + spread * rng.standard_normal((runs, values.size))
+    # The means of priors are drawn anew as well: they are measurements too, of another kind.
+    prior_sd = np.where(np.isfinite(at.data.prior_sd), at.data.prior_sd, 0.0)
+    means = values + prior_sd * rng.standard_normal((runs, values.size))
 
-    def data(each: tuple[Any, Array]) -> Data:
+    def data(record: tuple[tuple[dict[str, Array], ...], Array]) -> Data:
         flights = tuple(
-            flight._replace(outputs=one)
-            for flight, one in zip(at.data.flights, each[0], strict=True)
+            flight._replace(outputs=outputs)
+            for flight, outputs in zip(at.data.flights, record[0], strict=True)
         )
-        return at.data._replace(flights=flights, prior_mean=each[1])
+        return at.data._replace(flights=flights, prior_mean=record[1])
 
+    # Every refit from the optimum, which is where the record was simulated.
     starts = jnp.tile(at.z[None, :], (runs, 1))
-    each = (outputs, jnp.asarray(means, at.z.dtype))
-    ends = optimise_many(at, data, starts, each, batch=_BATCH)
-    fine = np.asarray(ends.converged)
-    found = {
-        name: np.asarray(value_of(at.layout, at.data, i, jnp.asarray(ends.z[fine, i])))
+    records = (outputs, jnp.asarray(means, at.z.dtype))
+    optima = optimise_many(at, data, starts, records, batch=_BATCH)
+    converged = np.asarray(optima.converged)
+    estimates = {
+        name: np.asarray(value_of(at.layout, at.data, i, jnp.asarray(optima.z[converged, i])))
         for i, name in enumerate(at.layout.free)
     }
-    return Bootstrap(found, int(runs - fine.sum()))
+    return Bootstrap(estimates, int(runs - converged.sum()))
 
 
 def _records(
@@ -77,14 +85,17 @@ def _records(
     for i, (flight, sds, outputs) in enumerate(each):
         if fit.coloured:
             residuals = [fit.signals[i].residual(n) for n in at.layout.outputs[i]]
+            # All outputs at once: their noises are correlated.
             coloured = drawn(np.stack(residuals), runs, rng)
-        one = {}
+        by_output = {}
         for n, y in flight.outputs.items():
             sd = float(sds[n]) * float(u.scales.get(n, 1.0))
             noise = sd * rng.standard_normal((runs, y.shape[0]))
             if fit.coloured:
                 noise = coloured[:, at.layout.outputs[i].index(n)]
-            made = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
-            one[n] = jnp.asarray(np.where(np.isnan(np.asarray(y)), np.nan, made), at.z.dtype)
-        records.append(one)
+            record = np.asarray(outputs[n]) + float(u.biases[i][n]) + noise
+            # The same gaps: they are part of what the data can tell.
+            record = np.where(np.isnan(np.asarray(y)), np.nan, record)
+            by_output[n] = jnp.asarray(record, at.z.dtype)
+        records.append(by_output)
     return tuple(records)

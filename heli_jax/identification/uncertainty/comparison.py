@@ -7,7 +7,7 @@ import numpy as np
 
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
-from heli_jax.identification.uncertainty.nuts import Posterior, nuts
+from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
 from heli_jax.identification.uncertainty.profile_likelihood import Profile, profile
 
 DIFFERENT = 0.15
@@ -38,10 +38,12 @@ def intervals(
     """Profile likelihood, bootstrap and posterior beside the Gaussian intervals of a fit.
 
     Args:
+        fit: the result of `fit`.
         profiles: parameters to profile; none unless given.
         runs: records of the bootstrap, 0 for none.
         draws: draws of each of four NUTS chains, 0 for none (needs the extra `bayes`).
-        progress: told in words what is going on.
+        seed: of bootstrap and chains.
+        progress: called with a line of text before each longer part of the work.
 
     Where the fit did not converge or the data leave a parameter open, there are none of these,
     and a sentence says so.
@@ -49,81 +51,97 @@ def intervals(
     Raises:
         ValueError: a parameter that is not free, or a missing extra.
     """
-    tell = progress or (lambda _: None)
-    lines, booted, posterior = {}, None, None
+    report = progress or (lambda _: None)
+    profiled, booted, posterior = {}, None, None
     missing = [n for n in profiles or () if n not in fit.estimates]
     if missing:
-        raise ValueError(f"profile of {missing[0]}: wanted is one of {', '.join(fit.estimates)}")
-    said: list[str] = []
+        raise ValueError(f"profile: expected one of {', '.join(fit.estimates)}, got {missing[0]}")
+    sentences: list[str] = []
+    # Without an optimum profiles and chains would wander off from where the optimiser stopped.
     if fit.status != "converged" and (profiles or runs or draws):
         why = "the fit did not converge"
-        if fit.lost:
-            why = f"the data do not determine {', '.join(fit.lost)}"
-        said = [f"No further intervals: {why}."]
+        if fit.not_identifiable:
+            why = f"the data do not determine {', '.join(fit.not_identifiable)}"
+        sentences = [f"No further intervals: {why}."]
         profiles, runs, draws = None, 0, 0
+    # From the quickest to the slowest, so that a mistake shows early.
     if profiles:
-        tell(f"profile likelihood of {', '.join(profiles)}")
-        lines = profile(fit, profiles)
+        report(f"profile likelihood of {', '.join(profiles)}")
+        profiled = profile(fit, profiles)
     if runs:
-        tell(f"bootstrap, {runs} records")
+        report(f"bootstrap, {runs} records")
         booted = bootstrap(fit, runs, seed=seed)
     if draws:
-        tell(f"NUTS, 4 chains of {draws} draws")
+        report(f"NUTS, 4 chains of {draws} draws")
         posterior = nuts(fit, draws, seed=seed)
-    found: dict[str, dict[str, tuple[float, float]]] = {}
-    for name, one in fit.estimates.items():
-        if one.lower95 is None or one.upper95 is None:
+    by_parameter = _by_parameter(fit, profiled, booted, posterior)
+    sentences += _sentences(fit, by_parameter, booted, posterior)
+    return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))
+
+
+def _by_parameter(
+    fit: Fit,
+    profiled: dict[str, Profile],
+    booted: Bootstrap | None,
+    posterior: Posterior | None,
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """As `Intervals` has them; nothing of a parameter that is not identifiable."""
+    by_parameter: dict[str, dict[str, tuple[float, float]]] = {}
+    for name, estimate in fit.estimates.items():
+        if estimate.lower95 is None or estimate.upper95 is None:
             continue
-        found[name] = {"gaussian": (one.lower95, one.upper95)}
-        if name in lines:
-            found[name]["profile"] = (lines[name].lower95, lines[name].upper95)
+        by_parameter[name] = {"gaussian": (estimate.lower95, estimate.upper95)}
+        if name in profiled:
+            by_parameter[name]["profile"] = (profiled[name].lower95, profiled[name].upper95)
+        # Percentiles of a single value would be an interval of no width.
         if booted is not None and booted.values[name].size > 1:
-            found[name]["bootstrap"] = booted.interval(name)
+            by_parameter[name]["bootstrap"] = booted.interval(name)
         if posterior is not None:
-            found[name]["nuts"] = posterior.interval(name)
-    said += _sentences(fit, found, booted, posterior)
-    return Intervals(found, lines, booted, posterior, tuple(said))
+            by_parameter[name]["nuts"] = posterior.interval(name)
+    return by_parameter
 
 
-def apart(one: tuple[float, float], other: tuple[float, float]) -> float:
+def apart(first: tuple[float, float], second: tuple[float, float]) -> float:
     """The larger distance between the ends of two intervals, over the width of the first."""
-    ends = np.abs(np.array(one) - np.array(other))
-    return float(np.max(ends) / abs(one[1] - one[0])) if np.isfinite(ends).all() else np.inf
+    ends = np.abs(np.array(first) - np.array(second))
+    return float(np.max(ends) / abs(first[1] - first[0])) if np.isfinite(ends).all() else np.inf
 
 
 def _sentences(
     fit: Fit,
-    found: dict[str, dict[str, tuple[float, float]]],
+    by_parameter: dict[str, dict[str, tuple[float, float]]],
     booted: Bootstrap | None,
     posterior: Posterior | None,
 ) -> list[str]:
-    said = []
-    if fit.coloured and any({"profile", "nuts"} & set(by) for by in found.values()):
+    sentences = []
+    if fit.coloured and any({"profile", "nuts"} & set(by) for by in by_parameter.values()):
         # Only what can be had: no bootstrap with a free time shift, no filter without an axis.
         bootstrap_too = booted is not None or not fit.reached.layout.shift
-        said.append(
+        sentences.append(
             "The residuals are coloured: profile and NUTS take them for white and are too narrow. "
-            "Believe the Gaussian interval, which allows for their memory"
+            "Believe the Gaussian interval, which allows for their autocorrelation"
             + (", or the bootstrap, which draws noise of their spectrum" if bootstrap_too else "")
             + ("; or fit by filter error." if fit.disturbable else ".")
         )
     if booted is not None and booted.failures:
-        said.append(
+        sentences.append(
             f"{booted.failures} of the bootstrap's records could not be fitted and are left out: "
             "its intervals are too narrow by what those would have said."
         )
+    # The numbers with their limits: a reader can see whether a few more draws will do.
     if posterior is not None and not posterior.trusted:
-        said.append(
-            f"The NUTS chains are not to be trusted (R-hat {posterior.rhat:.3f}, "
-            f"{posterior.effective:.0f} effective draws, {posterior.divergent} divergent steps, "
-            "wanted are below 1.01, above 400 and none): take more draws."
+        sentences.append(
+            "The NUTS chains are not to be trusted (R-hat, effective draws, divergent steps: "
+            f"expected below {RHAT}, above {EFFECTIVE} and none, got {posterior.rhat:.3f}, "
+            f"{posterior.effective:.0f} and {posterior.divergent}): take more draws."
         )
-    for name, by in found.items():
+    for name, by in by_parameter.items():
         others = {m: i for m, i in by.items() if m != "gaussian"}
         far = [m for m, i in others.items() if apart(by["gaussian"], i) > DIFFERENT]
+        # With coloured residuals they differ for the reason that was given above.
         if far and not fit.coloured:
-            said.append(f"{name}: {_which(far, others, booted, posterior)}")
-    return said
+            sentences.append(f"{name}: {_which(far, others, booted, posterior)}")
+    return sentences
 
 
 def _which(
@@ -132,21 +150,27 @@ def _which(
     booted: Bootstrap | None,
     posterior: Posterior | None,
 ) -> str:
-    """Which interval to believe where some differ from the Gaussian one."""
+    """Which interval to believe where some differ from the Gaussian one.
+
+    Args:
+        far: the methods that differ.
+        others: intervals of all methods but the Gaussian one.
+    """
     names = " and ".join(far)
     verb = "differ" if len(far) > 1 else "differs"
     text = f"{names} {verb} from the Gaussian interval by more than {DIFFERENT:.0%} of its width. "
     profiled = others.get("profile")
     if profiled is not None and not np.isfinite(profiled).all():
         return text + (
-            "The likelihood has no end within nine standard deviations: the data bound it to one "
-            "side at most, and no interval says more."
+            "It is practically not identifiable: within nine standard deviations the likelihood "
+            "bounds it to one side at most, and no interval says more."
         )
+    # All against the Gaussian one: it is the parabola that is wrong, not one of their assumptions.
     if len(far) == len(others):
         best = "profile" if profiled is not None else far[0]
         return text + (
-            f"The likelihood is no parabola here (few samples, strong correlation or a bound): "
-            f"believe the {best}."
+            "The log-likelihood is not quadratic here (few samples, strong correlation or a "
+            f"bound): believe the {best}."
         )
     if far == ["bootstrap"]:
         return text + (

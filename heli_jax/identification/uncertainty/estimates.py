@@ -1,7 +1,7 @@
 """Estimates with standard deviations and intervals, from an optimum and its verdict."""
 
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation, deviations
@@ -9,12 +9,20 @@ from heli_jax.identification.identifiability.sensitivity import references_of, u
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.unknowns.layout import Data, Layout, disturbance_limits, unpack
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Solution,
+    disturbance_limits,
+    unpack,
+)
 from heli_jax.identification.unknowns.nuisances import labels
 
 _SAYS_NOTHING = 1e3
-"""A disturbance's standard deviation or memory whose interval reaches by this factor to either side
-is not determined."""
+"""A disturbance's standard deviation or correlation time whose interval reaches by this factor to
+either side is not identifiable."""
+_LARGEST = 700.0
+"""log of a factor by which an interval reaches at most: the largest float64 is exp(709)"""
 
 
 def estimates_of(
@@ -22,48 +30,65 @@ def estimates_of(
     layout: Layout,
     e: Evaluation,
     verdict: Verdict,
-    quantiles: np.ndarray,
-    wider: np.ndarray,
+    quantiles: Float[np.ndarray, " q"],
+    wider: Float[np.ndarray, " q"],
 ) -> dict[str, Estimate]:
-    """The named unknowns; `wider` (q,) multiplies the white-noise deviations of all unknowns, and
-    their intervals reach `quantiles` (q,) deviations to either side."""
+    """The unknowns of interest: free parameters, gains, time shift.
+
+    Args:
+        problem: with units, bounds and priors.
+        layout: of the unknowns.
+        e: at the optimum.
+        verdict: what is identifiable, with the covariance as if residuals were white.
+        quantiles: (q,) standard deviations that an interval reaches to either side.
+        wider: (q,) by which the standard deviations of white residuals are multiplied.
+    """
     unknowns = unknowns_of(problem, layout, e)
     references = references_of(problem, unknowns)
-    norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
-    sds = deviations(e.J)
-    known = (norms > 0) & np.isfinite(sds)
-    product = norms * np.where(known, sds, 1.0)
-    alone = np.divide(1.0, product, where=known, out=np.ones_like(norms))
-    out = {}
+    insensitivity = _insensitivity(e)
+    estimates = {}
     for i, u in enumerate(unknowns):
         free = problem.free.get(u.name)
+        # Relative to its reference: the size of the value, or a sample for the time shift.
         white = float(np.sqrt(verdict.covariance[i, i]))
         relative = white * float(wider[i])
         sd, low, high = _interval95(u, relative, references[i], float(quantiles[i]))
-        lost = u.name in verdict.undetermined or u.name in verdict.without_effect
+        not_identifiable = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
-        out[u.name] = Estimate(
+        estimates[u.name] = Estimate(
             value=u.value,
-            sd=None if lost else sd,
-            lower95=None if lost else low,
-            upper95=None if lost else high,
+            sd=None if not_identifiable else sd,
+            lower95=None if not_identifiable else low,
+            upper95=None if not_identifiable else high,
             unit=_unit(problem, u.name),
             start=start,
             prior_share=verdict.prior_share[u.name],
             at_bound=_at_bound(problem, u.name, u.value),
-            sd_white=None if lost else float(white * references[i]),
-            sd_alone=None if lost else float(white * references[i] * min(1.0, alone[i])),
+            sd_white=None if not_identifiable else float(white * references[i]),
+            sd_alone=None if not_identifiable else float(white * references[i] * insensitivity[i]),
         )
-    return out
+    return estimates
+
+
+def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:
+    """The standard deviation of each unknown if all others were known, over that which it has; 1
+    where it is not identifiable."""
+    norms = np.linalg.norm(np.asarray(e.J, np.float64), axis=0)
+    sds = deviations(e.J)
+    known = (norms > 0) & np.isfinite(sds)
+    product = norms * np.where(known, sds, 1.0)
+    # Knowing more narrows an interval; what rounding has above 1 is taken off.
+    return np.minimum(1.0, np.divide(1.0, product, where=known, out=np.ones_like(norms)))
 
 
 def _interval95(
     u: Unknown, relative: float, reference: float, quantile: float
 ) -> tuple[float, float, float]:
     sd = float(relative * reference)
+    # Symmetric in the coordinate of the search: in the parameter of one sign, by equal factors.
     if u.symmetric or not u.logarithmic:
         return sd, u.value - quantile * sd, u.value + quantile * sd
-    reach = float(np.exp(min(quantile * relative, 700.0)))
+    reach = float(np.exp(min(quantile * relative, _LARGEST)))
     low, high = sorted((u.value / reach, u.value * reach))
     return sd, float(low), float(high)
 
@@ -79,21 +104,25 @@ def _unit(problem: Problem, name: str) -> str:
 def _at_bound(problem: Problem, name: str, value: float) -> bool:
     free = problem.free.get(name)
     if free is None:
+        # The shift is searched through a tanh, which comes near to its bound and never to it.
         return name == "time_shift" and abs(value) > 0.999 * MAX_TIME_SHIFT
     low, high = free.lower, free.upper
     width = high - low if low is not None and high is not None else abs(value)
     near = 1e-3 * width
+    # Of a small lower bound beside a wide range: near in proportion to the bound itself, since the
+    # search is in logarithms there.
     by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
     by_high = high is not None and high - value < near
     return bool(by_low or by_high)
 
 
 def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
+    """Where an estimate ended at its bound."""
     return [
-        f"{name} ended at its bound: the data want it beyond {one.value:g}; its interval does not "
-        "hold there."
-        for name, one in estimates.items()
-        if one.at_bound
+        f"{name} ended at its bound: the data want it beyond {estimate.value:g}; its interval does "
+        "not hold there."
+        for name, estimate in estimates.items()
+        if estimate.at_bound
     ]
 
 
@@ -104,11 +133,11 @@ _FAR = 3.0
 def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     """Where an estimate has left its prior."""
     notes = []
-    for name, one in estimates.items():
+    for name, estimate in estimates.items():
         prior = problem.free[name].prior
         if prior is None:
             continue
-        away = abs(one.value - prior.mean) / prior.sd
+        away = abs(estimate.value - prior.mean) / prior.sd
         if away > _FAR:
             notes.append(
                 f"{name} lies {away:.2g} sd of its prior from the prior's mean: data and priors "
@@ -117,8 +146,14 @@ def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     return notes
 
 
-def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
-    """Where a parameter of the disturbance ran to the end of what a record can show."""
+def extreme_noise_notes(layout: Layout, data: Data, z: Float[Array, " q"]) -> list[str]:
+    """Where a parameter of the disturbance ran to the end of what a record can show.
+
+    Args:
+        layout: of the unknowns.
+        data: whose length and sample time say what can be shown.
+        z: the optimum (q,), with logarithms of the disturbance's parameters.
+    """
     notes = []
     limits = disturbance_limits(data)
     for i, name in enumerate(layout.disturbance):
@@ -128,6 +163,7 @@ def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
             continue
         value = np.exp(min(max(at, low), high))
         meaning = {
+            # Shorter than a sample, or longer than the record.
             ("tau_w", True): "to this record the disturbance is white noise",
             ("tau_w", False): "to this record the disturbance is a random walk",
         }.get((name, at <= low), "the record bounds it to one side at most")
@@ -137,7 +173,7 @@ def extreme_noise_notes(layout: Layout, data: Data, z: Array) -> list[str]:
 
 
 def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
-    """Where the noise found, by 'flight/output', is not the stated one."""
+    """Where the estimated noise, sd by 'flight/output', is not the stated one."""
     notes = []
     for flight, label in zip(problem.training, labels(problem.training), strict=True):
         for name, stated in flight.sd.items():
@@ -152,58 +188,81 @@ def stated_noise_notes(problem: Problem, sds: dict[str, float]) -> list[str]:
 
 def flight_nuisances(
     problem: Problem,
-    layout: Layout,
-    data: Data,
-    z: Array,
+    at: Solution,
     e: Evaluation,
-    quantiles: np.ndarray,
-    wider: np.ndarray,
+    quantiles: Float[np.ndarray, " q"],
+    wider: Float[np.ndarray, " q"],
 ) -> dict[str, Estimate]:
-    """The disturbance, then initial states, biases and input offsets with their weak priors."""
-    q = len(layout.of_interest)
-    if layout.size == q:
+    """The disturbance, then initial states, biases and input offsets with their weak priors.
+
+    Args:
+        problem: with flights, units and starts.
+        at: the optimum.
+        e: what it tells.
+        quantiles: (q,) standard deviations that an interval reaches to either side.
+        wider: (q,) by which the standard deviations of white residuals are multiplied.
+    """
+    layout = at.layout
+    if layout.size == len(layout.of_interest):
         return {}
     whites = deviations(e.J)
     sds = np.multiply(whites, wider, where=np.isfinite(whites), out=whites.copy())
-    out, starts = {}, problem.noise
-    disturbance = unpack(layout, data, z).noise
-    for i, name in enumerate(layout.disturbance):
-        value, relative = float(disturbance[name]), float(sds[q + i])
-        reach = float(np.exp(min(float(quantiles[q + i]) * relative, 700.0)))
+    estimates = _disturbance(problem, at, sds, quantiles)
+    # In the order in which `unpack` takes them from z.
+    i = layout.first_nuisance
+    for k, label in enumerate(labels(problem.training)):
+        for name, scale, unit in _nuisances_of(problem, at, k):
+            value, sd = float(at.z[i] * scale), float(sds[i] * scale)
+            # Scaled so that the sd of each weak prior is one: its precision is the prior's share.
+            share = min(1.0, float(whites[i]) ** 2)
+            reach = float(quantiles[i]) * sd
+            limits = (value - reach, value + reach)
+            estimates[f"{label}/{name}"] = Estimate(value, sd, *limits, unit, 0.0, share, False)
+            i += 1
+    return estimates
+
+
+def _disturbance(
+    problem: Problem,
+    at: Solution,
+    sds: Float[np.ndarray, " q"],
+    quantiles: Float[np.ndarray, " q"],
+) -> dict[str, Estimate]:
+    """The parameters of the disturbance, searched in their logarithms: intervals by factors."""
+    layout, starts = at.layout, problem.noise
+    estimates = {}
+    disturbance = unpack(layout, at.data, at.z).noise
+    for i, name in enumerate(layout.disturbance, len(layout.of_interest)):
+        value, relative = float(disturbance[name]), float(sds[i])
+        reach = float(np.exp(min(float(quantiles[i]) * relative, _LARGEST)))
         unit = naming.unit(layout.model.Params, name) or ""
         limits = (value / reach, value * reach)
-        said = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
-        out[name] = Estimate(value, *said, unit, starts[name].start, 0.0, False)
-    at = layout.first_nuisance
-    for label, flight, outputs, (count, _) in zip(
-        labels(problem.training), data.flights, layout.outputs, layout.windows, strict=True
-    ):
-        parts = [
-            (
-                f"initial {n}" + (f" of window {k + 1}" if count > 1 else ""),
-                flight.state_scale[n],
-                naming.unit(layout.model.State, n),
-            )
-            for k in range(count)
-            for n in layout.states
-        ]
-        if layout.bias:
-            parts += [
-                (f"bias {n}", flight.bias_scale[n], naming.unit(layout.model.Outputs, n))
-                for n in outputs
-            ]
+        numbers = (value * relative, *limits) if reach < _SAYS_NOTHING else (None, None, None)
+        estimates[name] = Estimate(value, *numbers, unit, starts[name].start, 0.0, False)
+    return estimates
+
+
+def _nuisances_of(problem: Problem, at: Solution, k: int) -> list[tuple[str, float, str]]:
+    """Name, scale and unit of the nuisance parameters of flight k."""
+    layout, flight, (count, _) = at.layout, at.data.flights[k], at.layout.windows[k]
+    State, Outputs = layout.model.State, layout.model.Outputs
+    parts = [
+        (
+            f"initial {n}" + (f" of window {w + 1}" if count > 1 else ""),
+            flight.state_scale[n],
+            naming.unit(State, n),
+        )
+        for w in range(count)
+        for n in layout.states
+    ]
+    if layout.bias:
         parts += [
-            (f"offset {n}", flight.offset_scale[n], _offset_unit(problem, n))
-            for n in layout.offsets
+            (f"bias {n}", flight.bias_scale[n], naming.unit(Outputs, n)) for n in layout.outputs[k]
         ]
-        for name, scale, unit in parts:
-            value, sd = float(z[at] * scale), float(sds[at] * scale)
-            share = min(1.0, float(whites[at]) ** 2)
-            reach = float(quantiles[at]) * sd
-            limits = (value - reach, value + reach)
-            out[f"{label}/{name}"] = Estimate(value, sd, *limits, unit or "", 0.0, share, False)
-            at += 1
-    return out
+    parts += [
+        (f"offset {n}", flight.offset_scale[n], _offset_unit(problem, n)) for n in layout.offsets
+    ]
+    return [(name, scale, unit or "") for name, scale, unit in parts]
 
 
 def _offset_unit(problem: Problem, name: str) -> str | None:

@@ -1,19 +1,26 @@
 """Draws from the posterior by the No-U-Turn sampler, on the residual that the fit minimised."""
 
+from collections.abc import Callable
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, value_of
 
+RHAT = 1.01
+"""potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
+EFFECTIVE = 400
+"""effective draws above which an interval may be read off: 100 a chain (Vehtari et al., 2021)"""
 _CHAINS = 4
 _TARGET = 0.8
+"""acceptance rate that the step is adapted to (Hoffman and Gelman, 2014)"""
 
 
 class Posterior(NamedTuple):
@@ -30,7 +37,7 @@ class Posterior(NamedTuple):
     @property
     def trusted(self) -> bool:
         """Whether the chains agree, and are long enough for an interval."""
-        return self.rhat < 1.01 and self.effective > 400 and self.divergent == 0
+        return self.rhat < RHAT and self.effective > EFFECTIVE and self.divergent == 0
 
     def interval(self, name: str) -> tuple[float, float]:
         """2.5 and 97.5 % of the draws."""
@@ -55,6 +62,12 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
     The prior is flat in the optimiser's coordinates (log of a parameter of one sign) beside the
     priors of the problem; the scale of the noise is integrated out (Jeffreys).
 
+    Args:
+        fit: with the optimum that the chains begin about.
+        draws: of each chain, after its warm-up.
+        warmup: steps in which step size and mass matrix are adapted.
+        seed: of the chains.
+
     Raises:
         ValueError: blackjax is not installed, or the data do not determine every parameter.
     """
@@ -62,17 +75,18 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
         import blackjax
     except ImportError as e:
         raise ValueError(
-            "nuts: blackjax is not installed, wanted is the extra: pip install 'heli_jax[bayes]'"
+            "nuts: blackjax is not installed, expected the extra: pip install 'heli_jax[bayes]'"
         ) from e
     at = fit.reached
-    if fit.lost:
-        raise ValueError(f"nuts: the data do not determine {', '.join(fit.lost)}")
+    if fit.not_identifiable:
+        raise ValueError(f"nuts: the data do not determine {', '.join(fit.not_identifiable)}")
     e = evaluate(at.layout, at.data, at.noise, at.z)
-    # Whitened by the Gaussian approximation, so that all directions have size one.
+    # Whitened by the Gaussian approximation, so that all directions have size one: J = QR, and with
+    # z = z0 + R^-1 xi the precision J'J = R'R becomes the unit matrix.
     triangle = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     root = jnp.asarray(np.linalg.inv(triangle), at.z.dtype)
 
-    # Traced once each, where blackjax asks for them ten times.
+    # Traced once each, where blackjax traces them anew for each of its ten uses.
     @jax.jit
     def density(xi: Array) -> Array:
         return log_posterior(at.layout, at.data, at.noise, at.z + root @ xi)
@@ -97,7 +111,12 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
 
 
 def _sample(
-    blackjax: Any, density: Any, at: Solution, draws: int, warmup: int, seed: int
+    blackjax: ModuleType,
+    density: Callable[[Array], Array],
+    at: Solution,
+    draws: int,
+    warmup: int,
+    seed: int,
 ) -> tuple[Array, Array]:
     """Positions (chains, draws, q) and whether each step diverged (chains, draws)."""
     q = at.layout.size
@@ -105,19 +124,22 @@ def _sample(
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, target_acceptance_rate=_TARGET, initial_step_size=0.5
     )
+    # Whitened coordinates: a tenth of a standard deviation off the optimum.
     first = 0.1 * jax.random.normal(keys[0], (q,), at.z.dtype)
     run = jax.jit(adaptation.run, static_argnums=2)
     (state, parameters), _ = run(keys[1], first, warmup)
     sampler = blackjax.nuts(density, **parameters)
+    # Chains begin apart, so that R-hat can tell whether they meet; this much of them is left out.
     settling = warmup // 2
 
     def chain(key: Array) -> tuple[Array, Array]:
         start_key, key = jax.random.split(key)
         begin = state.position + 0.5 * jax.random.normal(start_key, (q,), at.z.dtype)
 
-        def step(now: Any, key: Array) -> tuple[Any, Any]:
-            now, info = sampler.step(key, now)
-            return now, (now.position, info.is_divergent)
+        # The states are blackjax's own records: `Any`.
+        def step(state: Any, key: Array) -> tuple[Any, tuple[Array, Array]]:
+            state, info = sampler.step(key, state)
+            return state, (state.position, info.is_divergent)
 
         keys = jax.random.split(key, draws + settling)
         _, (positions, divergent) = jax.lax.scan(step, sampler.init(begin), keys)
@@ -126,26 +148,36 @@ def _sample(
     return jax.jit(jax.vmap(chain))(jax.random.split(keys[2], _CHAINS))
 
 
-def _posterior(at: Solution, z: np.ndarray, divergent: int) -> Posterior:
+def _posterior(at: Solution, z: Float[np.ndarray, "chains draws q"], divergent: int) -> Posterior:
     from blackjax import diagnostics
 
+    # In the optimiser's coordinates, in which the posterior is nearest to a normal distribution.
     named = jnp.asarray(z[:, :, : len(at.layout.free)])
     rhat = np.max(np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named)))
     effective = np.min(np.asarray(jax.jit(diagnostics.effective_sample_size)(named)))
-    found = {
+    values = {
         name: np.asarray(value_of(at.layout, at.data, i, named[:, :, i]))
         for i, name in enumerate(at.layout.free)
     }
-    return Posterior(found, float(rhat), float(effective), divergent)
+    return Posterior(values, float(rhat), float(effective), divergent)
 
 
-def log_posterior(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
+def log_posterior(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> Float[Array, ""]:
     """Log density of z but for a constant, from the fit's own rows.
 
     The scale of the noise is integrated out under Jeffreys' prior: of each flight and output with
-    output error, the common one with filter error, unless it was given.
+    output error, the common one with filter error, unless it was fixed.
+
+    Args:
+        layout: of the unknowns.
+        data: the flights.
+        noise: that whitens the rows.
+        z: the unknowns (q,), in the optimiser's coordinates.
     """
     rows = rows_of(layout, data, noise, z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
+    # The rows of the priors come last and have no scale to be integrated out.
     measured = layout.estimator.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])
     return measured - 0.5 * jnp.sum(rest**2)

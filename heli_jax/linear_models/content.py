@@ -1,0 +1,264 @@
+"""What a file of a linear model says beside its matrices, checked and in SI: `content_of`.
+
+Every problem is an InputError of one sentence that begins with the place in the file.
+"""
+
+import keyword
+import math
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from heli_jax import units
+from heli_jax.dynamics.model import Axis
+from heli_jax.errors import InputError, nearest
+from heli_jax.linear_models.expression import Dimension
+from heli_jax.vehicle import Constant
+
+_KEYS = (
+    "name", "meaning", "states", "inputs", "outputs", "parameters", "A", "B", "C", "D", "E",
+    "delays", "axes",
+)  # fmt: skip
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
+_TITLE = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,59}")
+_MOST = 100
+"""states, inputs or outputs: dense matrices beyond take minutes to compile"""
+_TAKEN = ("seed", "sigma_w", "tau_w")
+"""names that a sweep or a disturbance adds"""
+BASE_UNITS = ("kg", "m", "s")
+PLAIN: Dimension = (0, 0, 0)
+TIME: Dimension = (0, 0, 1)
+
+
+class Signal(NamedTuple):
+    """A state, an input or an output."""
+
+    si: str
+    """the unit that it has inside"""
+    scale: float
+    """what takes a number in the file's unit to SI"""
+    dimension: Dimension
+    meaning: str
+
+
+class Quantity(NamedTuple):
+    """A parameter."""
+
+    constant: Constant
+    """value and unit in SI"""
+    dimension: Dimension
+    positive: bool
+    meaning: str
+
+
+class Content(NamedTuple):
+    """A file without its matrices, checked."""
+
+    name: str
+    states: dict[str, Signal]
+    inputs: dict[str, Signal]
+    outputs: dict[str, Signal]
+    parameters: dict[str, Quantity]
+    delays: tuple[tuple[str, str], ...]
+    axes: tuple[Axis, ...]
+
+
+def content_of(given: Mapping[str, Any]) -> Content:
+    """The content of a file from what its YAML holds.
+
+    Raises:
+        InputError: anything in it is wrong; the sentence begins with the place within the file.
+    """
+    _known(given, _KEYS, "")
+    for key in ("name", "states", "inputs", "outputs", "parameters", "A"):
+        if key not in given:
+            raise InputError(f"{key}: missing, expected one of a linear model's keys")
+    name = given["name"]
+    if not isinstance(name, str) or not _TITLE.fullmatch(name):
+        raise InputError(f"name: expected a short name such as roll, got {name!r:.60}")
+    states, inputs, outputs = (
+        {n: _signal(one, f"{key}.{n}") for n, one in _section(given, key).items()}
+        for key in ("states", "inputs", "outputs")
+    )
+    parameters = {
+        n: _quantity(one, f"parameters.{n}") for n, one in _section(given, "parameters").items()
+    }
+    _once({"states": states, "inputs": inputs, "parameters": parameters})
+    return Content(
+        name,
+        states,
+        inputs,
+        outputs,
+        parameters,
+        _delays(given, inputs, parameters),
+        _axes(given, states, inputs),
+    )
+
+
+def _known(given: Mapping[Any, Any], known: Iterable[str], place: str) -> None:
+    for key in given:
+        if key not in known:
+            where = f"{place}.{key}" if place else f"{key}"
+            raise InputError(f"{where}: unknown key{nearest(str(key), known)}")
+
+
+def _section(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """A section of named things, which may not be empty; their names can be names."""
+    section = as_mapping(given[key], key)
+    if not section:
+        raise InputError(f"{key}: empty, expected at least one")
+    if len(section) > _MOST and key != "parameters":
+        raise InputError(f"{key}: expected at most {_MOST}, got {len(section)}")
+    for name in section:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or keyword.iskeyword(name):
+            raise InputError(
+                f"{key}: expected a name of letters, digits and _ that begins with a letter, got "
+                f"{name!r:.60}"
+            )
+        if name in _TAKEN:
+            raise InputError(f"{key}.{name}: taken by sweeps and disturbances, expected another")
+    return section
+
+
+def as_mapping(given: Any, place: str) -> Mapping[str, Any]:
+    if not isinstance(given, Mapping):
+        raise InputError(f"{place}: expected names with values, got {given!r:.60}")
+    return given
+
+
+def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
+    """One name, one meaning: an expression would be read wrongly otherwise."""
+    seen: dict[str, str] = {}
+    for key, section in sections.items():
+        for name in section:
+            if name in seen:
+                raise InputError(f"{key}.{name}: stands in {seen[name]} too, expected another name")
+            seen[name] = key
+
+
+def _signal(given: Any, place: str) -> Signal:
+    """A state, input or output: its unit, or {unit, meaning}."""
+    given = {"unit": given} if isinstance(given, str) else as_mapping(given, place)
+    _known(given, ("unit", "meaning"), place)
+    si, scale, dimension = _unit(given, place)
+    return Signal(si, scale, dimension, _words(given, "meaning", place))
+
+
+def _quantity(given: Any, place: str) -> Quantity:
+    given = as_mapping(given, place)
+    _known(given, ("value", "unit", "source", "meaning", "positive"), place)
+    value = given.get("value")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{place}.value: expected a number, got {value!r:.40}")
+    si, scale, dimension = _unit(given, place)
+    number = float(value) * scale
+    if not math.isfinite(number):
+        raise InputError(f"{place}.value: expected a finite number, got {value!r:.40}")
+    positive = given.get("positive", False)
+    if not isinstance(positive, bool):
+        raise InputError(f"{place}.positive: expected true or false, got {positive!r:.40}")
+    source = _words(given, "source", place)
+    constant = Constant(number, si, source)
+    return Quantity(constant, dimension, positive, _words(given, "meaning", place))
+
+
+def _words(given: Mapping[str, Any], key: str, place: str) -> str:
+    words = given.get(key, "")
+    if not isinstance(words, str):
+        raise InputError(f"{place}.{key}: expected words, got {words!r:.40}")
+    return words
+
+
+def _unit(given: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
+    """The SI unit of the same kind, what takes a number there, and the dimension."""
+    unit = given.get("unit")
+    # YAML reads a bare 1 as a number.
+    unit = str(unit) if unit == 1 and not isinstance(unit, bool) else unit
+    if not isinstance(unit, str):
+        got = "nothing" if unit is None else f"{unit!r:.40}"
+        raise InputError(f"{place}.unit: expected a unit such as rad/s or 1, got {got}")
+    try:
+        exponents = units.base_of(unit)
+        si = units.as_text(exponents)
+        scale = units.factor(unit, si)
+    except ValueError as e:
+        raise InputError(f"{place}.unit: {e}") from e
+    return si, scale, tuple(exponents.get(n, 0) for n in BASE_UNITS)
+
+
+def _delays(
+    given: Mapping[str, Any],
+    inputs: Mapping[str, Signal],
+    parameters: Mapping[str, Quantity],
+) -> tuple[tuple[str, str], ...]:
+    found = []
+    for name, parameter in as_mapping(given.get("delays", {}), "delays").items():
+        place = f"delays.{name}"
+        if name not in inputs:
+            raise InputError(f"{place}: no such input{nearest(str(name), inputs)}")
+        if not isinstance(parameter, str) or parameter not in parameters:
+            raise InputError(
+                f"{place}: expected the name of a parameter, got {parameter!r:.40}"
+                f"{nearest(str(parameter), parameters)}"
+            )
+        if parameters[parameter].dimension != TIME:
+            raise InputError(
+                f"{place}: expected a parameter in s, got {parameter} in "
+                f"{parameters[parameter].constant.unit}"
+            )
+        found.append((name, parameter))
+    return tuple(found)
+
+
+# Name, states that may be its rate, the state that may be its angle.
+_AXES = (
+    ("roll", ("p", "dphi"), "phi"),
+    ("pitch", ("q", "dtheta"), "theta"),
+    ("yaw", ("r", "dpsi"), "psi"),
+    ("heave", ("w",), None),
+)
+
+
+def _axes(
+    given: Mapping[str, Any], states: Mapping[str, Signal], inputs: Mapping[str, Signal]
+) -> tuple[Axis, ...]:
+    """The axes that the file states, else those that the names of its states say."""
+    if "axes" not in given:
+        return tuple(
+            Axis(name, rate, angle if angle in states else None)
+            for name, rates, angle in _AXES
+            for rate in rates
+            if rate in states
+        )
+    axes = as_mapping(given["axes"], "axes")
+    return tuple(_axis(str(n), one, states, inputs) for n, one in axes.items())
+
+
+def _axis(
+    name: str, given: Any, states: Mapping[str, Signal], inputs: Mapping[str, Signal]
+) -> Axis:
+    place = f"axes.{name}"
+    given = as_mapping(given, place)
+    _known(given, ("rate", "angle", "stick", "flybar"), place)
+    if "rate" not in given:
+        raise InputError(f"{place}.rate: missing, expected a state")
+    flybar = given.get("flybar", [])
+    if not isinstance(flybar, list):
+        raise InputError(f"{place}.flybar: expected a list of states, got {flybar!r:.40}")
+    named = [("rate", given["rate"], states), *(("flybar", one, states) for one in flybar)]
+    named += [
+        (key, given[key], known)
+        for key, known in (("angle", states), ("stick", inputs))
+        if key in given
+    ]
+    for key, one, known in named:
+        if not isinstance(one, str) or one not in known:
+            kind = "input" if known is inputs else "state"
+            raise InputError(f"{place}.{key}: no such {kind} {one!r:.40}{nearest(str(one), known)}")
+    return Axis(
+        name,
+        given["rate"],
+        given.get("angle"),
+        stick=given.get("stick"),
+        flybar=tuple(flybar),
+    )

@@ -1,0 +1,119 @@
+"""The functions of a linear model from the entries of its matrices."""
+
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from heli_jax import naming
+from heli_jax.dynamics.model import Model
+from heli_jax.linear_models.content import Content, Signal
+from heli_jax.linear_models.expression import evaluate
+from heli_jax.linear_models.matrices import Entry
+from heli_jax.naming import Scalar
+
+
+def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Model:
+    """The Model of a file; its Params have the file's values as defaults.
+
+    Args:
+        content: the file without its matrices.
+        matrices: the entries of A, B, C, D and E.
+    """
+    State = _record("State", content.states)
+    Outputs = _record("Outputs", content.outputs)
+    equations = _Equations(dict(matrices), State, Outputs)
+    return Model(
+        content.name,
+        equations.vector_field,
+        equations.output,
+        _params(content),
+        State,
+        _record("Inputs", content.inputs),
+        Outputs,
+        linear=True,
+        axes=content.axes,
+        delays=content.delays,
+        positive=tuple(n for n, q in content.parameters.items() if q.positive),
+    )
+
+
+def _record(title: str, signals: Mapping[str, Signal]) -> type:
+    """A class with one scalar a signal, in SI."""
+    fields = [(n, Annotated[Scalar, one.si, one.meaning]) for n, one in signals.items()]
+    made: Any = NamedTuple(title, fields)  # type: ignore[misc]
+    return made
+
+
+def _params(content: Content) -> type:
+    fields = {
+        n: (Annotated[Scalar, q.constant.unit, q.meaning], q.constant.value)
+        for n, q in content.parameters.items()
+    }
+    return naming.extended(_Nothing, "Params", fields)
+
+
+class _Nothing(NamedTuple):
+    """No parameter yet."""
+
+
+class _Equations:
+    """E x' = A x + B u and y = C x + D u, entry by entry.
+
+    Compared by identity: the same file is read once, so that its model is one to `jax.jit`.
+    """
+
+    def __init__(self, matrices: dict[str, tuple[Entry, ...]], State: type, Outputs: type) -> None:
+        self.matrices, self.State, self.Outputs = matrices, State, Outputs
+
+    def vector_field(self, params: Any, state: Any, inputs: Any) -> Any:
+        """The derivatives of the states, per second."""
+        rates = self.rows(("A", "B"), naming.names(self.State), params, state, inputs)
+        if self.matrices["E"]:
+            return self.solved(params, rates)
+        return self.State(**rates)
+
+    def output(self, params: Any, state: Any, inputs: Any) -> Any:
+        """The outputs; one without a row is the state of its name."""
+        stated = {entry.row for name in ("C", "D") for entry in self.matrices[name]}
+        names = naming.names(self.Outputs)
+        rows = self.rows(("C", "D"), (n for n in names if n in stated), params, state, inputs)
+        return self.Outputs(**{n: rows[n] if n in rows else getattr(state, n) for n in names})
+
+    def rows(
+        self, matrices: tuple[str, str], names: Iterable[str], params: Any, state: Any, inputs: Any
+    ) -> dict[str, Any]:
+        """The sums of two matrices' rows, the first times the states, the second times the
+        inputs."""
+        # Zeros made of a state have its type and its batch axis.
+        zero = 0.0 * state[0]
+        sums = dict.fromkeys(names, zero)
+        for matrix, by in zip(matrices, (state, inputs), strict=True):
+            for entry in self.matrices[matrix]:
+                term = _value(entry, params) * getattr(by, entry.column)
+                sums[entry.row] = sums[entry.row] + term
+        return sums
+
+    def solved(self, params: Any, right: dict[str, Any]) -> Any:
+        """E^-1 times the right-hand side; E is the unit matrix in the rows that it does not
+        name."""
+        names = naming.names(self.State)
+        stated = {entry.row for entry in self.matrices["E"]}
+        zero = 0.0 * right[names[0]]
+        E = {
+            (i, j): zero + (1.0 if i == j and i not in stated else 0.0)
+            for i in names
+            for j in names
+        }
+        for entry in self.matrices["E"]:
+            E[entry.row, entry.column] = zero + _value(entry, params)
+        matrix = jnp.stack([jnp.stack([E[i, j] for j in names]) for i in names])
+        return naming.unravel(
+            self.State, jnp.linalg.solve(matrix, jnp.stack([right[n] for n in names]))
+        )
+
+
+def _value(entry: Entry, params: Any) -> Any:
+    """An entry [SI]."""
+    number = evaluate(entry.node, lambda name: getattr(params, name))
+    return number if entry.factor == 1.0 else entry.factor * number

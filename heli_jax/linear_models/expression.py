@@ -1,0 +1,285 @@
+"""The arithmetic that an entry of a matrix may be: `-1/tau_f`, `Bd/tau_f`, `2*(Lb - g)^2`.
+
+    sum     = product { ("+" | "-") product }
+    product = signed { ("*" | "/") signed }
+    signed  = [ "-" | "+" ] signed | power
+    power   = atom [ ("^" | "**") [ "-" | "+" ] digits ]
+    atom    = number | name | "(" sum ")"
+
+A grammar of our own, since Python's `eval` would run whatever stands in the file. Precedence is
+that of Python: -a^2 is -(a^2). Lengths and depths are bounded, so that no file exhausts the stack.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from heli_jax.errors import nearest
+
+LONGEST = 200
+"""characters of an expression"""
+DEEPEST = 20
+"""parentheses and signs within each other"""
+HIGHEST = 9
+"""the largest power, positive or negative"""
+
+# ASCII alone: \d and \w would take digits and letters of other scripts.
+_TOKEN = re.compile(
+    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
+    r"|(?P<sign>\*\*|[-+*/^()])"
+)
+
+
+class ExpressionError(ValueError):
+    """An expression is wrong; the sentence says at which character, from 1."""
+
+
+class Number(NamedTuple):
+    """A number as it is written."""
+
+    value: float
+
+
+class Parameter(NamedTuple):
+    """A parameter by its name."""
+
+    name: str
+
+
+class Negative(NamedTuple):
+    """-of"""
+
+    of: "Node"
+
+
+class Power(NamedTuple):
+    """of^exponent with a whole exponent."""
+
+    of: "Node"
+    exponent: int
+
+
+class Binary(NamedTuple):
+    """left operator right, the operator one of + - * /"""
+
+    operator: str
+    left: "Node"
+    right: "Node"
+
+
+type Node = Number | Parameter | Negative | Power | Binary
+"""An expression as a tree."""
+
+type Dimension = tuple[int, ...]
+"""Exponents of the base units; an angle counts as a plain number."""
+
+
+def parse(text: str, known: Mapping[str, Any]) -> Node:
+    """The tree of an expression.
+
+    Args:
+        text: the expression, of at most `LONGEST` characters.
+        known: the parameters by name.
+
+    Raises:
+        ExpressionError: it is none, or names a parameter that is not known.
+    """
+    if len(text) > LONGEST:
+        raise ExpressionError(f"expected at most {LONGEST} characters, got {len(text)}")
+    return _Parser(text, known).whole()
+
+
+class _Token(NamedTuple):
+    kind: str
+    """number, name, sign or end"""
+    text: str
+    at: int
+    """character, from 1"""
+
+
+class _Parser:
+    """Recursive descent: one method a rule of the grammar."""
+
+    def __init__(self, text: str, known: Mapping[str, Any]) -> None:
+        self.text, self.known, self.depth = text, known, 0
+        self.tokens = _tokens(text)
+        self.now = next(self.tokens)
+
+    def take(self) -> _Token:
+        taken = self.now
+        if taken.kind != "end":
+            self.now = next(self.tokens)
+        return taken
+
+    def refuse(self, problem: str, token: _Token) -> ExpressionError:
+        return ExpressionError(f"{self.text!r:.80}, character {token.at}: {problem}")
+
+    def whole(self) -> Node:
+        found = self.sum()
+        if self.now.kind != "end":
+            raise self.refuse(f"expected an operator or the end, got {self.now.text!r}", self.now)
+        return found
+
+    def sum(self) -> Node:
+        found = self.product()
+        while self.now.text in ("+", "-"):
+            operator = self.take().text
+            found = Binary(operator, found, self.product())
+        return found
+
+    def product(self) -> Node:
+        found = self.signed()
+        while self.now.text in ("*", "/"):
+            operator = self.take().text
+            found = Binary(operator, found, self.signed())
+        return found
+
+    def signed(self) -> Node:
+        if self.now.text not in ("-", "+"):
+            return self.power()
+        sign = self.take()
+        self.deeper(sign)
+        of = self.signed()
+        self.depth -= 1
+        return Negative(of) if sign.text == "-" else of
+
+    def power(self) -> Node:
+        base = self.atom()
+        if self.now.text not in ("^", "**"):
+            return base
+        self.take()
+        negative = self.now.text in ("-", "+") and self.take().text == "-"
+        token = self.take()
+        if not token.text.isdigit() or len(token.text) > 1:
+            raise self.refuse(
+                f"expected a whole power from -{HIGHEST} to {HIGHEST}, got {_shown(token)}", token
+            )
+        if self.now.text in ("^", "**"):
+            raise self.refuse("a power of a power, expected parentheses", self.now)
+        return Power(base, -int(token.text) if negative else int(token.text))
+
+    def atom(self) -> Node:
+        token = self.take()
+        if token.kind == "number":
+            value = float(token.text)
+            if value == float("inf"):
+                raise self.refuse(f"expected a finite number, got {token.text:.20}", token)
+            return Number(value)
+        if token.kind == "name":
+            if token.text not in self.known:
+                raise self.refuse(
+                    f"unknown parameter {token.text!r:.40}{nearest(token.text, self.known)}", token
+                )
+            return Parameter(token.text)
+        if token.text == "(":
+            self.deeper(token)
+            found = self.sum()
+            if self.take().text != ")":
+                raise self.refuse("this parenthesis is never closed", token)
+            self.depth -= 1
+            return found
+        raise self.refuse(
+            f"expected a number, a parameter or a parenthesis, got {_shown(token)}", token
+        )
+
+    def deeper(self, token: _Token) -> None:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise self.refuse(f"more than {DEEPEST} parentheses and signs deep", token)
+
+
+def _shown(token: _Token) -> str:
+    return "the end" if token.kind == "end" else repr(token.text[:20])
+
+
+def _tokens(text: str) -> Iterator[_Token]:
+    at = 0
+    while at < len(text):
+        if text[at] in " \t\n":
+            at += 1
+            continue
+        found = _TOKEN.match(text, at)
+        if found is None:
+            raise ExpressionError(
+                f"{text!r:.80}, character {at + 1}: expected numbers, parameters, + - * / ^ and "
+                f"parentheses, got {text[at]!r}"
+            )
+        yield _Token(str(found.lastgroup), found.group(), at + 1)
+        at = found.end()
+    yield _Token("end", "", len(text) + 1)
+
+
+def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
+    """The value of an expression.
+
+    Args:
+        node: the expression.
+        value: value(name) of a parameter: a number or a traced scalar.
+
+    Raises:
+        ZeroDivisionError, OverflowError: among plain Python numbers; traced scalars become inf.
+    """
+    match node:
+        case Number(number):
+            return number
+        case Parameter(name):
+            return value(name)
+        case Negative(of):
+            return -evaluate(of, value)
+        case Power(of, exponent):
+            return evaluate(of, value) ** exponent
+        case Binary(operator, left, right):
+            a, b = evaluate(left, value), evaluate(right, value)
+            if operator == "+":
+                return a + b
+            if operator == "-":
+                return a - b
+            return a * b if operator == "*" else a / b
+
+
+def parameters_of(node: Node) -> frozenset[str]:
+    """The parameters that an expression names."""
+    match node:
+        case Number():
+            return frozenset()
+        case Parameter(name):
+            return frozenset([name])
+        case Negative(of) | Power(of):
+            return parameters_of(of)
+        case Binary(_, left, right):
+            return parameters_of(left) | parameters_of(right)
+
+
+def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dimension:
+    """The dimension of an expression.
+
+    Args:
+        node: the expression.
+        of: of each parameter by name.
+        plain: that of a plain number.
+
+    Raises:
+        ExpressionError: it adds what cannot be added.
+    """
+    match node:
+        case Number():
+            return plain
+        case Parameter(name):
+            return of[name]
+        case Negative(inner):
+            return dimension(inner, of, plain)
+        case Power(inner, exponent):
+            return tuple(exponent * n for n in dimension(inner, of, plain))
+        case Binary(operator, left, right):
+            a, b = dimension(left, of, plain), dimension(right, of, plain)
+            if operator == "*":
+                return tuple(i + j for i, j in zip(a, b, strict=True))
+            if operator == "/":
+                return tuple(i - j for i, j in zip(a, b, strict=True))
+            if a != b:
+                raise ExpressionError(
+                    f"{operator!r} joins terms of different kinds, expected the same unit on both "
+                    "sides (a number with a unit is a parameter)"
+                )
+            return a

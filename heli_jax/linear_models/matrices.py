@@ -1,0 +1,250 @@
+"""The matrices of a file, entry by entry: names, units and expressions checked."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import units
+from heli_jax.errors import InputError, nearest
+from heli_jax.linear_models import expression
+from heli_jax.linear_models.content import BASE_UNITS, PLAIN, TIME, Content, Signal, as_mapping
+from heli_jax.linear_models.expression import Dimension, ExpressionError, Node
+
+
+class Entry(NamedTuple):
+    """One entry of a matrix: `factor` times an expression, in SI."""
+
+    row: str
+    column: str
+    node: Node
+    factor: float
+    place: str
+    """where it stands and what it says, for a sentence about it"""
+
+
+class _Unit(NamedTuple):
+    """What a row is in, or a column."""
+
+    dimension: Dimension
+    scale: float
+    """what takes a number in the file's unit to SI"""
+    bare: bool = True
+    """whether a number without a parameter has a meaning there"""
+
+
+def matrices_of(given: Mapping[str, Any], content: Content) -> dict[str, tuple[Entry, ...]]:
+    """The entries of A, B, C, D and E.
+
+    Args:
+        given: what the YAML holds.
+        content: what `content_of` makes of it.
+
+    Raises:
+        InputError: an entry is wrong, or the parameters' values make one infinite.
+    """
+    matrices = _Matrices(given, content).all()
+    values = {n: q.constant.value for n, q in content.parameters.items()}
+    if problem := not_possible(content, matrices, values):
+        raise InputError(problem)
+    return matrices
+
+
+def not_possible(
+    content: Content, matrices: Mapping[str, tuple[Entry, ...]], values: Mapping[str, float]
+) -> str:
+    """What is wrong with a model's parameters, as a sentence; empty where all can be.
+
+    Those that are positive have to be, every entry has to be a finite number, and E has to have an
+    inverse.
+
+    Args:
+        content: what the parameters are.
+        matrices: of `matrices_of`.
+        values: of all parameters, by name [SI].
+    """
+    for name, quantity in content.parameters.items():
+        if quantity.positive and not values[name] > 0:
+            return f"{name}: expected more than zero (positive: true), got {values[name]:g}"
+    for input_name, name in content.delays:
+        if values[name] < 0:
+            return f"{name}: expected a delay of {input_name} of zero or more, got {values[name]:g}"
+    for entry in (one for entries in matrices.values() for one in entries):
+        if not math.isfinite(_value(entry, values)):
+            return f"{entry.place}: not finite with the parameters' values"
+    return _not_invertible(content, matrices["E"], values)
+
+
+def _value(entry: Entry, values: Mapping[str, float]) -> float:
+    try:
+        number = expression.evaluate(entry.node, lambda name: float(values[name]))
+    except (ZeroDivisionError, OverflowError):
+        return math.nan
+    return entry.factor * float(number)
+
+
+def _not_invertible(
+    content: Content, entries: tuple[Entry, ...], values: Mapping[str, float]
+) -> str:
+    names = list(content.states)
+    E = np.eye(len(names))
+    for row in {entry.row for entry in entries}:
+        E[names.index(row)] = 0.0
+    for entry in entries:
+        E[names.index(entry.row), names.index(entry.column)] = _value(entry, values)
+    # Rows and columns of one size: units must not decide what is singular.
+    for axis in (1, 0):
+        E = E / np.maximum(np.max(np.abs(E), axis=axis, keepdims=True), 1e-300)
+    singular = np.linalg.matrix_rank(E) < len(names)
+    return "E: has no inverse with the parameters' values" if singular else ""
+
+
+class _Matrices:
+    """The entries of A, B, C, D and E with their units checked and numbers taken to SI.
+
+    A row of A and B is a derivative, so it is in the state's unit per second, times the unit of
+    E's diagonal where E names the row. An entry is in the row's unit over the column's. One that
+    names no parameter is a number in the file's units; any other is in SI by its parameters.
+    """
+
+    def __init__(self, given: Mapping[str, Any], content: Content) -> None:
+        self.given, self.content = given, content
+        self.dimensions = {n: q.dimension for n, q in content.parameters.items()}
+        self.columns = {
+            n: _Unit(one.dimension, one.scale)
+            for n, one in {**content.states, **content.inputs}.items()
+        }
+        self.outputs = {n: _Unit(o.dimension, o.scale) for n, o in content.outputs.items()}
+        self.rates = {n: _over(self.columns[n], _Unit(TIME, 1.0)) for n in content.states}
+
+    def all(self) -> dict[str, tuple[Entry, ...]]:
+        states, inputs, outputs = self.content.states, self.content.inputs, self.content.outputs
+        found = {"E": self.masses()}
+        for name, rows, columns in (
+            ("A", self.rates, states),
+            ("B", self.rates, inputs),
+            ("C", self.outputs, states),
+            ("D", self.outputs, inputs),
+        ):
+            found[name] = self.matrix(name, rows, columns)
+        self.check_rows(states, outputs)
+        return found
+
+    def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
+        """A matrix as it is written: by row, by column."""
+        found = {}
+        kind = "output" if matrix in ("C", "D") else "state"
+        for row, given in as_mapping(self.given.get(matrix, {}), matrix).items():
+            if row not in known:
+                raise InputError(f"{matrix}.{row}: no such {kind}{nearest(str(row), known)}")
+            for column in as_mapping(given, f"{matrix}.{row}"):
+                if column not in columns:
+                    kind = "input" if matrix in ("B", "D") else "state"
+                    raise InputError(
+                        f"{matrix}.{row}.{column}: no such {kind}{nearest(str(column), columns)}"
+                    )
+            found[row] = given
+        return found
+
+    def matrix(
+        self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
+    ) -> tuple[Entry, ...]:
+        return tuple(
+            self.entry(f"{name}.{row}.{column}", one, row, column, rows[row])
+            for row, given in self.rows(name, rows, columns).items()
+            for column, one in given.items()
+        )
+
+    def masses(self) -> tuple[Entry, ...]:
+        """E; its diagonal gives its rows their unit."""
+        states, found = self.content.states, []
+        for row, given in self.rows("E", states, states).items():
+            if row in given:
+                node = self.tree(f"E.{row}.{row}", given[row])
+                try:
+                    mass = expression.dimension(node, self.dimensions, PLAIN)
+                except ExpressionError as e:
+                    raise InputError(f"E.{row}.{row}: {given[row]!r:.80}: {e}") from e
+                rate = self.rates[row].dimension
+                total = tuple(i + j for i, j in zip(rate, mass, strict=True))
+                self.rates[row] = _Unit(total, self.rates[row].scale, total == rate)
+            for column, one in given.items():
+                place = f"E.{row}.{column}"
+                rate = _over(self.columns[column], _Unit(TIME, 1.0))
+                found.append(self.entry(place, one, row, column, self.rates[row], rate))
+        return tuple(found)
+
+    def tree(self, place: str, given: Any) -> Node:
+        if isinstance(given, bool) or not isinstance(given, int | float | str):
+            raise InputError(f"{place}: expected a number or an expression, got {given!r:.40}")
+        if isinstance(given, str):
+            try:
+                return expression.parse(given, self.content.parameters)
+            except ExpressionError as e:
+                raise InputError(f"{place}: {e}") from e
+        value = float(given)
+        if not math.isfinite(value):
+            raise InputError(f"{place}: expected a finite number, got {given!r:.40}")
+        return expression.Number(value)
+
+    def entry(
+        self,
+        place: str,
+        given: Any,
+        row: str,
+        column: str,
+        of: _Unit,
+        per: _Unit | None = None,
+    ) -> Entry:
+        node = self.tree(place, given)
+        said = f"{place}: {given!r:.80}"
+        expected = _over(of, self.columns[column] if per is None else per)
+        if not expression.parameters_of(node):
+            if not of.bare:
+                raise InputError(
+                    f"{said}: a number in a row whose E.{row}.{row} has a unit, expected a "
+                    f"parameter in {_unit_text(expected.dimension)}"
+                )
+            return Entry(row, column, node, expected.scale, said)
+        try:
+            found = expression.dimension(node, self.dimensions, PLAIN)
+        except ExpressionError as e:
+            raise InputError(f"{said}: {e}") from e
+        if found != expected.dimension:
+            raise InputError(
+                f"{said}: expected {_unit_text(expected.dimension)} (row over column), got "
+                f"{_unit_text(found)}"
+            )
+        return Entry(row, column, node, 1.0, said)
+
+    def check_rows(self, states: Mapping[str, Any], outputs: Mapping[str, Signal]) -> None:
+        """Every state needs its derivative, every output its equation or a state of its name."""
+        for name in states:
+            if name not in self.given["A"] and name not in self.given.get("B", {}):
+                raise InputError(
+                    f"A.{name}: missing, expected the row of that state's derivative ({{}} where "
+                    "it is zero)"
+                )
+        for name, output in outputs.items():
+            if name in self.given.get("C", {}) or name in self.given.get("D", {}):
+                continue
+            if name not in states:
+                raise InputError(
+                    f"outputs.{name}: expected a row C.{name}, or the name of a state"
+                    f"{nearest(name, states)}"
+                )
+            if states[name].dimension != output.dimension:
+                raise InputError(
+                    f"outputs.{name}.unit: expected the kind of the state {name}, in "
+                    f"{states[name].si}, got {output.si}"
+                )
+
+
+def _over(above: _Unit, below: _Unit) -> _Unit:
+    dimension = tuple(i - j for i, j in zip(above.dimension, below.dimension, strict=True))
+    return _Unit(dimension, above.scale / below.scale)
+
+
+def _unit_text(dimension: Dimension) -> str:
+    return units.as_text(dict(zip(BASE_UNITS, dimension, strict=True)))

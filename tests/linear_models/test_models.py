@@ -1,0 +1,185 @@
+"""The shipped linear models: what the R-50's report says, and SciPy's exponential."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import heli_jax
+from heli_jax import naming
+from heli_jax.analysis.linear import linearize, modes
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.problem import Free, Nuisance, Problem
+from heli_jax.identification.unknowns.transforms import plain_kind
+from heli_jax.linear_models.read import linear_model, shipped
+from heli_jax.simulation.simulate import simulate
+
+STATES = {
+    "roll": "phi p b d",
+    "roll-flybarless": "phi p b",
+    "pitch": "theta q a c",
+    "pitch-flybarless": "theta q a",
+    "attitude": "p q r a b c d",
+    "attitude-flybarless": "p q r a b",
+    "yaw": "r r_fb",
+    "heave": "w",
+    "heave-inflow": "w nu",
+    "hybrid": "u v p q phi theta a b w r r_fb c d",
+    "hybrid-flybarless": "u v p q phi theta a b w r r_fb",
+    "r50-hover": "u v p q phi theta a b w r r_fb c d",
+}
+
+
+def test_every_shipped_model_is_here():
+    assert set(shipped()) == set(STATES)
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_shipped_model_has_its_states_and_every_constant_a_source(name):
+    found = linear_model(name)
+    assert found.model.name == name
+    assert naming.names(found.model.State) == tuple(STATES[name].split())
+    assert all(naming.unit(found.model.State, n) for n in naming.names(found.model.State))
+    assert all(c.source for c in found.vehicle().constants.values())
+    assert {n for n in found.content.parameters if n.startswith("tau")} <= set(found.model.positive)
+
+
+# Of the report, to the digits of the issue's table; pairs once.
+R50 = (
+    0.3061 + 0.0937j, -0.4007 + 0.0860j, -0.6079, -1.6996 + 8.1918j, -2.6623 + 11.5781j,
+    -6.1966 + 8.1990j, -20.1675 + 4.6965j,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["r50-hover", "hybrid"])
+def test_the_r50_has_its_published_eigenvalues(name):
+    """In feet and in metres: units do not move an eigenvalue."""
+    found = linear_model(name)
+    values = modes(found.model, found.vehicle().params)
+    np.testing.assert_allclose(
+        np.sort_complex(values[values.imag >= 0]), np.sort_complex(R50), atol=5.1e-5
+    )
+
+
+def test_inflow_that_has_settled_leaves_the_heave_of_the_r50():
+    found, heave = linear_model("heave-inflow"), linear_model("heave")
+    A, B, *_ = (np.asarray(M) for M in linearize(found.model, found.vehicle().params).matrices)
+    settled = A[0, 0] - A[0, 1] * A[1, 0] / A[1, 1], B[0, 0] - A[0, 1] * B[1, 0] / A[1, 1]
+    still = linearize(heave.model, heave.vehicle().params).matrices
+    np.testing.assert_allclose(settled, (still.A[0, 0], still.B[0, 0]), rtol=1e-3)
+
+
+def r50_by_hand():
+    """A and B of the R-50 as published, in feet, entered by hand."""
+    names = STATES["r50-hover"].split()
+    A, B = np.zeros((13, 13)), np.zeros((13, 4))
+    tau_f, tau_s = 0.04631, 0.3415
+    rows = {
+        "u": {"u": -0.05046, "theta": -32.2, "a": -32.2},
+        "v": {"v": -0.1539, "phi": 32.2, "b": 32.2},
+        "p": {"u": -0.1437, "v": 0.1432, "b": 166.1},
+        "q": {"u": -0.0561, "v": -0.0585, "a": 82.57},
+        "phi": {"p": 1.0},
+        "theta": {"q": 1.0},
+        "a": {"q": -1.0, "a": -1 / tau_f, "b": -0.1892 / tau_f, "c": 0.6439 / tau_f},
+        "b": {"p": -1.0, "a": 0.3681 / tau_f, "b": -1 / tau_f, "d": 0.7103 / tau_f},
+        "w": {"a": -0.1474, "b": -9.748, "w": -0.6141, "r": 0.9303},
+        "r": {"v": 0.03013, "p": -3.525, "w": 0.08568, "r": -4.129, "r_fb": -33.07},
+        "r_fb": {"r": 2.163, "r_fb": -8.258},
+        "c": {"q": -1.0, "c": -1 / tau_s},
+        "d": {"p": -1.0, "d": -1 / tau_s},
+    }
+    for i, row in enumerate(names):
+        for column, value in rows[row].items():
+            A[i, names.index(column)] = value
+    # lat, lon, ped, col
+    B[names.index("a"), :2] = 0.0313 / tau_f, -0.1004 / tau_f
+    B[names.index("b"), :2] = 0.1398 / tau_f, 0.0138 / tau_f
+    B[names.index("w"), 3] = -45.84
+    B[names.index("r"), 2:] = 33.07, -3.329
+    B[names.index("c"), 1] = -0.2587 / tau_s
+    B[names.index("d"), 0] = 0.2731 / tau_s
+    return A, B
+
+
+def driven(A, B, U, dt):
+    """States (N, n) under held inputs (N, m), by SciPy's exponential of [[A, B], [0, 0]]."""
+    n, m = B.shape
+    E = scipy.linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+    X = np.zeros((len(U), n))
+    for k in range(len(U) - 1):
+        X[k + 1] = E[:n, :n] @ X[k] + E[:n, n:] @ U[k]
+    return X
+
+
+def test_the_r50_moves_as_scipys_exponential_says():
+    """Ten seconds, over which the slow mode grows twentyfold; the pedal's delay left out."""
+    rng = np.random.default_rng(50)
+    dt, U = 0.02, np.repeat(0.1 * rng.uniform(-1.0, 1.0, (20, 4)), 25, axis=0)
+    found = linear_model("r50-hover")
+    model = dataclasses.replace(found.model, delays=())
+    inputs = model.Inputs(**dict(zip(("lat", "lon", "ped", "col"), jnp.asarray(U.T), strict=True)))
+    run = simulate(model, found.vehicle().params, inputs, dt=dt)
+    expected = driven(*r50_by_hand(), U, dt)
+    for i, name in enumerate(STATES["r50-hover"].split()):
+        metres = expected[:, i] * (0.3048 if name in "uvw" else 1.0)
+        size = np.max(np.abs(metres))
+        assert size > 1e-3
+        np.testing.assert_allclose(getattr(run.states, name), metres, rtol=0, atol=1e-10 * size)
+
+
+def roll_by_hand(Lb, tau_f, Bd, Blat, tau_s=0.3415, Dlat=0.2731):
+    A = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, Lb, 0.0],
+            [0.0, -1.0, -1 / tau_f, Bd / tau_f],
+            [0.0, -1.0, 0.0, -1 / tau_s],
+        ]
+    )
+    return A, np.array([[0.0], [0.0], [Blat / tau_f], [Dlat / tau_s]])
+
+
+def test_a_fit_finds_the_derivatives_of_a_record_by_scipy():
+    """From starts a factor of two away, and Blat from the wrong sign."""
+    truth = {"Lb": 140.0, "tau_f": 0.06, "Bd": 0.6, "Blat": 0.12}
+    rng = np.random.default_rng(17)
+    dt, U = 0.02, np.repeat(0.2 * rng.uniform(-1.0, 1.0, (50, 1)), 20, axis=0)
+    X, sd = driven(*roll_by_hand(**truth), U, dt), 0.01
+    outputs = {
+        "phi": X[:, 0] + 0.2 * sd * rng.standard_normal(len(X)),
+        "p": X[:, 1] + sd * rng.standard_normal(len(X)),
+    }
+    found = linear_model("roll")
+    problem = Problem(
+        found.model,
+        found.vehicle().params,
+        [Flight(dt=dt, inputs={"lat": U[:, 0]}, outputs=outputs)],
+        {"Lb": Free(70.0), "tau_f": Free(0.03), "Bd": Free(0.3), "Blat": Free(-0.05)},
+        Nuisance(initial_state=False, bias=False, input_offset=False),
+    )
+    fitted = heli_jax.fit(problem)
+    assert fitted.status == "converged"
+    for name, value in truth.items():
+        estimate = fitted.estimates[name]
+        assert estimate.sd < 0.05 * abs(value)
+        assert abs(estimate.value - value) < 4.0 * estimate.sd
+    kinds = {n: plain_kind(f) for n, f in problem.free.items()}
+    assert kinds == {"Lb": "linear", "tau_f": "log", "Bd": "linear", "Blat": "linear"}
+
+
+@pytest.mark.parametrize(
+    ("free", "words"),
+    [
+        (Free(-0.1), "free.tau_f.start: expected more than zero"),
+        (Free(0.1, lower=-1.0), "free.tau_f.lower: expected more than zero"),
+        (Free(0.1, sign="any"), "free.tau_f.sign: expected keep"),
+    ],
+)
+def test_what_is_positive_starts_and_stays_above_zero(free, words):
+    found = linear_model("roll")
+    flight = Flight(dt=0.1, inputs={"lat": np.ones(9)}, outputs={"p": np.arange(9.0)})
+    with pytest.raises(ValueError, match=words):
+        Problem(found.model, found.vehicle().params, [flight], {"tau_f": free})

@@ -1,0 +1,276 @@
+"""Inputs that are late by times of their own, against an integration of the delayed equations."""
+
+import itertools
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem, accumulate, fit, simulate
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.model import Axis
+from heli_jax.identification.estimation.kalman import innovations
+from heli_jax.naming import Scalar
+
+DT, N = 0.05, 60
+HOLDS = {"held": "zero-order", "linear": "linear", "mixed": {"elevator": "linear"}}
+
+
+class Params(NamedTuple):
+    k: Annotated[Scalar, "1/s^2", "stiffness"] = 4.0
+    c: Annotated[Scalar, "1/s", "damping"] = 0.7
+    late: Annotated[Scalar, "s", "delay of the elevator"] = 0.0
+    later: Annotated[Scalar, "s", "delay of the flap"] = 0.0
+
+
+class State(NamedTuple):
+    theta: Annotated[Scalar, "rad", "angle"]
+    q: Annotated[Scalar, "rad/s", "rate"]
+
+
+class Inputs(NamedTuple):
+    elevator: Scalar
+    flap: Scalar
+    thrust: Scalar
+
+
+class Outputs(NamedTuple):
+    theta: Annotated[Scalar, "rad", "angle"]
+    felt: Scalar
+
+
+def field(p, x, u):
+    return State(x.q, -p.k * x.theta - p.c * x.q + 2.0 * u.elevator + u.flap - 0.5 * u.thrust)
+
+
+def bent(p, x, u):
+    q = -p.k * jnp.sin(x.theta) - p.c * x.q + 2.0 * u.elevator + u.flap - 0.5 * u.thrust
+    return State(x.q, q)
+
+
+def output(p, x, u):
+    return Outputs(x.theta, x.q + u.elevator - u.flap + u.thrust)
+
+
+DELAYS = (("elevator", "late"), ("flap", "later"))
+AXES = (Axis("pitch", rate="q", angle="theta"),)
+
+
+def model(linear):
+    return Model(
+        "delayed", field if linear else bent, output, Params, State, Inputs, Outputs,
+        linear=linear, delays=DELAYS, axes=AXES,
+    )  # fmt: skip
+
+
+LINEAR, NONLINEAR = model(True), model(False)
+PLAIN = Model("plain", field, output, Params, State, Inputs, Outputs, linear=True)
+
+
+def sticks(seed=0):
+    return np.random.default_rng(seed).standard_normal((3, N))
+
+
+def read(u, t, hold):
+    """An input at a time, which may lie between samples and before the first."""
+    place = np.clip(t / DT, 0.0, N - 1.0)
+    if hold == "linear":
+        return np.interp(place, np.arange(N), u)
+    return u[int(np.floor(place + 1e-9))]
+
+
+def by_hand(u, delays, hold, linear, upto=N):
+    """theta and what is felt (N,), by an integration that stops at every corner of an input."""
+    holds = [hold.get(n, "zero-order") if isinstance(hold, dict) else hold for n in Inputs._fields]
+    late = (*delays, 0.0)
+
+    def acting(t):
+        return [read(v, t - d, h) for v, d, h in zip(u, late, holds, strict=True)]
+
+    def rates(t, x, middle):
+        # Within a part every input stays or follows one line: read from the part's inside.
+        lo, hi = middle
+        e, f, w = (
+            (read(v, lo - d, h) + (read(v, hi - d, h) - read(v, lo - d, h)) * (t - lo) / (hi - lo))
+            if h == "linear" else read(v, 0.5 * (lo + hi) - d, h)
+            for v, d, h in zip(u, late, holds, strict=True)
+        )  # fmt: skip
+        pull = x[0] if linear else np.sin(x[0])
+        return [x[1], -4.0 * pull - 0.7 * x[1] + 2.0 * e + f - 0.5 * w]
+
+    x, out = np.zeros(2), []
+    for k in range(upto):
+        e, f, w = acting(k * DT + (0.0 if isinstance(hold, dict) or hold == "linear" else 1e-12))
+        # A held input that is late by whole samples and a part jumps within the interval.
+        out.append((x[0], x[1] + e - f + w))
+        corners = sorted({0.0, *((d / DT) % 1.0 for d in late), 1.0})
+        for lo, hi in itertools.pairwise(corners):
+            span = (k + lo) * DT, (k + hi) * DT
+            x = solve_ivp(rates, span, x, args=(span,), rtol=1e-10, atol=1e-12).y[:, -1]
+    return np.array(out).T
+
+
+@pytest.fixture(scope="module")
+def run():
+    """theta and what is felt of a delayed model, compiled once a model and hold."""
+    compiled = {}
+
+    def go(machine, u, delays, hold, **keywords):
+        key = (machine.name, machine.linear, str(hold), str(keywords))
+        if key not in compiled:
+            compiled[key] = jax.jit(
+                lambda p, u: simulate(machine, p, u, dt=DT, hold=hold, **keywords).outputs
+            )
+        p = Params(late=jnp.asarray(delays[0]), later=jnp.asarray(delays[1]))
+        out = compiled[key](p, Inputs(*jnp.asarray(u)))
+        return np.array([out.theta, out.felt])
+
+    return go
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("delays", [(0.012, 0.17), (0.17, 0.012), (0.07, 0.07), (0.0, 0.1)])
+def test_two_delays_of_a_linear_model(run, hold, delays):
+    u = sticks()
+    expected = by_hand(u, delays, HOLDS[hold], True, 25)
+    np.testing.assert_allclose(
+        run(LINEAR, u, delays, HOLDS[hold])[:, :25], expected, rtol=0, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_two_delays_of_a_model_that_is_not_linear(run, hold):
+    u, delays = sticks(1), (0.17, 0.012)
+    expected = by_hand(u, delays, HOLDS[hold], False, 25)
+    actual = run(NONLINEAR, u, delays, HOLDS[hold], substeps=8)[:, :25]
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_in_blocks_and_reduced_it_is_the_same_run(run, hold):
+    u, delays = sticks(2), (0.03, 0.11)
+    stepwise = run(LINEAR, u, delays, HOLDS[hold])
+    blocks = run(LINEAR, u, delays, HOLDS[hold], block=16)
+    np.testing.assert_allclose(blocks, stepwise, rtol=0, atol=1e-12)
+    p = Params(late=jnp.asarray(0.03), later=jnp.asarray(0.11))
+
+    def update(value, outputs, _):
+        return value + outputs.theta * outputs.felt
+
+    for block in (1, 4):
+        value, _ = accumulate(
+            LINEAR, p, Inputs(*jnp.asarray(u)), update, jnp.zeros(()), dt=DT, hold=HOLDS[hold],
+            block=block,
+        )  # fmt: skip
+        assert float(value) == pytest.approx(np.sum(stepwise[0] * stepwise[1]), rel=1e-10)
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
+def test_derivatives_by_each_delay(machine, hold):
+    u = Inputs(*jnp.asarray(sticks(3)))
+
+    def theta(d):
+        p = Params(late=d[0], later=d[1])
+        return simulate(machine, p, u, dt=DT, hold=HOLDS[hold]).outputs.theta
+
+    d, h = jnp.asarray([0.031, 0.116]), 1e-5
+    J = np.asarray(jax.jit(jax.jacfwd(theta))(d))
+    theta = jax.jit(theta)
+    for i in range(2):
+        step = h * jnp.eye(2)[i]
+        central = (np.asarray(theta(d + step)) - np.asarray(theta(d - step))) / (2 * h)
+        np.testing.assert_allclose(J[:, i], central, rtol=0, atol=1e-6 * np.abs(central).max())
+
+
+def test_one_delay_of_all_and_one_of_its_own_add_up(run):
+    u = sticks(4)
+    own = run(LINEAR, u, (0.031, 0.116), "linear", delay=0.02)
+    p = Params(late=jnp.asarray(0.051), later=jnp.asarray(0.136))
+    shifted = simulate(
+        LINEAR, p, Inputs(*jnp.asarray(u)), dt=DT, hold={"elevator": "linear", "flap": "linear"}
+    ).outputs
+    # The thrust has no delay of its own and is late by the common one.
+    late = simulate(
+        PLAIN, p, Inputs(0.0 * u[2], 0.0 * u[2], u[2]), dt=DT, hold="linear", delay=0.02
+    ).outputs
+    at_once = simulate(PLAIN, p, Inputs(0.0 * u[2], 0.0 * u[2], u[2]), dt=DT).outputs
+    together = np.asarray(shifted.theta) - np.asarray(at_once.theta) + np.asarray(late.theta)
+    np.testing.assert_allclose(own[0], together, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
+def test_the_filter_without_noise_predicts_the_simulation(run, machine):
+    """With nothing random in it a filter corrects nothing: its innovations are y - simulation."""
+    u, delays = sticks(5), (0.031, 0.116)
+    disturbed = with_disturbance(machine, "pitch")
+    assert disturbed.delays == machine.delays
+    p = disturbed.Params(
+        late=jnp.asarray(0.031), later=jnp.asarray(0.116), sigma_w=jnp.asarray(1e-9)
+    )
+    y = np.random.default_rng(6).standard_normal(N)
+    found = innovations(
+        disturbed, p, Inputs(*jnp.asarray(u)), {"theta": jnp.asarray(y)}, {"theta": 1.0}, dt=DT,
+        hold="linear", substeps=8,
+    )  # fmt: skip
+    expected = y - run(machine, u, delays, "linear", substeps=8)[0]
+    atol = 1e-9 if machine.linear else 1e-5  # two ways to integrate
+    np.testing.assert_allclose(found.error["theta"], expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("machine", [LINEAR, NONLINEAR], ids=["linear", "nonlinear"])
+def test_noise_is_drawn_beside_delays(run, machine):
+    """The noise adds to a linear model's run what it adds without any input."""
+    disturbed = with_disturbance(machine, "pitch")
+    p = disturbed.Params(
+        late=jnp.asarray(0.031), later=jnp.asarray(0.116), sigma_w=jnp.asarray(0.3)
+    )
+    u, key = sticks(7), jax.random.key(1)
+
+    def theta(u, key=None):
+        found = simulate(disturbed, p, Inputs(*jnp.asarray(u)), dt=DT, hold="linear", key=key)
+        return np.asarray(found.outputs.theta)
+
+    moved, still = theta(u, key) - theta(u), theta(0.0 * u, key)
+    assert np.std(still) > 0.01
+    atol = 1e-12 if machine.linear else 0.5 * np.std(still)
+    np.testing.assert_allclose(moved, still, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("window", [None, 1.0])
+def test_delays_are_found_beside_the_parameters(run, window):
+    """In one piece and in windows, whose inputs begin before them."""
+    u = sticks(8)
+    rng = np.random.default_rng(9)
+    y = run(LINEAR, u, (0.031, 0.116), "linear")[0] + 1e-3 * rng.standard_normal(N)
+    flight = Flight(
+        dt=DT, inputs=dict(zip(Inputs._fields, u, strict=True)), outputs={"theta": y},
+        hold=dict.fromkeys(Inputs._fields, "linear"),
+    )  # fmt: skip
+    free = {n: Free(v) for n, v in {"k": 3.0, "c": 1.0, "late": 0.06, "later": 0.06}.items()}
+    problem = Problem(LINEAR, Params(), [flight], free, Nuisance(bias=False), window=window)
+    found = fit(problem)
+    assert found.status == "converged"
+    for name, true in {"k": 4.0, "c": 0.7, "late": 0.031, "later": 0.116}.items():
+        estimate = found.estimates[name]
+        assert abs(estimate.value - true) < 4 * estimate.sd, name
+    assert found.estimates["late"].sd < 2e-3
+
+
+def test_a_shift_of_all_inputs_in_windows(run):
+    u = sticks(10)
+    # The thrust stays at its neutral, so that all that moves is late by 0.1 s more.
+    u[2] = 0.0
+    machine = Params(late=jnp.asarray(0.031), later=jnp.asarray(0.116))
+    y = run(LINEAR, u, (0.131, 0.216), "linear")[0]
+    flight = Flight(
+        dt=DT, inputs=dict(zip(Inputs._fields, u, strict=True)), outputs={"theta": y},
+        hold=dict.fromkeys(Inputs._fields, "linear"),
+    )  # fmt: skip
+    nuisance = Nuisance(bias=False, time_shift=True)
+    found = fit(Problem(LINEAR, machine, [flight], {"k": Free(3.5)}, nuisance, window=1.0))
+    assert found.nuisance["time_shift"].value == pytest.approx(0.1, abs=1e-5)
+    assert found.estimates["k"].value == pytest.approx(4.0, rel=1e-5)
