@@ -109,8 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(sweep)
     _add_sweep_options(sweep)
     info = command("info", _info, "signals, rates, duration and gaps of a log")
-    info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
-    info.add_argument("--time", metavar="NAME", help="the column of time stamps")
+    _add_info_options(info)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -157,6 +156,15 @@ def _add_sweep_options(command: argparse.ArgumentParser) -> None:
         metavar="tcp://HOST:8786",
         help="compute on the workers of this dask scheduler",
     )
+
+
+def _add_info_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
+    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+    command.add_argument("--flight", type=_count, metavar="N", help="this flight alone (from 1)")
+    command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
+    command.add_argument("--json", action="store_true", help="everything, for other programs")
 
 
 def _count(text: str) -> int:
@@ -320,10 +328,14 @@ def _client(options: argparse.Namespace, config: Path) -> contextlib.AbstractCon
 
 
 def _info(options: argparse.Namespace) -> int:
-    from heli_jax import output
-    from heli_jax.flights import describe_log
+    from heli_jax import log_output
+    from heli_jax.flights.describe import describe_flights
 
-    output.print_info(describe_log(options.log, options.time))
+    flights = list(describe_flights(options.log, options.time, options.time_unit, options.flight))
+    if options.json:
+        print(log_output.as_json(flights))
+    else:
+        log_output.print_flights(flights, options.channels)
     return DONE
 
 

@@ -167,7 +167,7 @@ def make_log(
         topics=tuple(topics),
         firmware=_firmware(rows),
         parameters=_parameters(rows),
-        notes=(f"{damaged} damaged places skipped",) if damaged else (),
+        notes=(f"{damaged} damaged place{'' if damaged == 1 else 's'} skipped",) if damaged else (),
     )
 
 

@@ -49,20 +49,41 @@ def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
             format may be, it cannot be read, or it is of no readable format; it holds several
             flights and none is named, or not the one that is.
     """
-    logs = open_flights(path)
+    logs = chosen_flights(path, open_flights(path), flight)
     if not isinstance(logs, tuple):
-        if flight not in (None, 1):
-            raise wrong(str(path), f"holds one flight, expected number 1, got {flight}")
         return logs
-    numbers = [log.flight[0] for log in logs]
-    if flight is None and len(logs) > 1:
-        known = ", ".join(map(str, numbers[:20])) + (", ..." if len(numbers) > 20 else "")
+    if len(logs) > 1:
+        numbers = [str(log.flight[0]) for log in logs]
+        known = ", ".join(numbers[:20]) + (", ..." if len(numbers) > 20 else "")
         problem = f"holds {len(logs)} flights, expected the number of one: {known}"
         raise wrong(str(path), problem)
-    if flight is not None and flight not in numbers:
-        known = ", ".join(map(str, numbers[:20]))
-        raise wrong(str(path), f"holds no flight {flight} with frames, expected one of {known}")
-    return logs[0] if flight is None else logs[numbers.index(flight)]
+    return logs[0]
+
+
+def chosen_flights(
+    path: str | Path, logs: Table | tuple[ChannelLog, ...], flight: int | None
+) -> Table | tuple[ChannelLog, ...]:
+    """The flight of a number, or all without one.
+
+    Args:
+        path: for the message.
+        logs: what was opened.
+        flight: from 1.
+
+    Raises:
+        InputError: there is none of this number.
+    """
+    if flight is None:
+        return logs
+    if not isinstance(logs, tuple):
+        if flight != 1:
+            raise wrong(str(path), f"holds one flight, expected number 1, got {flight}")
+        return logs
+    chosen = tuple(log for log in logs if log.flight[0] == flight)
+    if not chosen:
+        known = ", ".join(str(log.flight[0]) for log in logs[:20])
+        raise wrong(str(path), f"holds no flight {flight} with samples, expected one of {known}")
+    return chosen
 
 
 def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:

@@ -60,6 +60,8 @@ class _Content:
     appended: list[int] = field(default_factory=list)
     damaged: int = 0
     dropouts: int = 0
+    dropped: int = 0
+    """ms"""
 
 
 def open_ulog(path: Path) -> ChannelLog:
@@ -84,7 +86,9 @@ def open_ulog(path: Path) -> ChannelLog:
         count = content.damaged
         notes.append(f"{count} damaged message{'' if count == 1 else 's'} skipped")
     if content.dropouts:
-        notes.append(f"the logger dropped data {content.dropouts} times")
+        times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
+        lost = f"{content.dropped * 1e-3:.3g} s in all"
+        notes.append(f"the logger dropped data {times}, {lost}")
     information = content.information
     parts = (information.get("sys_name", ""), information.get("ver_hw", ""), _version(information))
     return ChannelLog(
@@ -164,6 +168,7 @@ def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
         case "A":
             _take_subscription(body, content)
         case "O":
+            content.dropped += struct.unpack("<H", body[:2])[0]
             content.dropouts += 1
         case "B":
             flags = body[8:16]
