@@ -275,7 +275,9 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
     signs = {}
     for sign in (",", ".") if delimiter != "," else ():
         for text in texts:
-            row = pc.index(pc.match_substring(text, sign), True).as_py()
+            matches = pc.match_substring(text, sign)
+            # `index` alone would do, and import pandas for its second argument.
+            row = pc.index(matches, True).as_py() if pc.any(matches).as_py() else -1
             if row >= 0:
                 signs[sign] = shown(text[row].as_py().strip())
                 break
@@ -289,9 +291,13 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
 
 def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     """Cells without the blanks around them, null where nothing is left."""
+    import pyarrow as pa
+
     pc = _compute()
     trimmed = pc.utf8_trim_whitespace(text)
-    return pc.if_else(pc.equal(trimmed, ""), None, trimmed)
+    # Not compared with "": pyarrow imports pandas, a fifth of a second, to take a value of Python.
+    nothing = pa.nulls(1, trimmed.type)[0]
+    return pc.if_else(pc.cast(pc.utf8_length(trimmed), pa.bool_()), trimmed, nothing)
 
 
 def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
@@ -300,9 +306,24 @@ def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
 
     filled = _filled(text)
     try:
-        return np.asarray(filled.cast(pa.float64()).to_numpy(zero_copy_only=False))
+        numbers = filled.cast(pa.float64())
     except pa.ArrowInvalid:  # it does not say which row
         return _floats_one_by_one(filled)
+    # As buffers, since to_numpy imports pandas too.
+    values = _buffer(numbers, np.float64)
+    return np.where(
+        _buffer(_compute().is_valid(numbers).cast(pa.uint8()), np.uint8), values, np.nan
+    )
+
+
+def _buffer(numbers: "pa.ChunkedArray", kind: type) -> np.ndarray:
+    """The numbers (N,), without regard to which are null."""
+    pieces = [
+        np.frombuffer(chunk.buffers()[1], kind, len(chunk), chunk.offset * np.dtype(kind).itemsize)
+        for chunk in numbers.chunks
+        if len(chunk)
+    ]
+    return np.concatenate([np.zeros(0, kind), *pieces])
 
 
 def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:
