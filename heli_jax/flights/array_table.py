@@ -195,7 +195,7 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
     try:
         import h5py  # pyright: ignore[reportMissingImports]
     except ImportError as e:
-        problem = "is an HDF5 file inside, for which h5py is needed: pip install h5py"
+        problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem) from e
 
     def read() -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -138,7 +138,7 @@ def find_delimiter(header: str, first: str) -> str:
 def is_of_blanks(header: str, first: str) -> bool:
     """Whether blanks alone stand between the cells of header and first row."""
     # Names may hold blanks: only where nothing else is between them, and as many cells below.
-    alone = not any(delimiter in header + first for delimiter in ("\t", ";", ","))
+    alone = not any(delimiter in header.strip() + first.strip() for delimiter in ("\t", ";", ","))
     return alone and len(header.split()) == len(first.split()) > 1
 
 

@@ -113,7 +113,7 @@ def require_moving_inputs(flight: Flight) -> None:
         InputError: naming the first input and the value it keeps.
     """
     path = flight.source.path if flight.source else flight.name or "flight"
-    if any(values.min() != values.max() for values in flight.inputs.values()):
+    if not flight.inputs or any(x.min() != x.max() for x in flight.inputs.values()):
         return
     name, values = next(iter(flight.inputs.items()))
     others = " as do the others" if len(flight.inputs) > 1 else ""
