@@ -26,7 +26,7 @@ from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import read_channels
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
+from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
 from heli_jax.flights.table import Table, column, shown, wrong
 
 _FEWEST = 8
@@ -290,7 +290,7 @@ def _on_grid(
     samples = {}
     for (key, kind), x in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
-        samples[key, kind] = (hold if stays else interpolate)(seconds, x, clock.times)
+        samples[key, kind] = (hold if stays else resampled)(seconds, x, clock.times)
     return clock.dt, samples, notes + clock.notes
 
 

@@ -12,7 +12,7 @@ from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, un
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
+from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
 from heli_jax.flights.table import shown, wrong
 
 _FEWEST = 8
@@ -181,7 +181,7 @@ def _on_grid(
     samples = {}
     for (key, kind), signal in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
-        method = hold if stays else interpolate
+        method = hold if stays else resampled
         samples[key, kind] = method(signal.clock.seconds, signal.values, times)
     return float(times[0]), 1.0 / rate, samples, notes
 
