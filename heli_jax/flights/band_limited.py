@@ -71,7 +71,9 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
     at = (seconds - seconds[0]) / step
     count = int(np.ceil(at[-1])) + 1
     even = np.empty(count)
-    line = np.interp(np.arange(count), at, values)
+    # The last even sample lies behind the last stamp, where the slope goes on.
+    slope = (values[-1] - values[-2]) / (at[-1] - at[-2])
+    line = np.interp(np.arange(count), np.r_[at, at[-1] + 1], np.r_[values, values[-1] + slope])
     for begin in range(0, count, _BLOCK):
         end = min(begin + _BLOCK, count)
         first, last = max(begin - _OVERLAP, 0), min(end + _OVERLAP, count)
@@ -108,7 +110,8 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
     for lag in range(middle + 1):
         band[_TAPS - lag, lag:] += energy[middle + lag]
     band[_TAPS] += _RIDGE
-    right -= np.convolve(np.pad(padded, middle, mode="edge"), energy, mode="valid")
+    beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
+    right -= np.convolve(beyond, energy, mode="valid")
     correction = solveh_banded(band, right)
     return (padded + correction)[half : half + line.size]
 

@@ -158,7 +158,7 @@ def describe_flights(
     """
     log = chosen_flights(path, open_flights(path), number)
     if not isinstance(log, tuple):
-        yield _describe_table(log, time, unit)
+        yield describe_table(log, time, unit)
         return
     for option, value in (("time", time), ("unit of time", unit)):
         if value is not None:
@@ -198,7 +198,17 @@ def _describe_topic(topic: Topic) -> TopicInfo:
     return TopicInfo(topic.name, topic.times.size, time, columns)
 
 
-def _describe_table(table: Table, time: str | Signal | None, unit: str | None) -> LogInfo:
+def describe_table(table: Table, time: str | Signal | None, unit: str | None) -> LogInfo:
+    """As `describe_log`, of a table that is open.
+
+    Args:
+        table: of rows.
+        time: the column of time stamps.
+        unit: of the time stamps.
+
+    Raises:
+        InputError: it has no such column.
+    """
     surveys = table.survey()
     if time is None:
         signal, guessed = _guess_time(table, surveys)

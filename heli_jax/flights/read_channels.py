@@ -25,7 +25,7 @@ _Key = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
-class _Clock:
+class TopicClock:
     """The times (N,) [s] of one topic inside the window, from the log's beginning, and its rows."""
 
     topic: str
@@ -46,7 +46,7 @@ class _Clock:
 class _Signal:
     """Samples (N,) in SI on a clock."""
 
-    clock: _Clock
+    clock: TopicClock
     values: np.ndarray
 
 
@@ -88,14 +88,14 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
 
 def _signals(log: ChannelLog, request: Request) -> dict[_Key, _Signal]:
     """The signals in SI inside the window, each on the clock of its topic."""
-    clocks: dict[str, _Clock] = {}
+    clocks: dict[str, TopicClock] = {}
     signals = {}
     for (key, kind), signal in request.signals.items():
         topic = log.topic_of(signal.name).name
         times, values = log.channel(signal.name)
         if topic not in clocks:
             elapsed = times - log.first_time
-            clocks[topic] = _clock(log.path, topic, elapsed, request.options.window)
+            clocks[topic] = topic_clock(log.path, topic, elapsed, request.options.window)
         clock = clocks[topic]
         with np.errstate(over="ignore"):  # what overflows is refused below
             values = values[clock.rows] * units.factor(signal.unit, signal.si)
@@ -109,10 +109,20 @@ def _signals(log: ChannelLog, request: Request) -> dict[_Key, _Signal]:
     return signals
 
 
-def _clock(
+def topic_clock(
     path: str, topic: str, elapsed: np.ndarray, window: tuple[float, float] | None
-) -> _Clock:
-    """The times of a topic inside the window, finite and increasing."""
+) -> TopicClock:
+    """The times of a topic inside the window, finite and increasing.
+
+    Args:
+        path: for the message.
+        topic: its name.
+        elapsed: its stamps (N,) [s] from the log's beginning.
+        window: first and last [s].
+
+    Raises:
+        InputError: they are no clock, or too few.
+    """
     place = f"topic {shown(topic)}"
     if elapsed.size and not np.all(np.abs(elapsed) <= LATEST):
         raise wrong(path, "got times that are no finite numbers, expected a clock", place)
@@ -134,7 +144,7 @@ def _clock(
         raise wrong(path, f"{problem}; give a window without it", place)
     if np.median(steps) < SHORTEST_STEP:
         raise wrong(path, "its steps are shorter than 1 ns, expected a clock", place)
-    return _Clock(topic, seconds, slice(first, last))
+    return TopicClock(topic, seconds, slice(first, last))
 
 
 def _holds(request: Request, signals: Mapping[_Key, _Signal]) -> dict[str, Decision]:
@@ -177,7 +187,8 @@ def _on_grid(
         samples = {key: signal.values for key, signal in signals.items()}
         return float(clocks[0].seconds[0]), dt, samples, notes
     notes = tuple(f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes)
-    times = _common_times(path, clocks, rate)
+    _require_no_gaps(path, clocks)
+    times = common_times(path, clocks, rate)
     samples = {}
     for (key, kind), signal in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
@@ -186,7 +197,7 @@ def _on_grid(
     return float(times[0]), 1.0 / rate, samples, notes
 
 
-def _uniform(path: str, clock: _Clock) -> tuple[float, tuple[str, ...]]:
+def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
     """The step [s] of a single topic's clock, which is a uniform grid, and notes."""
     seconds = clock.seconds
     grid = uniform_grid(seconds - seconds[0], rounding_of(seconds))
@@ -203,8 +214,7 @@ def _uniform(path: str, clock: _Clock) -> tuple[float, tuple[str, ...]]:
     return grid.dt, grid.notes
 
 
-def _common_times(path: str, clocks: list[_Clock], rate: float) -> np.ndarray:
-    """Times (M,) [s] at the rate at which all topics have samples before and behind."""
+def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
     for clock in clocks:
         steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
         row = int(np.argmax(steps))
@@ -212,6 +222,14 @@ def _common_times(path: str, clocks: list[_Clock], rate: float) -> np.ndarray:
             problem = f"a gap of {steps[row]:.6g} s at {clock.seconds[row]:.6g} s, expected none"
             problem += f" longer than {most:.3g} s; give a window without it"
             raise wrong(path, problem, f"topic {shown(clock.topic)}")
+
+
+def common_times(path: str, clocks: list[TopicClock], rate: float) -> np.ndarray:
+    """Times (M,) [s] at the rate [Hz] at which all topics have samples before and behind.
+
+    Raises:
+        InputError: there are too few, or absurdly many.
+    """
     start = max(float(clock.seconds[0]) for clock in clocks)
     end = min(float(clock.seconds[-1]) for clock in clocks)
     fastest = min(clock.usual for clock in clocks)
