@@ -7,7 +7,7 @@ limit of the band). These pass a low-pass filter, a sinc in a Kaiser window, eva
 times.
 
 At 200 Hz with a fifth of a step of jitter and 5 % of the samples lost, what lies between 26 and
-60 Hz is below -75 dB at 50 Hz. Above 70 % of the old Nyquist frequency lost samples cannot be made
+70 Hz is below -75 dB at 50 Hz. Above 70 % of the old Nyquist frequency lost samples cannot be made
 up for, and a part folds; even samples have no such limit.
 """
 
@@ -20,10 +20,11 @@ _REACH = 25
 _BETA = 7.0
 _TAPS = 32
 """samples that a sample between two others is a sum of"""
-_TAPS_BETA = 6.0
+_TAPS_BETA = 8.0
 _PENALTY = 0.1
 """for what lies in the upper seventh of the old band: a lost sample is what makes it small"""
 _RIDGE = 1e-9
+_END, _END_RIDGE = 4, 1e-2
 _BLOCK, _OVERLAP = 1 << 15, 256
 _TABLE = 1 << 16
 _AT_ONCE = 1 << 22
@@ -97,6 +98,7 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
     base = np.floor(at).astype(np.int64) + 1
     columns = base[:, None] + np.arange(_TAPS)
     weights = _sinc(at[:, None] + half - columns)
+    weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
     band = np.zeros((_TAPS + 1, padded.size))
     for lag in range(_TAPS):
         products = weights[:, : _TAPS - lag] * weights[:, lag:]
@@ -104,12 +106,16 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
         band[_TAPS - lag] += np.bincount(to, products.ravel(), padded.size)
     missing = values - np.sum(weights * padded[columns], axis=1)
     right = np.bincount(columns.ravel(), (weights * missing[:, None]).ravel(), padded.size)
-    high = _PENALTY * firwin(_TAPS // 2 + 1, 0.85, pass_zero=False, window=("kaiser", 4.0))
+    high = _PENALTY * firwin(_TAPS + 1, 0.85, pass_zero=False, window=("kaiser", 6.0))
+    high -= high.mean()  # straight lines, however steep, cost nothing
     energy = np.convolve(high, high[::-1])
     middle = energy.size // 2
     for lag in range(middle + 1):
         band[_TAPS - lag, lag:] += energy[middle + lag]
     band[_TAPS] += _RIDGE
+    # At the ends samples stand on one side alone, and their noise would grow outward.
+    band[_TAPS, : half + _END] += _END_RIDGE
+    band[_TAPS, -half - _END :] += _END_RIDGE
     beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
     right -= np.convolve(beyond, energy, mode="valid")
     correction = solveh_banded(band, right)
