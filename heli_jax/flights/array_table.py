@@ -102,20 +102,21 @@ def open_mat(path: Path) -> ArrayTable:
 
     import scipy.io
 
-    # Any: what the reader gives is an array, a structure or an object of its own.
-    def read() -> dict[str, Any]:
+    def read() -> dict[str, np.ndarray]:
         sizes = scipy.io.whosmat(io.BytesIO(data))
         _require_few_cells(path, sum(int(np.prod(shape, dtype=float)) for _, shape, _ in sizes))
-        return scipy.io.loadmat(io.BytesIO(data), struct_as_record=False, squeeze_me=False)
+        content = scipy.io.loadmat(io.BytesIO(data), struct_as_record=False, squeeze_me=False)
+        # Within the guard: of a damaged file some arrays are none, which shows at the first look.
+        arrays: dict[str, np.ndarray] = {}
+        for name, value in content.items():
+            if not name.startswith("__"):
+                arrays.update(_leaves(name, value, 0))
+        return arrays
 
-    content = _guarded(path, "MATLAB file", read)
-    arrays: dict[str, np.ndarray] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            arrays.update(_leaves(name, value, 0))
-    return ArrayTable(str(path), "mat", data, arrays)
+    return ArrayTable(str(path), "mat", data, _guarded(path, "MATLAB file", read))
 
 
+# Any: what the reader gives is an array, a structure or an object of its own.
 def _leaves(name: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray]]:
     """The numeric vectors below a value, by path; a matrix gives a vector for each column."""
     fields = getattr(value, "_fieldnames", None)

@@ -80,7 +80,12 @@ def test_conversions_that_are_refused(tmp_path, capsys):
     path, out = some_ulog(tmp_path), tmp_path / "out.csv"
     refused(capsys, ["convert", path, out], "2 clocks", "expected --rate")
     refused(capsys, ["convert", path, tmp_path / "out.xlsx"], ".csv, .parquet, .nc")
-    refused(capsys, ["convert", path, out, "--signals", "vehicle_at"], "no channel", "did you mean")
+    refused(
+        capsys,
+        ["convert", path, out, "--signals", "manual_control_setpoint.y"],
+        "no channel",
+        "did you mean",
+    )
     refused(capsys, ["convert", path, out, "--rate", "-1"], "rate is -1")
     refused(capsys, ["convert", path, out, "--window", "5", "1"], "two increasing numbers")
     refused(capsys, ["convert", path, out, "--window", "50", "51"], "holds 0 samples")
