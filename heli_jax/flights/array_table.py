@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from heli_jax.flights import mat_file
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -23,10 +24,8 @@ from heli_jax.regular_file import read_regular
 _LARGEST = 10**9
 _MOST_CELLS = 3 * 10**8
 """of all arrays: 2.4 GB of numbers, which a few compressed bytes can claim"""
-_DEEPEST = 8
-"""structures within structures"""
 _MOST_ELEMENTS = 100
-"""of an array of structures: more are data of another shape than a log's"""
+"""columns of a matrix: more are data of another shape than a log's"""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -98,41 +97,13 @@ def open_mat(path: Path) -> ArrayTable:
     data = read_regular(path, "a MATLAB file", _LARGEST)
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
-    import io
-
-    import scipy.io
-
-    def read() -> dict[str, np.ndarray]:
-        sizes = scipy.io.whosmat(io.BytesIO(data))
-        _require_few_cells(path, sum(int(np.prod(shape, dtype=float)) for _, shape, _ in sizes))
-        content = scipy.io.loadmat(io.BytesIO(data), struct_as_record=False, squeeze_me=False)
-        # Within the guard: of a damaged file some arrays are none, which shows at the first look.
-        arrays: dict[str, np.ndarray] = {}
-        for name, value in content.items():
-            if not name.startswith("__"):
-                arrays.update(_leaves(name, value, 0))
-        return arrays
-
-    return ArrayTable(str(path), "mat", data, _guarded(path, "MATLAB file", read))
-
-
-# Any: what the reader gives is an array, a structure or an object of its own.
-def _leaves(name: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray]]:
-    """The numeric vectors below a value, by path; a matrix gives a vector for each column."""
-    fields = getattr(value, "_fieldnames", None)
-    if fields is not None:
-        for each in fields if depth < _DEEPEST else ():
-            yield from _leaves(f"{name}.{each}", getattr(value, each), depth + 1)
-        return
-    if not isinstance(value, np.ndarray):
-        return
-    if value.dtype == object:
-        items = value.ravel()
-        for i, item in enumerate(items[:_MOST_ELEMENTS]):
-            index = f"[{i}]" if items.size > 1 else ""
-            yield from _leaves(f"{name}{index}", item, depth + 1) if depth < _DEEPEST else ()
-        return
-    yield from _vectors(name, value)
+    try:
+        whole = mat_file.read_arrays(data)
+    except mat_file.DamagedMatFile as e:
+        raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    _require_few_cells(path, sum(array.size for array in whole.values()))
+    arrays = {n: part for name, array in whole.items() for n, part in _vectors(name, array)}
+    return ArrayTable(str(path), "mat", data, arrays)
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
