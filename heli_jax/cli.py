@@ -109,8 +109,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(sweep)
     _add_sweep_options(sweep)
     info = command("info", _info, "signals, rates, duration and gaps of a log")
-    info.add_argument("log", metavar="LOG", help=".csv, .txt, .tsv or .parquet")
-    info.add_argument("--time", metavar="NAME", help="the column of time stamps")
+    _add_info_options(info)
+    convert = command("convert", _convert, "signals of a log on one clock, as a table")
+    _add_convert_options(convert)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -157,6 +158,34 @@ def _add_sweep_options(command: argparse.ArgumentParser) -> None:
         metavar="tcp://HOST:8786",
         help="compute on the workers of this dask scheduler",
     )
+
+
+def _add_info_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
+    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+    command.add_argument("--flight", type=_count, metavar="N", help="this flight alone (from 1)")
+    command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
+    command.add_argument("--json", action="store_true", help="everything, for other programs")
+
+
+def _add_convert_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+    command.add_argument("out", metavar="OUT", help=".csv, .parquet or .nc")
+    command.add_argument(
+        "--signals",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="'vehicle_attitude.*' (default all)",
+    )
+    command.add_argument("--rate", type=float, metavar="HZ", help="resample to this rate")
+    command.add_argument(
+        "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="[s] from the log's beginning"
+    )
+    command.add_argument("--flight", type=_count, metavar="N", help="of a log of several (from 1)")
+    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
+    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
 
 
 def _count(text: str) -> int:
@@ -320,10 +349,34 @@ def _client(options: argparse.Namespace, config: Path) -> contextlib.AbstractCon
 
 
 def _info(options: argparse.Namespace) -> int:
-    from heli_jax import output
-    from heli_jax.flights import describe_log
+    from heli_jax import log_output
+    from heli_jax.flights.describe import describe_flights
 
-    output.print_info(describe_log(options.log, options.time))
+    flights = list(describe_flights(options.log, options.time, options.time_unit, options.flight))
+    if options.json:
+        print(log_output.as_json(flights))
+    else:
+        log_output.print_flights(flights, options.channels)
+    return DONE
+
+
+def _convert(options: argparse.Namespace) -> int:
+    from heli_jax.flights import convert
+
+    out = Path(options.out)
+    convert.require_output(out, options.log)
+    run_directory.require_place(out, f"{out}")
+    window = None if options.window is None else tuple(options.window)
+    selection = convert.Selection(
+        options.signals, options.rate, window, options.flight, options.time, options.time_unit
+    )
+    converted = convert.convert_log(options.log, selection)
+    with run_directory.whole_file(out, f"{out}") as temporary:
+        convert.write_converted(temporary, converted)
+    for note in converted.notes:
+        _say(f"{options.log}: {note}")
+    columns = converted.columns
+    _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
     return DONE
 
 

@@ -355,9 +355,9 @@ def _as_logged(
         return {"time": times, **driven, **outputs}
     logged, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
     model = experiment.model
-    columns = {
-        logged.time.signal: times / factor_to_si(logged.time.unit, "s", f"{where}.time.unit")
-    }
+    # An autopilot's log needs no name for the time; the table that is written here has one.
+    name, unit = ("time", "s") if logged.time is None else (logged.time.signal, logged.time.unit)
+    columns = {name: times / factor_to_si(unit, "s", f"{where}.time.unit")}
     for by_name, values in (
         (signals(model, "inputs", logged.inputs, where), driven),
         (signals(model, "outputs", logged.outputs, where), outputs),

@@ -26,7 +26,6 @@ from heli_jax.report.card import card, summary
 from heli_jax.workflow import FitRun
 
 if TYPE_CHECKING:
-    from heli_jax.flights.describe import LogInfo, TimeInfo
     from heli_jax.generate import Simulated
     from heli_jax.sweeps.run import Progress
 
@@ -313,38 +312,3 @@ def print_sweep(out: Path) -> None:
             f"({timing['elements_per_s']:.3g} a second, with compilation)"
         )
     print(f"store: {out / 'sweep.zarr'}")
-
-
-def print_info(info: "LogInfo") -> None:
-    """What a log holds, on standard output."""
-    print(f"{info.path}: {info.format}, {info.size} bytes, {info.n_rows} rows")
-    print(f"sha256 {info.sha256}")
-    if info.time is None:
-        print("time: no column looks like a clock")
-    else:
-        _print_clock(info.time)
-    rows = []
-    for c in info.columns:
-        numbers = (
-            ("",) * 4
-            if c.kind == "text"
-            else tuple(f"{v:.6g}" for v in (c.min, c.max, c.mean, c.sd))
-        )
-        rows.append((c.name, c.kind, str(c.count), *numbers, str(c.n_nan)))
-    _table(("signal", "kind", "count", "min", "max", "mean", "sd", "NaN"), rows)
-
-
-def _print_clock(clock: "TimeInfo") -> None:
-    uniform = (
-        f"uniform (jitter {100 * clock.jitter:.2g} % of a step)" if clock.uniform else "not uniform"
-    )
-    print(
-        f"time: {clock.column} [{clock.unit}], {clock.duration:.6g} s at {clock.rate:.6g} Hz, "
-        f"{uniform}"
-    )
-    if clock.problem:
-        print(f"! {clock.problem}")
-    for gap in clock.gaps[:10]:
-        print(f"gap of {gap.length:.4g} s at {gap.start:.6g} s")
-    if len(clock.gaps) > 10:
-        print(f"and {len(clock.gaps) - 10} more gaps")

@@ -46,10 +46,11 @@ def _read_flight(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
                 f"{nearest(name, naming.names(model.Params))}"
             )
+    time = f.signals.time
     try:
         flight = read_flight(
             experiment.path.parent / f.log,
-            time=Signal(f.signals.time.signal, f.signals.time.unit, "s"),
+            time=None if time is None else Signal(time.signal, time.unit, "s"),
             inputs=signals(model, "inputs", f.signals.inputs, f"{where}.signals", gain),
             outputs=signals(model, "outputs", f.signals.outputs, f"{where}.signals"),
             rate=f.rate,
@@ -58,6 +59,7 @@ def _read_flight(
             hold_out=f.hold_out,
             name=f.name or f"flight {i + 1}",
             moving_inputs=moving,
+            number=f.number,
         )
     except InputError:
         raise  # it names the log and the line already

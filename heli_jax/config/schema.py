@@ -65,7 +65,8 @@ class OutputConfig(_Strict):
 
 
 class SignalsConfig(_Strict):
-    time: TimeConfig
+    time: TimeConfig | None = None
+    """of a table of rows; the topics of an autopilot's log have clocks of their own"""
     inputs: dict[str, InputConfig]
     outputs: dict[str, OutputConfig]
 
@@ -73,6 +74,8 @@ class SignalsConfig(_Strict):
 class FlightConfig(_Strict):
     log: str
     signals: SignalsConfig
+    number: Annotated[int, Field(ge=1)] | None = None
+    """which flight of a log that holds several"""
     name: str | None = None
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.

@@ -19,7 +19,9 @@ from heli_jax.flights.csv_text import (
     find_delimiter,
     find_header,
     header_names,
+    is_of_blanks,
     require_short_lines,
+    tabs_for_blanks,
 )
 from heli_jax.flights.table import (
     Survey,
@@ -69,7 +71,10 @@ def open_csv(path: Path) -> "CsvTable":
     if len(header) > LONGEST_HEADER:
         raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
     require_short_lines(str(path), body, line + 1)
-    delimiter = find_delimiter(header, body.lstrip("\n").split("\n", 1)[0])
+    first = body.lstrip("\n").split("\n", 1)[0]
+    delimiter = find_delimiter(header, first)
+    if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
+        header, body, delimiter = tabs_for_blanks(header), tabs_for_blanks(body), "\t"
     # Counted before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(str(path), header.count(delimiter) + 1, f"line {line}")
     names = header_names(str(path), header, delimiter, line)
@@ -270,7 +275,9 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
     signs = {}
     for sign in (",", ".") if delimiter != "," else ():
         for text in texts:
-            row = pc.index(pc.match_substring(text, sign), True).as_py()
+            matches = pc.match_substring(text, sign)
+            # `index` alone would do, and import pandas for its second argument.
+            row = pc.index(matches, True).as_py() if pc.any(matches).as_py() else -1
             if row >= 0:
                 signs[sign] = shown(text[row].as_py().strip())
                 break
@@ -284,9 +291,13 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
 
 def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
     """Cells without the blanks around them, null where nothing is left."""
+    import pyarrow as pa
+
     pc = _compute()
     trimmed = pc.utf8_trim_whitespace(text)
-    return pc.if_else(pc.equal(trimmed, ""), None, trimmed)
+    # Not compared with "": pyarrow imports pandas, a fifth of a second, to take a value of Python.
+    nothing = pa.nulls(1, trimmed.type)[0]
+    return pc.if_else(pc.cast(pc.utf8_length(trimmed), pa.bool_()), trimmed, nothing)
 
 
 def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
@@ -295,9 +306,24 @@ def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
 
     filled = _filled(text)
     try:
-        return np.asarray(filled.cast(pa.float64()).to_numpy(zero_copy_only=False))
+        numbers = filled.cast(pa.float64())
     except pa.ArrowInvalid:  # it does not say which row
         return _floats_one_by_one(filled)
+    # As buffers, since to_numpy imports pandas too.
+    values = _buffer(numbers, np.float64)
+    return np.where(
+        _buffer(_compute().is_valid(numbers).cast(pa.uint8()), np.uint8), values, np.nan
+    )
+
+
+def _buffer(numbers: "pa.ChunkedArray", kind: type) -> np.ndarray:
+    """The numbers (N,), without regard to which are null."""
+    pieces = [
+        np.frombuffer(chunk.buffers()[1], kind, len(chunk), chunk.offset * np.dtype(kind).itemsize)
+        for chunk in numbers.chunks
+        if len(chunk)
+    ]
+    return np.concatenate([np.zeros(0, kind), *pieces])
 
 
 def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:

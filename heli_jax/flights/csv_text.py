@@ -135,6 +135,18 @@ def find_delimiter(header: str, first: str) -> str:
     return max((",", ";", "\t"), key=header.count)
 
 
+def is_of_blanks(header: str, first: str) -> bool:
+    """Whether blanks alone stand between the cells of header and first row."""
+    # Names may hold blanks: only where nothing else is between them, and as many cells below.
+    alone = not any(delimiter in header.strip() + first.strip() for delimiter in ("\t", ";", ","))
+    return alone and len(header.split()) == len(first.split()) > 1
+
+
+def tabs_for_blanks(text: str) -> str:
+    """Lines whose cells have any number of blanks around them, with one tab between cells."""
+    return "\n".join("\t".join(line.split()) for line in lines_of(text))
+
+
 def header_names(path: str, header: str, delimiter: str, line: int) -> tuple[str, ...]:
     """The names in a header, quotation marks and blanks around them taken off.
 

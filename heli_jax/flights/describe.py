@@ -1,7 +1,8 @@
 """What a log holds, before anybody asks for anything."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,8 @@ from heli_jax.flights.grid import (
     rounding_of,
     uniform_grid,
 )
-from heli_jax.flights.open_log import open_table
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
@@ -26,6 +28,15 @@ _UNIT_AT_END = re.compile(
 )
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
+_SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
+_LONGEST_FLIGHT = 6 * 3600.0
+"""s: ticks that would make a longer one are more likely of the next smaller unit"""
+_FILTER = re.compile(
+    r"lpf|low_?pass|notch|hntch|hntc2|cutoff|_flt[tde]?$|filt|_nf\d|decimation|looptime|pid_process_denom",
+    re.IGNORECASE,
+)
+"""names of settings that say what the firmware did to the signals before it logged them"""
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,8 @@ class ColumnInfo:
     max: float
     mean: float
     sd: float
+    unit: str = ""
+    """as the log states it; empty where it does not"""
 
 
 @dataclass(frozen=True)
@@ -55,10 +68,11 @@ class Gap:
 
 @dataclass(frozen=True)
 class TimeInfo:
-    """The log's clock.
+    """The clock of a log or of one of its topics.
 
-    `rate` [Hz] is that of the usual step; `jitter` the largest error of a step in steps, NaN where
-    the stamps are no uniform grid; `problem` says why they are no clock at all, otherwise empty.
+    `rate` [Hz] is that of the usual step; `jitter` the largest error of a step in steps, or where
+    the stamps are no uniform grid what 95 % of the steps keep to, gaps apart; `problem` says why
+    they are no clock at all, otherwise empty; `guessed` says that nothing states the unit.
     """
 
     column: str
@@ -69,11 +83,27 @@ class TimeInfo:
     jitter: float
     gaps: tuple[Gap, ...]
     problem: str = ""
+    guessed: bool = False
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """Channels of one clock; `time` is None where their rows have only an order."""
+
+    name: str
+    n_rows: int
+    time: TimeInfo | None
+    columns: tuple[ColumnInfo, ...]
 
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What a log holds; `time` is None where no column looks like a clock."""
+    """What a log, or one flight of it, holds.
+
+    `time` is None where no column looks like a clock; an autopilot's log has `topics` with clocks
+    of their own, whose channels are `columns` too, and `duration` [s] from the first sample to the
+    last. `filters` are those of the `parameters` that say how the firmware filtered its signals.
+    """
 
     path: str
     format: str
@@ -82,23 +112,111 @@ class LogInfo:
     n_rows: int
     columns: tuple[ColumnInfo, ...]
     time: TimeInfo | None
+    topics: tuple[TopicInfo, ...] = ()
+    duration: float = float("nan")
+    flight: tuple[int, int] = (1, 1)
+    firmware: str = ""
+    parameters: Mapping[str, str | int | float] = field(default_factory=dict)
+    filters: Mapping[str, str | int | float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
-def describe_log(path: str | Path, time: str | Signal | None = None) -> LogInfo:
-    """Signals, rates, duration and gaps of a log.
+def describe_log(
+    path: str | Path, time: str | Signal | None = None, unit: str | None = None
+) -> LogInfo:
+    """Signals, rates, duration and gaps of a log, of its first flight where it holds several.
 
     Args:
         path: the log, in a format that `read_flight` reads.
         time: the column of time stamps, in seconds where only its name is given; by default a
-            column with a usual name (its unit from an ending such as `_ms`), or the first that
-            increases from row to row.
+            column with a usual name (its unit from an ending such as `_ms`, or guessed from the
+            steps), or the first that increases from row to row.
+        unit: of the time stamps, whichever column they are in.
 
     Raises:
-        InputError: the log cannot be read, or has no such column.
+        InputError: the log cannot be read, has no such column, or needs no column of times.
     """
-    table = open_table(path)
+    return next(describe_flights(path, time, unit))
+
+
+def describe_flights(
+    path: str | Path,
+    time: str | Signal | None = None,
+    unit: str | None = None,
+    number: int | None = None,
+) -> Iterator[LogInfo]:
+    """As `describe_log`, of all flights of a log, one by one.
+
+    Args:
+        path: the log.
+        time: the column of time stamps.
+        unit: of the time stamps.
+        number: of the one flight to describe, from 1.
+
+    Raises:
+        InputError: as `describe_log`.
+    """
+    log = chosen_flights(path, open_flights(path), number)
+    if not isinstance(log, tuple):
+        yield describe_table(log, time, unit)
+        return
+    for option, value in (("time", time), ("unit of time", unit)):
+        if value is not None:
+            problem = f"its topics have clocks of their own, expected no {option} to be stated"
+            raise wrong(str(path), problem)
+    for flight in log:
+        yield _describe_channels(flight)
+
+
+def _describe_channels(log: ChannelLog) -> LogInfo:
+    topics = tuple(_describe_topic(topic) for topic in log.topics)
+    last = [float(t.times[-1]) for t in log.topics if t.clock and t.times.size > 1]
+    return LogInfo(
+        path=log.path,
+        format=log.format,
+        size=log.size,
+        sha256=log.sha256,
+        n_rows=max(topic.n_rows for topic in topics),
+        columns=tuple(each for topic in topics for each in topic.columns),
+        time=None,
+        topics=topics,
+        duration=max(last) - log.first_time if last else float("nan"),
+        flight=log.flight,
+        firmware=log.firmware,
+        parameters=log.parameters,
+        filters={k: v for k, v in log.parameters.items() if _FILTER.search(k)},
+        notes=log.notes,
+    )
+
+
+def _describe_topic(topic: Topic) -> TopicInfo:
+    columns = tuple(
+        _describe_column(Survey(name, np.asarray(x, np.float64), x.size), topic.units.get(name, ""))
+        for name, x in topic.columns.items()
+    )
+    time = _describe_stamps(topic.clock, "s", topic.times) if topic.clock else None
+    return TopicInfo(topic.name, topic.times.size, time, columns)
+
+
+def describe_table(table: Table, time: str | Signal | None, unit: str | None) -> LogInfo:
+    """As `describe_log`, of a table that is open.
+
+    Args:
+        table: of rows.
+        time: the column of time stamps.
+        unit: of the time stamps.
+
+    Raises:
+        InputError: it has no such column.
+    """
     surveys = table.survey()
-    signal = _guess_time(table, surveys) if time is None else _asked_time(table, surveys, time)
+    if time is None:
+        signal, guessed = _guess_time(table, surveys)
+    else:
+        signal, guessed = _asked_time(table, surveys, time), False
+    if signal is not None and unit is not None:
+        signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
     return LogInfo(
         path=table.path,
         format=table.format,
@@ -106,7 +224,8 @@ def describe_log(path: str | Path, time: str | Signal | None = None) -> LogInfo:
         sha256=table.sha256,
         n_rows=_n_rows(surveys),
         columns=tuple(_describe_column(each) for each in surveys),
-        time=None if signal is None else _describe_time(table, surveys, signal),
+        time=clock,
+        duration=float("nan") if clock is None else clock.duration,
     )
 
 
@@ -116,17 +235,17 @@ def _n_rows(surveys: list[Survey]) -> int:
     return max(sizes, default=0)
 
 
-def _describe_column(survey: Survey) -> ColumnInfo:
+def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     nan = float("nan")
     if survey.values is None:
-        return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan)
+        return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan, unit)
     n_nan = int(np.count_nonzero(np.isnan(survey.values)))
     x = survey.values[np.isfinite(survey.values)]
     numbers = (nan, nan, nan, nan)
     if x.size:
         with np.errstate(all="ignore"):  # a sum of huge numbers may overflow
             numbers = (float(x.min()), float(x.max()), float(x.mean()), float(x.std()))
-    return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers)
+    return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers, unit)
 
 
 def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Signal:
@@ -134,59 +253,92 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
     require_columns(table.path, table.names, [signal.name])
     if _values(surveys, signal.name) is None:
         raise wrong(table.path, "holds text, expected times", column(signal.name))
-    try:
-        units.factor(signal.unit, "s")
-    except ValueError as e:
-        raise wrong(table.path, str(e), column(signal.name)) from e
+    if signal.unit not in _SECONDS:
+        try:
+            units.factor(signal.unit, "s")
+        except ValueError as e:
+            raise wrong(table.path, str(e), column(signal.name)) from e
     return signal
 
 
-def _guess_time(table: Table, surveys: list[Survey]) -> Signal | None:
+def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, bool]:
+    """The clock, and whether its unit is a guess."""
     numeric = [survey.name for survey in surveys if survey.values is not None]
     # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
-        stem, unit = _split_unit(name)
-        if stem.casefold() in _TIME_NAMES or table.time_unit(name):
-            return Signal(name, unit, "s")
+        stem, _ = _split_unit(name)
+        # Of a path, log.roll.time, the last part is the name.
+        if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
+            return _with_unit(table, surveys, name)
     for name in numeric:
         values = _values(surveys, name)
         if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
-            return Signal(name, _split_unit(name)[1], "s")
-    return None
+            return _with_unit(table, surveys, name)
+    return None, False
+
+
+def _with_unit(table: Table, surveys: list[Survey], name: str) -> tuple[Signal, bool]:
+    stated = table.time_unit(name) or _split_unit(name)[1]
+    if stated:
+        return Signal(name, stated, "s"), False
+    stamps = _values(surveys, name)
+    return Signal(name, _likely_unit(stamps), "s"), True
+
+
+def _likely_unit(stamps: np.ndarray | None) -> str:
+    """The unit of stamps (N,) by their usual step: no flight is logged once in 5 s, or lasts a
+    day."""
+    if stamps is None or stamps.size < 2:
+        return "s"
+    with np.errstate(all="ignore"):
+        step = float(np.median(np.diff(stamps)))
+        length = float(stamps[-1] - stamps[0])
+    for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
+        if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
+            return unit
+    return "ns"
 
 
 def _split_unit(name: str) -> tuple[str, str]:
+    """A name without the unit at its end, and this unit, empty where there is none."""
     match = _UNIT_AT_END.fullmatch(name)
-    return (match[1], match[3]) if match else (name, "s")
+    return (match[1], match[3]) if match else (name, "")
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
     return next(survey.values for survey in surveys if survey.name == name)
 
 
-def _describe_time(table: Table, surveys: list[Survey], signal: Signal) -> TimeInfo:
-    unit = table.time_unit(signal.name) or signal.unit
+def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed: bool) -> TimeInfo:
     stamps = _values(surveys, signal.name)
     assert stamps is not None  # only a column of numbers is guessed or taken for a clock
+    unit = table.time_unit(signal.name) or signal.unit
+    return replace(_describe_stamps(signal.name, unit, stamps), guessed=guessed)
+
+
+def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
+    """What stamps (N,) in a unit of time are as a clock."""
+    scale = _SECONDS[unit] if unit in _SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
-        seconds = stamps * units.factor(unit, "s")
+        seconds = stamps * scale
         steps = np.diff(seconds)
     problem = _clock_problem(seconds, steps)
     nan = float("nan")
     if problem:
-        return TimeInfo(signal.name, unit, nan, nan, False, nan, (), problem)
+        return TimeInfo(name, unit, nan, nan, False, nan, (), problem)
     usual = float(np.median(steps))  # the mean would count the gaps
-    grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * units.factor(unit, "s"))
+    grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale)
     uneven = isinstance(grid, Uneven)
     # Stamps that are a grid but for their rounding have no gaps, however coarse it is.
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
+    short = steps[steps <= _GAP_STEPS * usual]
     return TimeInfo(
-        column=signal.name,
+        column=name,
         unit=unit,
         duration=float(seconds[-1] - seconds[0]),
         rate=1.0 / (usual if uneven else grid.dt),
         uniform=not uneven,
-        jitter=nan if uneven else grid.jitter,
+        jitter=float(np.quantile(np.abs(short / usual - 1), 0.95)) if uneven else grid.jitter,
         gaps=tuple(Gap(float(seconds[i] - seconds[0]), float(steps[i])) for i in long),
     )
 

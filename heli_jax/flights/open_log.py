@@ -1,36 +1,159 @@
 """Which reader opens a log."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+from heli_jax.flights import array_table, blackbox_header, dataflash, dataflash_text, ulog
+from heli_jax.flights.blackbox import open_blackbox
 from heli_jax.flights.csv_table import open_csv
+from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.regular_file import require_regular
+from heli_jax.regular_file import open_regular, require_regular
+
+_SNIFFED = 8192
+"""bytes: a DataFlash log in text may begin with the firmware's own lines"""
+_TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log")
+_ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
+EXPECTED = (
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .parquet), arrays (.mat, .nc, .h5, .hdf5) or"
+    " an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
+)
 
 
 def open_table(path: str | Path) -> Table:
-    """Open a log; its columns are read when they are asked for.
+    """Open a table of rows: text, Parquet or arrays, of which one column is the time.
+
+    Raises:
+        InputError: as `open_log`, or the file is an autopilot's log.
+    """
+    log = open_log(path)
+    if isinstance(log, ChannelLog):
+        raise wrong(log.path, f"is a log of {log.format}, expected a table in CSV or Parquet")
+    return log
+
+
+def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
+    """Open a log of any format; columns of tables are read when they are asked for.
+
+    Args:
+        path: the file.
+        flight: which flight of a file that holds several, from 1.
+
+    Returns:
+        A table, whose time is one of its columns, or the channels of an autopilot's log.
 
     Raises:
         InputError: there is no such file, it is no regular one, it is larger than a log of its
-            format may be, it cannot be read, or it is of no readable format.
+            format may be, it cannot be read, or it is of no readable format; it holds several
+            flights and none is named, or not the one that is.
+    """
+    logs = chosen_flights(path, open_flights(path), flight)
+    if not isinstance(logs, tuple):
+        return logs
+    if len(logs) > 1:
+        numbers = [str(log.flight[0]) for log in logs]
+        known = ", ".join(numbers[:20]) + (", ..." if len(numbers) > 20 else "")
+        problem = f"holds {len(logs)} flights, expected the number of one: {known}"
+        raise wrong(str(path), problem)
+    return logs[0]
+
+
+def chosen_flights(
+    path: str | Path, logs: Table | tuple[ChannelLog, ...], flight: int | None
+) -> Table | tuple[ChannelLog, ...]:
+    """The flight of a number, or all without one.
+
+    Args:
+        path: for the message.
+        logs: what was opened.
+        flight: from 1.
+
+    Raises:
+        InputError: there is none of this number.
+    """
+    if flight is None:
+        return logs
+    if not isinstance(logs, tuple):
+        if flight != 1:
+            raise wrong(str(path), f"holds one flight, expected number 1, got {flight}")
+        return logs
+    chosen = tuple(log for log in logs if log.flight[0] == flight)
+    if not chosen:
+        known = ", ".join(str(log.flight[0]) for log in logs[:20])
+        raise wrong(str(path), f"holds no flight {flight} with samples, expected one of {known}")
+    return chosen
+
+
+def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
+    """As `open_log`, but all flights of an autopilot's log.
+
+    Raises:
+        InputError: as `open_log`, but for the number of flights.
     """
     path = Path(path)
-    # By the ending, not by the content, so that a damaged Parquet file is called so and not read as
-    # text. A new format adds one entry.
-    readers = {".parquet": open_parquet} | dict.fromkeys((".csv", ".txt", ".tsv"), open_csv)
     try:
         # Any size here: each reader has a limit of its own.
-        if not require_regular(path, "a log in CSV or Parquet", sys.maxsize):
-            raise wrong(str(path), "is empty, expected a log in CSV or Parquet")
-        reader = readers.get(path.suffix.lower())
-        if reader is None:
-            raise wrong(
-                str(path),
-                f"logs ending in {shown(path.suffix)} cannot be read, expected .csv, .txt, .tsv"
-                " or .parquet; convert other logs to CSV or Parquet first",
-            )
-        return reader(path)
+        if not require_regular(path, "a log", sys.maxsize):
+            raise wrong(str(path), "is empty, expected a log")
+        return _reader(path)(path)
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
+
+
+_Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]
+
+
+def _reader(path: Path) -> _Reader:
+    ending = path.suffix.lower()
+    # By the ending first where it says enough, so that a damaged Parquet file is called so and not
+    # read as text.
+    if ending == ".parquet":
+        return open_parquet
+    with open_regular(path, "a log", sys.maxsize) as file:
+        head = file.read(_SNIFFED)
+    if ending in (".csv", ".tsv"):
+        return open_csv
+    marked = _by_content(head)
+    if marked is not None and ending not in _ARRAYS:
+        return marked
+    by_ending: dict[str, _Reader] = dict.fromkeys(_TEXTS, open_csv)
+    by_ending |= {
+        ".mat": array_table.open_mat,
+        ".nc": array_table.open_netcdf,
+        ".h5": array_table.open_hdf5,
+        ".hdf5": array_table.open_hdf5,
+        ".ulg": _one(ulog.open_ulog),
+        ".bin": _one(dataflash.open_dataflash),
+        ".bbl": open_blackbox,
+        ".bfl": open_blackbox,
+    }
+    if ending not in by_ending:
+        raise wrong(str(path), f"logs ending in {shown(path.suffix)} cannot be read, {EXPECTED}")
+    return by_ending[ending]
+
+
+def _by_content(head: bytes) -> _Reader | None:
+    """The reader of a file whose first bytes say what it is, whatever it is called."""
+    if head.startswith(ulog.MAGIC):
+        return _one(ulog.open_ulog)
+    if head.startswith(dataflash.MAGIC):
+        return _one(dataflash.open_dataflash)
+    if blackbox_header.MARK in head:
+        return open_blackbox
+    if head.startswith(b"PAR1"):
+        return open_parquet
+    if head.startswith(b"MATLAB "):
+        return array_table.open_mat
+    if head.startswith((b"CDF\x01", b"CDF\x02")):
+        return array_table.open_netcdf
+    if head.startswith(array_table.HDF5_MAGIC):
+        return array_table.open_hdf5
+    if dataflash_text.is_dataflash_text(head):
+        return _one(dataflash_text.open_dataflash_text)
+    return None
+
+
+def _one(reader: Callable[[Path], ChannelLog]) -> _Reader:
+    return lambda path: (reader(path),)

@@ -22,9 +22,11 @@ from heli_jax.flights.grid import (
     uniform_grid,
 )
 from heli_jax.flights.holds import Decision, decide
-from heli_jax.flights.open_log import open_table
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.read_channels import read_channels
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.resample import hold, interpolate, longest_gap, new_clock
+from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
 from heli_jax.flights.table import Table, column, shown, wrong
 
 _FEWEST = 8
@@ -37,23 +39,24 @@ _DEFAULT = ReadOptions()
 def read_flight(
     path: str | Path,
     *,
-    time: str | Signal,
+    time: str | Signal | None = None,
     inputs: Mapping[str, Signal],
     outputs: Mapping[str, Signal],
     options: ReadOptions = _DEFAULT,
     **keywords: Any,
 ) -> Flight:
-    """Read one run from a log in CSV or Parquet.
+    """Read one run from a log.
 
     Args:
-        path: the log, ending in .csv, .txt, .tsv or .parquet.
-        time: the column of time stamps, in seconds where only its name is given.
+        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md).
+        time: the column of time stamps, in seconds where only its name is given; None for an
+            autopilot's log, whose topics have clocks of their own.
         inputs: the log's signals by the model's names; two inputs may share a column. What one
             does between samples is its `hold`; "auto" decides by how it moves in the log.
         outputs: the same for what was measured.
         options: which part of the log, at which rate; all of it unless given.
         **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
-            [s], `known` [SI], `hold_out`, `name`, `moving_inputs`.
+            [s], `known` [SI], `hold_out`, `name`, `moving_inputs`, `number`.
 
     Raises:
         InputError: one sentence on what is wrong with the log or with the arguments.
@@ -61,10 +64,24 @@ def read_flight(
     """
     options = dataclasses.replace(options, **keywords)
     request = Request(str(path), time, inputs, outputs, options)
-    table = open_table(path)
+    log = open_log(path, options.number)
+    if isinstance(log, ChannelLog):
+        flight = read_channels(log, request)
+    else:
+        flight = _read_table(log, request)
+    if options.moving_inputs:
+        require_moving_inputs(flight)
+    return flight
+
+
+def _read_table(table: Table, request: Request) -> Flight:
+    """The flight of a table of rows, one column of which is the time."""
+    options, path = request.options, table.path
+    if request.time is None:
+        raise wrong(path, "no time is stated, expected the name of the column of time stamps")
     numbers = table.numbers(request.columns)
     clock = _clock(table, request.time, numbers[request.time.name])
-    rows, notes = _rows(table.path, clock.elapsed, options.window)
+    rows, notes = _rows(path, clock.elapsed, options.window)
     signals = _to_si(table, request, numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     _check_step(stamps)
@@ -74,10 +91,10 @@ def read_flight(
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = _holds(request, signals)
     dt, samples, more = _on_grid(stamps, options.rate, signals, grid, holds)
-    flight = Flight(
+    return Flight(
         dt=dt,
-        inputs={key: samples[key, "input"] for key in inputs},
-        outputs={key: samples[key, "output"] for key in outputs},
+        inputs=request.of_kind("input", samples),
+        outputs=request.of_kind("output", samples),
         t0=float(clock.stamps[rows.start] * clock.scale),
         sd=request.noise(),
         known=request.known,
@@ -87,9 +104,6 @@ def read_flight(
         hold={key: decision.hold for key, decision in holds.items()},
         hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
     )
-    if options.moving_inputs:
-        require_moving_inputs(flight)
-    return flight
 
 
 def require_moving_inputs(flight: Flight) -> None:
@@ -99,7 +113,7 @@ def require_moving_inputs(flight: Flight) -> None:
         InputError: naming the first input and the value it keeps.
     """
     path = flight.source.path if flight.source else flight.name or "flight"
-    if any(values.min() != values.max() for values in flight.inputs.values()):
+    if not flight.inputs or any(x.min() != x.max() for x in flight.inputs.values()):
         return
     name, values = next(iter(flight.inputs.items()))
     others = " as do the others" if len(flight.inputs) > 1 else ""
@@ -276,7 +290,7 @@ def _on_grid(
     samples = {}
     for (key, kind), x in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
-        samples[key, kind] = (hold if stays else interpolate)(seconds, x, clock.times)
+        samples[key, kind] = (hold if stays else resampled)(seconds, x, clock.times)
     return clock.dt, samples, notes + clock.notes
 
 

@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
 from heli_jax.flights.table import column, wrong
@@ -29,6 +31,8 @@ class ReadOptions:
     """what to call the run"""
     moving_inputs: bool = True
     """whether a run in which no input ever moves is refused"""
+    number: int | None = None
+    """which flight of a file that holds several, from 1"""
 
 
 class Request:
@@ -41,7 +45,7 @@ class Request:
     def __init__(
         self,
         path: str,
-        time: str | Signal,
+        time: str | Signal | None,
         inputs: Mapping[str, Signal],
         outputs: Mapping[str, Signal],
         options: ReadOptions,
@@ -63,7 +67,14 @@ class Request:
     @property
     def columns(self) -> list[str]:
         """The columns to read, each once, the time first."""
-        return list(dict.fromkeys([self.time.name, *(s.name for s in self.signals.values())]))
+        time = [] if self.time is None else [self.time.name]
+        return list(dict.fromkeys([*time, *(s.name for s in self.signals.values())]))
+
+    def of_kind(
+        self, kind: str, samples: Mapping[tuple[str, str], np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """The samples of all inputs or of all outputs by the model's name, in the user's order."""
+        return {key: samples[key, each] for key, each in self.signals if each == kind}
 
     def noise(self) -> dict[str, float]:
         """The stated noise of the outputs, in SI."""
@@ -77,7 +88,7 @@ class Request:
     def _check_columns(self) -> None:
         # Two inputs may share a column. Any other double use is a slip: a column that is input and
         # output at once would be fitted perfectly, and say nothing.
-        uses = {self.time.name: ("time", "the time")}
+        uses = {} if self.time is None else {self.time.name: ("time", "the time")}
         for (key, kind), signal in self.signals.items():
             use = (kind, f"{kind} {key!r}")
             before = uses.setdefault(signal.name, use)
@@ -87,7 +98,8 @@ class Request:
 
     def _check_units(self) -> None:
         signals = {f"{kind} {key!r}": s for (key, kind), s in self.signals.items()}
-        signals["the time"] = Signal(self.time.name, self.time.unit, "s")
+        if self.time is not None:
+            signals["the time"] = Signal(self.time.name, self.time.unit, "s")
         for use, signal in signals.items():
             try:
                 units.factor(signal.unit, signal.si)

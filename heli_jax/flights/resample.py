@@ -4,10 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heli_jax.flights.band_limited import PASSED, decimate
+
 # What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
 # still near a straight line. What lies in a longer gap nobody knows.
 _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
+_GOES_DOWN = 0.9
+"""new rate over old, below which something between the two Nyquist frequencies could fold"""
 
 
 @dataclass(frozen=True)
@@ -31,8 +35,9 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
     # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
-    if rate * usual < 0.5:
-        notes.append("nothing was filtered: what the log holds above half the new rate is aliased")
+    if rate * usual < _GOES_DOWN:
+        passed = PASSED * rate
+        notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, steps stay steps")
     if rate * usual > 2.0:
         notes.append("outputs were interpolated between samples: their noise is no longer white")
     return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
@@ -53,6 +58,22 @@ def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarr
     """
     tolerance = 1e-6 * float(np.median(np.diff(seconds)))
     return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
+
+
+def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """A signal that is no step: on straight lines, or low-pass filtered where the rate goes down.
+
+    Args:
+        seconds: stamps (N,) [s], increasing.
+        values: samples (N,), NaN where one is missing.
+        times: (M,) [s], evenly spaced.
+
+    Returns:
+        (M,), in the samples' unit; NaN where too much is missing.
+    """
+    if times.size < 2 or np.median(np.diff(seconds)) >= _GOES_DOWN * (times[1] - times[0]):
+        return interpolate(seconds, values, times)
+    return decimate(seconds, values, times)
 
 
 def interpolate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -163,11 +163,29 @@ def test_file_that_may_not_be_read(tmp_path, monkeypatch):
     refused(path, "Permission denied")
 
 
-@pytest.mark.parametrize("ending", [".ulg", ".bin", ".xlsx", ""])
+@pytest.mark.parametrize("ending", [".xlsx", ""])
 def test_other_formats(tmp_path, ending):
     path = tmp_path / f"flight{ending}"
     path.write_bytes(b"ULog")
-    refused(path, repr(ending), "convert")
+    refused(path, repr(ending), ".parquet", ".ulg")
+
+
+@pytest.mark.parametrize(
+    ("ending", "words"),
+    [
+        (".ulg", "is no ULog file"),
+        (".bin", "is no DataFlash log"),
+        (".log", "holds a header alone"),
+        (".bbl", "is no blackbox log"),
+        (".mat", "is no whole MATLAB file"),
+        (".nc", "is no NetCDF file"),
+        (".h5", "is no HDF5 file"),
+    ],
+)
+def test_files_that_only_their_name_makes_a_log(tmp_path, ending, words):
+    path = tmp_path / f"flight{ending}"
+    path.write_bytes(b"ULog")
+    refused(path, words)
 
 
 BAD_REQUEST = {

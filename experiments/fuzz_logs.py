@@ -1,0 +1,118 @@
+"""Damaged logs: each file truncated and with flipped bytes, many times over.
+
+Every attempt has to end in a flight or in one sentence, within ten seconds. Run it on any logs:
+
+    python experiments/fuzz_logs.py ../shared/data/ulog/sample_log_small.ulg --count 500
+
+It prints how many ended how, the slowest, and the process's largest memory; exit code 1 where one
+ended in a traceback or hung.
+"""
+
+import argparse
+import collections
+import contextlib
+import io
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax import log_output
+from heli_jax.errors import InputError
+from heli_jax.flights.convert import Selection, convert_log
+from heli_jax.flights.describe import describe_flights
+
+LONGEST = 10
+"""s, for one attempt"""
+
+
+class Hung(Exception):
+    """An attempt took longer than `LONGEST`."""
+
+
+def damaged(data: bytes, count: int, seed: int = 0) -> Iterator[tuple[str, bytes]]:
+    """What was done to the bytes, and the result: `count` truncations, then `count` flips."""
+    rng = np.random.default_rng(seed)
+    for size in rng.integers(0, len(data), count).tolist():
+        yield f"cut at {size}", data[:size]
+    for _ in range(count):
+        # A few bytes at a time: a single one mostly hits samples, which nobody can tell.
+        flipped = bytearray(data)
+        places = rng.integers(0, len(data), int(rng.integers(1, 9))).tolist()
+        # Half of them near the beginning, where headers and formats are.
+        if rng.random() < 0.5:
+            places = [place % min(2000, len(data)) for place in places]
+        for place in places:
+            flipped[place] ^= int(rng.integers(1, 256))
+        yield f"flipped at {places}", bytes(flipped)
+
+
+def outcome(path: Path) -> str:
+    """`flight`, `noted` (a flight with a stated loss) or `refused`.
+
+    Raises:
+        AssertionError: the error is none of one sentence, or the text is none for a terminal.
+        Hung: it took too long.
+    """
+
+    def alarm(*_: object) -> None:
+        raise Hung
+
+    before = signal.signal(signal.SIGALRM, alarm)
+    signal.alarm(LONGEST)
+    try:
+        flights = list(describe_flights(path))
+        for flight in flights:
+            shown = io.StringIO()
+            with contextlib.redirect_stdout(shown):
+                log_output.print_flights([flight])
+            lines = shown.getvalue().splitlines()[1:]
+            assert max(map(len, lines)) <= 80
+            assert "\x1b" not in shown.getvalue()
+        log_output.as_json(flights)
+        number = flights[0].flight[0] if flights[0].flight[1] > 1 else None
+        converted = convert_log(path, Selection(rate=50.0, flight=number))
+        return "noted" if any(f.notes for f in flights) or converted.notes else "flight"
+    except InputError as e:
+        words = str(e)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    assert len(words.splitlines()) == 1, words
+    assert path.name in words, words
+    return "refused"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Damage logs and read them.")
+    parser.add_argument("logs", nargs="+", type=Path)
+    parser.add_argument("--count", type=int, default=500)
+    options = parser.parse_args()
+    failed = False
+    for log in options.logs:
+        counts, slowest = collections.Counter(), (0.0, "")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / log.name
+            for words, data in damaged(log.read_bytes(), options.count):
+                path.write_bytes(data)
+                began = time.monotonic()
+                try:
+                    counts[outcome(path)] += 1
+                except (Exception, Hung) as e:
+                    failed = True
+                    counts["failed"] += 1
+                    print(f"{log.name}, {words}: {type(e).__name__}: {e}"[:400])
+                slowest = max(slowest, (time.monotonic() - began, words))
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        words = ", ".join(f"{n} {what}" for what, n in sorted(counts.items()))
+        print(f"{log.name}: {words}; slowest {slowest[0]:.2f} s, {memory:.0f} MB at most")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""Logs of named arrays: MATLAB (.mat), NetCDF (.nc) and HDF5 (.h5, .hdf5).
+
+An array's name is its path: `log.roll.data` in MATLAB's structures, `log/roll` in HDF5.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax.flights import mat_file
+from heli_jax.flights.table import (
+    Survey,
+    column,
+    require_columns,
+    require_few_columns,
+    shown,
+    wrong,
+)
+from heli_jax.regular_file import read_regular
+
+_LARGEST = 10**9
+_MOST_CELLS = 3 * 10**8
+"""of all arrays: 2.4 GB of numbers, which a few compressed bytes can claim"""
+_MOST_ELEMENTS = 100
+"""columns of a matrix: more are data of another shape than a log's"""
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+class ArrayTable:
+    """A `Table` on arrays, each (N,); those asked for together have to be of one length."""
+
+    def __init__(
+        self,
+        path: str,
+        kind: str,
+        data: bytes,
+        arrays: Mapping[str, np.ndarray],
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        self.path, self.format, self.size = path, kind, len(data)
+        self.sha256 = hashlib.sha256(data).hexdigest()
+        self.names = tuple(arrays)
+        self._arrays, self._units = arrays, dict(units or {})
+        if not arrays:
+            raise wrong(path, "holds no rows of numbers, expected a log")
+        require_few_columns(path, len(arrays))
+
+    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """The arrays as float64 (N,).
+
+        Raises:
+            InputError: one is missing or they differ in length.
+        """
+        require_columns(self.path, self.names, names)
+        arrays = {name: np.asarray(self._arrays[name], np.float64) for name in names}
+        sizes = {name: values.size for name, values in arrays.items()}
+        first = next(iter(names))
+        other = next((n for n in names if sizes[n] != sizes[first]), None)
+        if other is not None:
+            problem = f"has {sizes[other]} samples, expected {sizes[first]} as {shown(first)} has"
+            raise wrong(self.path, problem, column(other))
+        return arrays
+
+    def survey(self) -> list[Survey]:
+        """Every array, in the file's order."""
+        return [
+            Survey(name, np.asarray(values, np.float64), values.size)
+            for name, values in self._arrays.items()
+        ]
+
+    def place(self, row: int) -> str:
+        """`row 1` is the first."""
+        return f"row {row + 1}"
+
+    def cell_text(self, name: str, row: int) -> str:
+        """What stands in a cell, in words."""
+        return repr(self._arrays[name][row].item())[:40]
+
+    def time_unit(self, name: str) -> str | None:
+        """The unit that the file states, where it is one of time."""
+        unit = self._units.get(name, "").split(" since ")[0].strip()
+        words = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+        unit = words.get(unit, unit)
+        return unit if unit in words.values() else None
+
+
+def open_mat(path: Path) -> ArrayTable:
+    """A MATLAB file, of version 7.3 too where h5py is installed.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a MATLAB file", _LARGEST)
+    if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
+        return _from_hdf5(path, "mat 7.3", data)
+    try:
+        whole = mat_file.read_arrays(data)
+    except mat_file.DamagedMatFile as e:
+        raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    _require_few_cells(path, sum(array.size for array in whole.values()))
+    arrays = {n: part for name, array in whole.items() for n, part in _vectors(name, array)}
+    return ArrayTable(str(path), "mat", data, arrays)
+
+
+def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    if value.dtype.kind not in "biuf" or value.ndim > 2 or not value.size:
+        return
+    if value.ndim < 2 or 1 in value.shape:
+        yield name, value.ravel()
+        return
+    # Samples run along the longer side.
+    table = value if value.shape[0] >= value.shape[1] else value.T
+    for i in range(min(table.shape[1], _MOST_ELEMENTS)):
+        yield f"{name}[{i}]", table[:, i]
+
+
+def open_netcdf(path: Path) -> ArrayTable:
+    """A NetCDF file; of version 4 where a reader of HDF5 is installed.
+
+    Raises:
+        InputError: it is none, it is damaged, or it holds no arrays of numbers.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a NetCDF file", _LARGEST)
+    if data.startswith(HDF5_MAGIC):
+        return _from_hdf5(path, "netcdf", data)
+    if not data.startswith((b"CDF\x01", b"CDF\x02")):
+        raise wrong(str(path), "is no NetCDF file, expected one that begins with its mark")
+    import io
+
+    import xarray
+
+    # Any: name -> array, and name -> unit.
+    def read() -> tuple[dict[str, Any], dict[str, str]]:
+        # Times stay numbers: `time_unit` knows what they are.
+        with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_times=False) as file:
+            _require_few_cells(path, sum(v.size for v in file.variables.values()))
+            arrays, units = {}, {}
+            for name, variable in file.variables.items():
+                for part, values in _vectors(str(name), np.asarray(variable.values)):
+                    arrays[part] = values
+                    units[part] = str(variable.attrs.get("units", ""))
+            return arrays, units
+
+    arrays, units = _guarded(path, "NetCDF file", read)
+    return ArrayTable(str(path), "netcdf", data, arrays, units)
+
+
+def open_hdf5(path: Path) -> ArrayTable:
+    """An HDF5 file, where h5py is installed.
+
+    Raises:
+        InputError: it is none, it is damaged, it holds no arrays of numbers, or h5py is missing.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "an HDF5 file", _LARGEST)
+    if not data.startswith(HDF5_MAGIC):
+        raise wrong(str(path), "is no HDF5 file, expected one that begins with its mark")
+    return _from_hdf5(path, "hdf5", data)
+
+
+def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
+    try:
+        import h5py  # pyright: ignore[reportMissingImports]
+    except ImportError as e:
+        problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
+        raise wrong(str(path), problem) from e
+
+    def read() -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        arrays: dict[str, np.ndarray] = {}
+        units: dict[str, str] = {}
+        cells = 0
+
+        # Any: h5py's classes cannot be named where it is not installed.
+        def visit(name: str, item: Any) -> None:
+            nonlocal cells
+            if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim <= 2:
+                cells += item.size
+                _require_few_cells(path, cells)
+                dotted = name.replace("/", ".") if kind == "mat 7.3" else name
+                for part, values in _vectors(dotted, np.asarray(item)):
+                    arrays[part] = values
+                    unit = item.attrs.get("units", "")
+                    units[part] = unit if isinstance(unit, str) else ""
+
+        with h5py.File(path, "r") as file:
+            file.visititems(visit)
+        return arrays, units
+
+    arrays, units = _guarded(path, "HDF5 file", read)
+    return ArrayTable(str(path), kind, data, arrays, units)
+
+
+def _require_few_cells(path: Path, count: int) -> None:
+    if count > _MOST_CELLS:
+        raise wrong(str(path), f"expected at most {_MOST_CELLS} values, got {count}")
+
+
+def _guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
+    """What a library reads; whatever it raises of a damaged file is an error of that file."""
+    import warnings
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return read()
+    # Each library raises what its parser stumbles over: KeyError, TypeError, zlib.error, ...
+    except (Exception, MemoryError) as e:
+        from heli_jax.errors import InputError
+
+        if isinstance(e, InputError):
+            raise
+        raise wrong(str(path), f"is no whole {what} ({type(e).__name__})") from e

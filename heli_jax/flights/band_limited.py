@@ -1,0 +1,150 @@
+"""Fewer samples a second, without folding what the new rate cannot hold onto what it can.
+
+Two steps. Uneven samples become even ones of their own usual rate: the signal of least energy near
+that rate's Nyquist frequency which goes through them, by least squares (as in Feichtinger and
+Groechenig, 'Theory and practice of irregular sampling', 1994, with a penalty in place of a hard
+limit of the band). These pass a low-pass filter, a sinc in a Kaiser window, evaluated at the new
+times.
+
+At 200 Hz with a fifth of a step of jitter and 5 % of the samples lost, what lies between 26 and
+70 Hz is below -75 dB at 50 Hz. Above 70 % of the old Nyquist frequency lost samples cannot be made
+up for, and a part folds; even samples have no such limit.
+"""
+
+import numpy as np
+
+PASSED, STOPPED = 0.4, 0.5
+"""of the new rate: what is slower passes, what is faster is taken away"""
+_REACH = 25
+"""new steps on each side that the low-pass filter sees: 70 dB between the two"""
+_BETA = 7.0
+_TAPS = 32
+"""samples that a sample between two others is a sum of"""
+_TAPS_BETA = 8.0
+_PENALTY = 0.1
+"""for what lies in the upper seventh of the old band: a lost sample is what makes it small"""
+_RIDGE = 1e-9
+_END, _END_RIDGE = 4, 1e-2
+_BLOCK, _OVERLAP = 1 << 15, 256
+_TABLE = 1 << 16
+_AT_ONCE = 1 << 22
+"""weights in memory"""
+
+
+def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """A signal at a lower rate.
+
+    Args:
+        seconds: stamps (N,) [s], increasing, with steps of at most a few usual ones.
+        values: samples (N,), NaN where one is missing.
+        times: (M,) [s], evenly spaced, M >= 2.
+
+    Returns:
+        (M,), in the samples' unit; NaN where more is missing than two new steps, or five old ones.
+    """
+    known = np.isfinite(values)
+    if np.count_nonzero(known) < 2:
+        return np.full(times.size, np.nan)
+    usual, step = float(np.median(np.diff(seconds))), float(times[1] - times[0])
+    longest = max(2 * step, 5 * usual)
+    seconds, values = seconds[known], values[known]
+    even_step, even = even_samples(seconds, values, usual)
+    filtered = _low_pass(even, even_step, times - seconds[0], step)
+    behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
+    gap = seconds[behind] - seconds[behind - 1]
+    inside = (times >= seconds[0] - usual) & (times <= seconds[-1] + usual)
+    return np.where(inside & (gap <= longest), filtered, np.nan)
+
+
+def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple[float, np.ndarray]:
+    """Samples (K,) at even steps [s] from the first stamp to behind the last, and the step.
+
+    Args:
+        seconds: stamps (N,) [s], increasing, N >= 2.
+        values: samples (N,), all known.
+        usual: the usual step [s].
+    """
+    span = float(seconds[-1] - seconds[0])
+    # Bounded whatever the stamps: four even samples for each that there is.
+    step = max(usual, span / (4 * seconds.size))
+    if np.ptp(np.diff(seconds)) < 1e-3 * step:
+        return span / (seconds.size - 1), values
+    at = (seconds - seconds[0]) / step
+    count = int(np.ceil(at[-1])) + 1
+    even = np.empty(count)
+    # The last even sample lies behind the last stamp, where the slope goes on.
+    slope = (values[-1] - values[-2]) / (at[-1] - at[-2])
+    line = np.interp(np.arange(count), np.r_[at, at[-1] + 1], np.r_[values, values[-1] + slope])
+    for begin in range(0, count, _BLOCK):
+        end = min(begin + _BLOCK, count)
+        first, last = max(begin - _OVERLAP, 0), min(end + _OVERLAP, count)
+        rows = slice(*np.searchsorted(at, [first, last - 1 + 1e-9]))
+        block = _fitted(at[rows] - first, values[rows], line[first:last])
+        even[begin:end] = block[begin - first : end - first]
+    return step, even
+
+
+def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Even samples (K,) of the signal through `values` (N,) at `at` (N,) in steps.
+
+    What is looked for is the difference from straight lines (K,), so that a gap is bridged by one.
+    """
+    from scipy.linalg import solveh_banded
+    from scipy.signal import firwin
+
+    half = _TAPS // 2
+    # Behind both ends the line goes on, for the taps that reach there.
+    padded = np.pad(line, half, mode="reflect", reflect_type="odd")
+    base = np.floor(at).astype(np.int64) + 1
+    columns = base[:, None] + np.arange(_TAPS)
+    weights = _sinc(at[:, None] + half - columns)
+    weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
+    # Diagonals from the middle down: LAPACK takes ten times as long for those above it.
+    band = np.zeros((_TAPS, padded.size))
+    for lag in range(_TAPS):
+        products = weights[:, : _TAPS - lag] * weights[:, lag:]
+        to = columns[:, : _TAPS - lag].ravel()
+        band[lag] += np.bincount(to, products.ravel(), padded.size)
+    missing = values - np.sum(weights * padded[columns], axis=1)
+    right = np.bincount(columns.ravel(), (weights * missing[:, None]).ravel(), padded.size)
+    high = _PENALTY * firwin(_TAPS - 1, 0.85, pass_zero=False, window=("kaiser", 6.0))
+    high -= high.mean()  # straight lines, however steep, cost nothing
+    energy = np.convolve(high, high[::-1])
+    middle = energy.size // 2
+    for lag in range(middle + 1):
+        band[lag, : padded.size - lag] += energy[middle + lag]
+    band[0] += _RIDGE
+    # At the ends samples stand on one side alone, and their noise would grow outward.
+    band[0, : half + _END] += _END_RIDGE
+    band[0, -half - _END :] += _END_RIDGE
+    beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
+    right -= np.convolve(beyond, energy, mode="valid")
+    correction = solveh_banded(band, right, lower=True)
+    return (padded + correction)[half : half + line.size]
+
+
+def _sinc(x: np.ndarray) -> np.ndarray:
+    """The weight of the sample x steps away, for a signal of the band of these steps."""
+    half = _TAPS // 2
+    window = np.i0(_TAPS_BETA * np.sqrt(np.clip(1 - (x / half) ** 2, 0, 1))) / np.i0(_TAPS_BETA)
+    return np.sinc(x) * window
+
+
+def _low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) -> np.ndarray:
+    """Even samples (K,), `step` [s] apart from 0, filtered, at `times` (M,) [s]."""
+    taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
+    # As the mirror image through each end goes on: value and slope stay.
+    padded = np.pad(even, taps, mode="reflect", reflect_type="odd")
+    x = np.linspace(0, 1, _TABLE)
+    window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
+    kernel = np.sinc((PASSED + STOPPED) * _REACH * x) * window
+    filtered = np.empty(times.size)
+    at_once = max(1, _AT_ONCE // taps)
+    for begin in range(0, times.size, at_once):
+        at = times[begin : begin + at_once] / step
+        columns = np.floor(at).astype(np.int64)[:, None] + np.arange(-taps // 2 + 1, taps // 2 + 1)
+        away = np.abs(at[:, None] - columns) * (step / (new_step * _REACH))
+        weights = np.interp(away, x, kernel, right=0.0)
+        samples = padded[np.clip(columns + taps, 0, padded.size - 1)]
+        filtered[begin : begin + at_once] = np.sum(weights * samples, 1) / np.sum(weights, 1)
+    return filtered

@@ -1,0 +1,156 @@
+"""Blackbox logs of Rotorflight, Betaflight and Cleanflight (.bbl, .bfl, .TXT).
+
+Source of the format: 'Blackbox logging internals' of Cleanflight; the events of Rotorflight are
+those that its firmware writes. The channels keep the firmware's own numbers and names.
+"""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax.errors import InputError
+from heli_jax.flights.blackbox_frames import Frames, find_frames
+from heli_jax.flights.blackbox_header import HOME, MARK, FrameLayout, Header, read_header
+from heli_jax.flights.blackbox_predictors import MainFrames, main_frames, other_frames
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.table import wrong
+from heli_jax.regular_file import read_regular
+
+_LARGEST = 10**9
+"""bytes: decoded it takes about ten times as much"""
+_MOST_FLIGHTS = 1000
+_DEGREES_PER_SECOND = "0x3f800000"
+"""gyro_scale of firmware whose gyro counts are degrees per second: the float 1.0"""
+
+
+def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
+    """The flights of a blackbox file, without those that hold no frame.
+
+    Raises:
+        InputError: it is no blackbox file, or none of its flights can be read.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a blackbox log", _LARGEST)
+    starts = _flight_starts(data)
+    if not starts:
+        raise wrong(str(path), "is no blackbox log, expected one that begins with its header")
+    if len(starts) > _MOST_FLIGHTS:
+        raise wrong(str(path), f"expected at most {_MOST_FLIGHTS} flights, got {len(starts)}")
+    sha256 = hashlib.sha256(data).hexdigest()
+    flights: list[ChannelLog] = []
+    problems: list[InputError] = []
+    for i, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)], strict=True)):
+        try:
+            log = _flight(str(path), data[start:end], sha256, len(data), (i + 1, len(starts)))
+        except InputError as e:
+            problems.append(e)
+            continue
+        if log is not None:
+            flights.append(log)
+    if not flights:
+        raise problems[0] if problems else wrong(str(path), "holds no frames, expected a flight")
+    return tuple(flights)
+
+
+def _flight_starts(data: bytes) -> list[int]:
+    starts, at = [], data.find(MARK)
+    while at >= 0:
+        starts.append(at)
+        at = data.find(MARK, at + len(MARK))
+    return starts
+
+
+def _flight(
+    path: str, data: bytes, sha256: str, size: int, flight: tuple[int, int]
+) -> ChannelLog | None:
+    """One flight from its bytes; None where it holds no frame."""
+    head = read_header(path, data)
+    frames = find_frames(data, head.start, head.layouts)
+    main = main_frames(frames, head)
+    if not main.times.size:
+        return None
+    layout = head.layouts["I"]
+    units = _units(layout, head)
+    topics = [Topic("main", main.times * 1e-6, _columns(main.values, layout), units, "time")]
+    topics += [t for letter in "SG" if (t := _other(frames, letter, head, main)) is not None]
+    return ChannelLog(
+        path=path,
+        format="blackbox",
+        size=size,
+        sha256=sha256,
+        topics=tuple(topics),
+        firmware=head.settings.get("Firmware revision", head.settings.get("Firmware type", "")),
+        parameters={k: v for k, v in head.settings.items() if not k.startswith("Field ")},
+        notes=_losses(frames, main),
+        flight=flight,
+    )
+
+
+def _columns(values: np.ndarray, layout: FrameLayout) -> dict[str, np.ndarray]:
+    columns = {}
+    for i, (name, signed) in enumerate(zip(layout.names, layout.signed, strict=True)):
+        # Kept as 32 bits, of which an unsigned field uses the top one for its size.
+        column = np.ascontiguousarray(values[:, i].astype(np.int32, copy=False))
+        columns[name] = column if signed else column.view(np.uint32)
+    return columns
+
+
+def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
+    """The units that are sure whatever the version of the firmware."""
+    units = {"time": "us", "headspeed": "rpm", "tailspeed": "rpm"}
+    if head.settings.get("gyro_scale", "").lower() == _DEGREES_PER_SECOND:
+        gyros = [n for n in layout.names if n.startswith(("gyroADC[", "gyroRAW[", "gyroUnfilt["))]
+        units |= dict.fromkeys(gyros, "deg/s")
+    return {name: unit for name, unit in units.items() if name in layout.names}
+
+
+def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic | None:
+    """Slow frames (S) or positions (G) as a topic; None where there are none."""
+    if letter not in head.layouts or not frames.starts[letter].size:
+        return None
+    layout, home = head.layouts[letter], None
+    if HOME in layout.predictors:
+        home, known = _home(frames, head, main)
+        if not known.all():  # a position is the distance from a home that is not known yet
+            frames.rows[letter], frames.starts[letter] = (
+                frames.rows[letter][known],
+                frames.starts[letter][known],
+            )
+            home = home[known]
+    values = other_frames(frames, letter, head, main, home)
+    if "time" in layout.names:
+        times, clock = values[:, layout.names.index("time")].astype(np.int64), "time"
+        # Of the 32 bits that the firmware writes the main frames know the turns.
+        times = times + ((main.times[0] - times[:1]) >> 32 << 32)
+    else:
+        # They stand between main frames and share the time of the one before.
+        last = np.searchsorted(main.starts, frames.starts[letter]) - 1
+        times, clock = main.times[np.maximum(last, 0)], "time of the main frame before"
+    names = {"S": "slow", "G": "GPS"}
+    columns = _columns(values.astype(np.int64), layout)
+    taken = set(head.layouts["I"].names)
+    columns = {k if k not in taken else f"{names[letter]}.{k}": v for k, v in columns.items()}
+    return Topic(names[letter], times * 1e-6, columns, {}, clock)
+
+
+def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, np.ndarray]:
+    """By G frame the home position (M, 2) before it, and whether there is one (M,)."""
+    count = frames.starts["G"].size
+    if "H" not in head.layouts or not frames.starts["H"].size:
+        return np.zeros((count, 2), np.int64), np.zeros(count, bool)
+    homes = other_frames(frames, "H", head, main, None)[:, :2]
+    if homes.shape[1] < 2:
+        homes = np.repeat(homes, 2, axis=1)
+    before = np.searchsorted(frames.starts["H"], frames.starts["G"]) - 1
+    return homes[np.maximum(before, 0)], before >= 0
+
+
+def _losses(frames: Frames, main: MainFrames) -> tuple[str, ...]:
+    if not frames.damage and not main.dropped:
+        return ()
+    places = len(frames.damage)
+    words = f"{places} damaged frame{'' if places == 1 else 's'} skipped"
+    if main.dropped:
+        words += f", {main.dropped} more frames lost that were differences from a lost one"
+    return (words,)

@@ -1,0 +1,197 @@
+"""How a blackbox packs the fields of a frame into bytes, undone for many frames at once.
+
+Every decoder takes the bytes of the log (B,) uint8 and the positions (M,) where M groups of fields
+begin, and returns their values, int64 (M, k), and the positions (M,) behind them. A position beyond
+the end reads the last byte: the caller compares the positions behind with the size.
+
+Source: the field encodings as documented in 'Blackbox logging internals' of Cleanflight, data
+version 2.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+Decoded = tuple[np.ndarray, np.ndarray]
+
+SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB = 0, 1, 3, 6
+TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 7, 8, 9, 10
+
+LARGEST_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
+"""fields that share a tag, by encoding; those of the others stand alone"""
+
+
+def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """Numbers of seven bits a byte, the lowest first; the top bit says that more follow."""
+    byte = _bytes(data, at)
+    values, at = byte & 127, at + 1
+    more = np.flatnonzero(byte & 128)
+    for shift in (7, 14, 21, 28):
+        if not more.size:
+            break
+        byte = _bytes(data, at[more])
+        values[more] |= (byte & 127) << shift
+        at[more] += 1
+        more = more[(byte & 128) != 0]
+    # 32 bits end with the fifth byte: a number that goes on is damage, which the firmware's own
+    # tools read as zero.
+    values[more] = 0
+    return (values & 0xFFFFFFFF)[:, None], at
+
+
+def signed_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """Zigzag: 0, -1, 1, -2, ... stand as 0, 1, 2, 3, ..."""
+    values, at = unsigned_vb(data, at)
+    return (values >> 1) ^ -(values & 1), at
+
+
+def negative_14_bit(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """The negative of a number of 14 bits, as a falling battery voltage is kept."""
+    values, at = unsigned_vb(data, at)
+    return -_signed(values, 14), at
+
+
+def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
+    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag."""
+    if count == 1:
+        return signed_vb(data, at)
+    tag, at = _bytes(data, at), at + 1
+    values = np.zeros((at.size, count), np.int64)
+    for k in range(count):
+        present = np.flatnonzero((tag >> k) & 1)
+        if present.size:
+            numbers, after = signed_vb(data, at[present])
+            values[present, k], at[present] = numbers[:, 0], after
+    return values, at
+
+
+def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """Four fields of 0, 4, 8 or 16 bits in a row of nibbles, as two bits each of a byte say."""
+    tag, start = _bytes(data, at), at + 1
+    values = np.zeros((at.size, 4), np.int64)
+    nibble = np.zeros(at.size, np.int64)
+    for k in range(4):
+        size = (tag >> (2 * k)) & 3
+        for code, bits in ((1, 4), (2, 8), (3, 16)):
+            i = np.flatnonzero(size == code)
+            if not i.size:
+                continue
+            # A field may begin in the middle of a byte: three bytes always hold it.
+            first = start[i] + (nibble[i] >> 1)
+            three = _joined(data, first, 3)
+            values[i, k] = _signed(three >> (24 - 4 * (nibble[i] & 1) - bits), bits)
+            nibble[i] += bits // 4
+    return values, start + ((nibble + 1) >> 1)
+
+
+# Bits and shifts of the three fields, by the two bits on top of the first byte; a word is as many
+# bytes long as the code says, plus one.
+_TAG2_3S32 = (((2, 4), (2, 2), (2, 0)), ((4, 8), (4, 4), (4, 0)), ((6, 16), (6, 8), (6, 0)))
+_TAG2_3SVARIABLE = (((2, 4), (2, 2), (2, 0)), ((5, 9), (5, 4), (4, 0)), ((8, 14), (7, 7), (7, 0)))
+
+
+def tag2_3s32(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """Three fields of 2, 4 or 6 bits each, or of whole bytes, as two bits of the first say."""
+    return _three(data, at, _TAG2_3S32)
+
+
+def tag2_3svariable(data: np.ndarray, at: np.ndarray) -> Decoded:
+    """Three fields of 2, 2, 2 or 5, 5, 4 or 8, 7, 7 bits, or of whole bytes."""
+    return _three(data, at, _TAG2_3SVARIABLE)
+
+
+def _three(
+    data: np.ndarray, at: np.ndarray, layouts: tuple[tuple[tuple[int, int], ...], ...]
+) -> Decoded:
+    lead = _bytes(data, at)
+    values = np.zeros((at.size, 3), np.int64)
+    kind = lead >> 6
+    after = at + 1 + np.where(kind < 3, kind, 0)
+    for code, layout in enumerate(layouts):
+        i = np.flatnonzero(kind == code)
+        if i.size:
+            word = _joined(data, at[i], code + 1)
+            for k, (bits, shift) in enumerate(layout):
+                values[i, k] = _signed(word >> shift, bits)
+    _whole_bytes(data, lead, values, after, np.flatnonzero(kind == 3))
+    return values, after
+
+
+def _whole_bytes(
+    data: np.ndarray, lead: np.ndarray, values: np.ndarray, after: np.ndarray, i: np.ndarray
+) -> None:
+    """Fields of one to four bytes each, the lowest first, into `values` and `after` at rows `i`."""
+    for k in range(3):
+        size = (lead[i] >> (2 * k)) & 3
+        for code in range(4):
+            j = i[size == code]
+            if j.size:
+                number = np.zeros(j.size, np.int64)
+                for n in range(code + 1):
+                    number |= _bytes(data, after[j] + n) << (8 * n)
+                values[j, k] = _signed(number, 8 * (code + 1))
+                after[j] += code + 1
+
+
+def _bytes(data: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return data.take(at, mode="clip").astype(np.int64)
+
+
+def _joined(data: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
+    """`count` bytes as one number, the highest first."""
+    number = _bytes(data, at)
+    for n in range(1, count):
+        number = (number << 8) | _bytes(data, at + n)
+    return number
+
+
+def _signed(number: np.ndarray, bits: int) -> np.ndarray:
+    """The lowest `bits` bits as two's complement."""
+    half = 1 << (bits - 1)
+    return ((number + half) & ((1 << bits) - 1)) - half
+
+
+def _nothing(data: np.ndarray, at: np.ndarray) -> Decoded:
+    return np.zeros((at.size, 1), np.int64), at
+
+
+_ALONE: dict[int, Callable[[np.ndarray, np.ndarray], Decoded]] = {
+    SIGNED_VB: signed_vb,
+    UNSIGNED_VB: unsigned_vb,
+    NEG_14BIT: negative_14_bit,
+    TAG2_3S32: tag2_3s32,
+    TAG8_4S16: tag8_4s16,
+    NULL: _nothing,
+    TAG2_3SVARIABLE: tag2_3svariable,
+}
+
+KNOWN = frozenset((*_ALONE, TAG8_8SVB))
+
+
+def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Decoded:
+    """All fields (M, F) of frames of one kind whose fields begin at `at` (M,).
+
+    Args:
+        data: the bytes of the log (B,) uint8.
+        at: positions (M,) of the frames' first fields.
+        encodings: of the F fields, each one of `KNOWN`.
+    """
+    values = np.empty((at.size, len(encodings)), np.int64)
+    field = 0
+    while field < len(encodings):
+        encoding = encodings[field]
+        # Neighbours of one encoding share a tag, up to as many as it has room for.
+        end = field + 1
+        while (
+            end < len(encodings)
+            and encodings[end] == encoding
+            and end - field < LARGEST_GROUP.get(encoding, 1)
+        ):
+            end += 1
+        if encoding == TAG8_8SVB:
+            numbers, at = tag8_8svb(data, at, end - field)
+        else:
+            numbers, at = _ALONE[encoding](data, at)
+        values[:, field:end] = numbers[:, : end - field]
+        field = end
+    return values, at

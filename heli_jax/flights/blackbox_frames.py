@@ -1,0 +1,161 @@
+"""Where the frames of a blackbox log begin and end.
+
+Frames have no length: each ends where the next begins, and which that is shows only once its fields
+are decoded. To do that frame by frame is a hundred times too slow in Python. So every byte that
+might begin a frame is taken for one, all are decoded at once with NumPy, and a walk from end to
+beginning keeps those that are frames. What is no frame where one should be is damage; the walk goes
+on at the next byte from which a frame leads to the beginning of another.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from heli_jax.flights.blackbox_encodings import decode
+from heli_jax.flights.blackbox_header import FrameLayout
+
+LONGEST_FRAME = 256
+"""bytes, as firmware's own tools have it: what goes on for longer is damage"""
+_CELLS_AT_ONCE = 1 << 22
+_LONGEST_PIECE = 1 << 18
+_EVENT = ord("E")
+_END_OF_LOG = b"End of log\0"
+
+# Numbers in an event, by its type: v is one of variable length. Types 50 to 52 are Rotorflight's.
+_EVENTS = {0: "v", 14: "vv", 15: "v", 30: "vv", 50: "v", 51: "v", 52: "v"}
+_ADJUSTMENT, _RESUME, _CUSTOM, _END = 13, 14, (100, 101), 255
+
+
+@dataclass
+class Frames:
+    """The frames of one flight, by kind in the order of the file.
+
+    `rows` (M, F) int64 by letter are the numbers as written, before any prediction; `starts` (M,)
+    where each frame begins [bytes]. `damage` (D,) are the places where something was no frame,
+    `resumes` where the firmware says that it went on after a pause, `end` says that it closed the
+    log.
+    """
+
+    rows: dict[str, np.ndarray]
+    starts: dict[str, np.ndarray]
+    damage: list[int] = field(default_factory=list)
+    resumes: list[int] = field(default_factory=list)
+    end: bool = False
+
+
+def find_frames(data: bytes, start: int, layouts: dict[str, FrameLayout]) -> Frames:
+    """All frames of a flight.
+
+    Args:
+        data: the flight's bytes, its header included.
+        start: where its frames begin.
+        layouts: the fields of each kind of frame, by letter.
+    """
+    return _Walk(data, start, layouts).run()
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Bytes (M,) that may begin a frame, where it would end, and its numbers (M, F)."""
+
+    starts: np.ndarray
+    ends: np.ndarray
+    values: np.ndarray
+
+
+class _Walk:
+    def __init__(self, data: bytes, start: int, layouts: dict[str, FrameLayout]) -> None:
+        self.data, self.at, self.layouts = data, start, layouts
+        self.size = len(data)
+        self.bytes = np.frombuffer(data, np.uint8)
+        self.is_letter = np.zeros(256, bool)
+        self.is_letter[[*map(ord, layouts), _EVENT]] = True
+        widest = max(len(layout.names) for layout in layouts.values())
+        self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
+        self.frames = Frames({}, {})
+        self.kept: dict[str, list[_Candidates]] = {letter: [] for letter in layouts}
+        self.in_damage = False
+
+    def run(self) -> Frames:
+        while self.at < self.size and not self.frames.end:
+            self._walk_piece(self.at, min(self.at + self.piece, self.size))
+        for letter, layout in self.layouts.items():
+            none = np.zeros((0, len(layout.names)), np.int64)
+            pieces = self.kept[letter]
+            self.frames.rows[letter] = np.concatenate([none, *(p.values for p in pieces)])
+            self.frames.starts[letter] = np.concatenate(
+                [np.zeros(0, np.int64), *(p.starts for p in pieces)]
+            )
+        return self.frames
+
+    def _walk_piece(self, first: int, last: int) -> None:
+        """Walk from `self.at` to the first frame that begins at `last` or behind it."""
+        candidates = {letter: self._candidates(letter, first, last) for letter in self.layouts}
+        ends = np.zeros(last - first, np.int64)
+        for each in candidates.values():
+            ends[each.starts - first] = each.ends
+        begins = first + np.flatnonzero(ends)
+        next_end, visited = ends.tolist(), []
+        while self.at < last and not self.frames.end:
+            end = next_end[self.at - first]
+            if end:
+                visited.append(self.at)
+            elif self.data[self.at] == _EVENT:
+                end = self._event_end(self.at)
+            if end:
+                self.at, self.in_damage = end, False
+                continue
+            self._note_damage()
+            i = int(np.searchsorted(begins, self.at, side="right"))
+            self.at = int(begins[i]) if i < begins.size else last
+        for letter, each in candidates.items():
+            i = np.flatnonzero(np.isin(each.starts, visited, assume_unique=True))
+            self.kept[letter].append(_Candidates(each.starts[i], each.ends[i], each.values[i]))
+
+    def _candidates(self, letter: str, first: int, last: int) -> _Candidates:
+        starts = first + np.flatnonzero(self.bytes[first:last] == ord(letter))
+        values, ends = decode(self.bytes, starts + 1, self.layouts[letter].encodings)
+        # A frame leads to another, or to the end of the file.
+        whole = (ends <= self.size) & (ends - starts <= LONGEST_FRAME)
+        follows = self.is_letter[self.bytes.take(ends, mode="clip")]
+        i = np.flatnonzero(whole & (follows | (ends == self.size)))
+        return _Candidates(starts[i], ends[i], values[i])
+
+    def _note_damage(self) -> None:
+        rest = self.data[self.at : self.at + LONGEST_FRAME]
+        # Erased memory behind the last frame is no loss.
+        blank = not rest.strip(b"\xff") or not rest.strip(b"\0")
+        if not self.in_damage and not blank:
+            self.frames.damage.append(self.at)
+        self.in_damage = True
+
+    def _event_end(self, at: int) -> int:
+        """Where the event at `at` ends; 0 where it is none."""
+        kind = self.data[at + 1] if at + 1 < len(self.data) else -1
+        if kind == _END:
+            self.frames.end = self.data.startswith(_END_OF_LOG, at + 2)
+            return at + 2 + len(_END_OF_LOG) if self.frames.end else 0
+        end = self._numbers_end(at + 2, kind)
+        if not end or end > len(self.data):
+            return 0
+        if end < len(self.data) and not self.is_letter[self.data[end]]:
+            return 0
+        if kind == _RESUME:
+            self.frames.resumes.append(at)
+        return end
+
+    def _numbers_end(self, at: int, kind: int) -> int:
+        if kind == _ADJUSTMENT and at < len(self.data):
+            # A float of four bytes where the top bit of the function says so, else a number.
+            return at + 5 if self.data[at] >= 128 else self._skip_numbers(at + 1, 1)
+        if kind in _CUSTOM and at < len(self.data):
+            return at + 1 + self.data[at]
+        if kind in _EVENTS:
+            return self._skip_numbers(at, len(_EVENTS[kind]))
+        return 0
+
+    def _skip_numbers(self, at: int, count: int) -> int:
+        for _ in range(count):
+            length = next((n for n, b in enumerate(self.data[at : at + 5], 1) if b < 128), 5)
+            at += length
+        return at

@@ -1,0 +1,308 @@
+"""From a log of any format to one table of a uniform clock: CSV, Parquet or NetCDF."""
+
+import fnmatch
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax.errors import InputError, nearest
+from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.describe import describe_table
+from heli_jax.flights.holds import decide
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
+from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
+from heli_jax.flights.table import Table, require_few_columns, shown, wrong
+
+ENDINGS = (".csv", ".parquet", ".nc")
+TIME = "time"
+"""the name of the first column, in seconds from the log's beginning"""
+_SHARE = 0.5
+"""of the longest topic's time: where nothing is asked for, topics of less are left out"""
+_LONGEST = 3 * 10**8
+"""cells: 2.4 GB"""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is taken of a log.
+
+    Attributes:
+        signals: names of channels, in which * stands for anything; all where there are none.
+        rate: to resample to [Hz]; without it the samples stay as they are.
+        window: first and last time [s] from the log's beginning.
+        flight: which flight of a file that holds several, from 1.
+        time: of a table the column of time stamps; guessed where it is not given.
+        time_unit: of these stamps; guessed likewise.
+    """
+
+    signals: Sequence[str] = ()
+    rate: float | None = None
+    window: tuple[float, float] | None = None
+    flight: int | None = None
+    time: str | None = None
+    time_unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Converted:
+    """Columns (M,) float64 by name, `time` [s] first, NaN where a sample is missing; `units` where
+    the log states them; `notes` on what was assumed, resampled or is missing, in sentences."""
+
+    columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def convert_log(path: str | Path, selection: Selection) -> Converted:
+    """The selected signals of a log on one clock.
+
+    A signal that jumps and stays is held between samples, as a stick or a mode is; the others are
+    interpolated, or low-pass filtered where the rate goes down. What lies in a gap that nothing
+    should bridge is missing.
+
+    Raises:
+        InputError: the log cannot be read, a signal or a clock is missing, the signals have several
+            clocks and no rate is given, or rate and window make no sense.
+    """
+    _check(str(path), selection)
+    log = open_log(path, selection.flight)
+    notes: list[str] = []
+    if not isinstance(log, ChannelLog):
+        log = _as_channels(log, selection, notes)
+    elif selection.time or selection.time_unit:
+        raise wrong(log.path, "its topics have clocks of their own, expected no time to be stated")
+    notes += log.notes
+    names = _names(log, selection.signals)
+    clocks = _clocks(log, names, selection, notes)
+    names = [name for name in names if log.topic_of(name).name in clocks]
+    if selection.rate is None:
+        columns = _as_logged(log, names, clocks)
+    else:
+        columns = _resampled(log, names, clocks, selection.rate)
+        for clock in clocks.values():
+            notes += [f"{clock.words}: {n}" for n in new_clock(clock.seconds, selection.rate).notes]
+    notes += _missing(columns)
+    units = {name: log.topic_of(name).units.get(name, "") for name in names}
+    return Converted(columns, {TIME: "s"} | units, tuple(notes))
+
+
+def _check(path: str, selection: Selection) -> None:
+    rate, window = selection.rate, selection.window
+    if rate is not None and not 0 < rate < np.inf:
+        raise wrong(path, f"rate is {rate:g}, expected a positive number in Hz")
+    if window is not None and not (np.all(np.isfinite(window)) and window[0] < window[1]):
+        raise wrong(path, f"window is {list(window)}, expected two increasing numbers of seconds")
+
+
+def _as_channels(table: Table, selection: Selection, notes: list[str]) -> ChannelLog:
+    """A table as a log of one topic, its clock named or guessed."""
+    info = describe_table(table, selection.time, selection.time_unit)
+    clock = info.time
+    if clock is None or clock.problem:
+        why = clock.problem if clock else "no column looks like a clock"
+        raise wrong(table.path, f"{why}, expected --time NAME, a column of increasing times")
+    if clock.guessed:
+        notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
+    rows = next(c.count for c in info.columns if c.name == clock.column)
+    # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
+    whole = not isinstance(table, ArrayTable)
+    numeric = [c for c in info.columns if c.kind == "number"]
+    names = [c.name for c in numeric if whole or c.count == rows]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
+    numbers = dict(table.numbers(names))
+    stamps = numbers.pop(clock.column)
+    # By the clock's own measure of its length, which knows its unit.
+    scale = clock.duration / float(stamps[-1] - stamps[0])
+    topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
+    return ChannelLog(table.path, table.format, table.size, table.sha256, (topic,))
+
+
+def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
+    """The channels that are asked for, in the order of the patterns; without any, all but the
+    clocks themselves."""
+    if not patterns:
+        names = [
+            name
+            for topic in log.topics
+            for name in topic.columns
+            if topic.clock and name not in (topic.clock, f"{topic.name}.{topic.clock}")
+        ]
+        if not names:
+            raise wrong(log.path, "no topic has times, expected a log with a clock")
+    else:
+        names = []
+        for pattern in patterns:
+            # The brackets of gyroADC[0] are meant as they stand.
+            literal = pattern.replace("[", "[[]")
+            matches = [n for n in log.names if fnmatch.fnmatchcase(n, literal)]
+            if not matches:
+                known = {n[:60] for n in log.names}
+                problem = f"no channel {shown(pattern)}{nearest(pattern[:60], known)}"
+                raise wrong(log.path, problem)
+            names += matches
+    names = list(dict.fromkeys(names))
+    require_few_columns(log.path, len(names))
+    if TIME in names:
+        problem = f"{TIME!r} is the name of the clock that is written, expected other signals"
+        raise wrong(log.path, problem)
+    return names
+
+
+def _clocks(
+    log: ChannelLog, names: Sequence[str], selection: Selection, notes: list[str]
+) -> dict[str, TopicClock]:
+    """The clocks of the topics that hold the channels, by the topics' names.
+
+    A topic that has none is an error where its channels are asked for, otherwise a note.
+    """
+    clocks, problems = {}, []
+    for topic in dict.fromkeys(log.topic_of(name) for name in names):
+        times, _ = log.channel(next(iter(topic.columns)))
+        elapsed = times - log.first_time
+        try:
+            clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, selection.window)
+        except InputError as e:
+            if selection.signals:
+                raise
+            problems.append(e)
+            notes.append(f"left out: {str(e).removeprefix(f'{log.path}, ')}")
+    if not clocks:
+        raise problems[0]
+    # Events that came in a moment would leave no time that all topics share.
+    spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
+    for name, span in spans.items():
+        if not selection.signals and span < _SHARE * max(spans.values()):
+            del clocks[name]
+            notes.append(f"left out: topic {shown(name)}, which covers {span:.3g} s")
+    return clocks
+
+
+def _missing(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Notes on missing samples, one for all signals that miss as many."""
+    by_count: dict[int, list[str]] = {}
+    for name, values in columns.items():
+        by_count.setdefault(int(np.isnan(values).sum()), []).append(shown(name))
+    by_count.pop(0, None)
+    size = columns[TIME].size
+    return [
+        f"{count} of {size} samples are missing, in {', '.join(names[:6])}"
+        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        for count, names in by_count.items()
+    ]
+
+
+def _as_logged(
+    log: ChannelLog, names: Sequence[str], clocks: Mapping[str, TopicClock]
+) -> dict[str, np.ndarray]:
+    """The samples as they are, which needs one clock for all."""
+    if len(clocks) > 1:
+        few = ", ".join(clock.words for clock in list(clocks.values())[:4])
+        more = ", ..." if len(clocks) > 4 else ""
+        problem = f"the signals have {len(clocks)} clocks ({few}{more}), expected --rate, to which"
+        raise wrong(log.path, f"{problem} they are resampled, or signals of one topic")
+    (clock,) = clocks.values()
+    values = {name: _finite(log.channel(name).values[clock.rows]) for name in names}
+    return {TIME: clock.seconds} | values
+
+
+def _resampled(
+    log: ChannelLog, names: Sequence[str], clocks: Mapping[str, TopicClock], rate: float
+) -> dict[str, np.ndarray]:
+    times = common_times(log.path, list(clocks.values()), rate)
+    if times.size * len(names) > _LONGEST:
+        problem = f"{len(names)} signals at {rate:g} Hz are {times.size * len(names)} numbers"
+        raise wrong(log.path, f"{problem}, expected at most {_LONGEST}; take fewer signals")
+    columns = {TIME: times}
+    gaps = {name: _in_gaps(clock.seconds, times) for name, clock in clocks.items()}
+    for name in names:
+        topic = log.topic_of(name).name
+        clock = clocks[topic]
+        values = _finite(log.channel(name).values[clock.rows])
+        known = values[~np.isnan(values)]
+        stays = not known.size or decide(known).hold == "zero-order"
+        new = (hold if stays else resampled)(clock.seconds, values, times)
+        columns[name] = np.where(gaps[topic], np.nan, new)
+    return columns
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """Values with infinite ones as missing: no filter has an answer to them."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Whether each of the times (M,) lies in a gap of the stamps (N,) that is not bridged."""
+    behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
+    step = seconds[behind] - seconds[behind - 1]
+    away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
+    return (step > longest_gap(seconds) * (1 + 1e-9)) & (away > 1e-9)
+
+
+def require_output(out: Path, log: str | Path) -> None:
+    """Refuse a name that no format that is written ends with, and the log itself.
+
+    Raises:
+        InputError: naming the endings.
+    """
+    if out.suffix.lower() not in ENDINGS:
+        raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
+    if out.exists() and Path(log).exists() and os.path.samefile(out, log):
+        raise InputError(f"{out}: is the log itself, expected another name")
+
+
+def write_converted(out: Path, converted: Converted) -> None:
+    """Write the columns; what is missing is an empty cell, or NaN in NetCDF.
+
+    Args:
+        out: ends in one of `ENDINGS`.
+        converted: what to write.
+
+    Raises:
+        InputError: a signal has a name that NetCDF does not allow.
+        OSError: the place cannot be written to.
+    """
+    if out.suffix.lower() == ".nc":
+        _write_netcdf(out, converted)
+    else:
+        _write_table(out, converted)
+
+
+def _write_table(out: Path, converted: Converted) -> None:
+    import pyarrow as pa
+
+    arrays = {name: pa.array(x, mask=np.isnan(x)) for name, x in converted.columns.items()}
+    units = {name: {"unit": unit} for name, unit in converted.units.items() if unit}
+    fields = [pa.field(n, pa.float64(), metadata=units.get(n)) for n in arrays]
+    table = pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields))
+    if out.suffix.lower() == ".parquet":
+        import pyarrow.parquet
+
+        pyarrow.parquet.write_table(table, out)
+        return
+    import pyarrow.csv
+
+    pyarrow.csv.write_csv(table, out)
+
+
+def _write_netcdf(out: Path, converted: Converted) -> None:
+    import xarray
+
+    data = xarray.Dataset(
+        {
+            name: (TIME, values, {"units": converted.units[name]} if converted.units[name] else {})
+            for name, values in converted.columns.items()
+        }
+    )
+    try:
+        data.to_netcdf(out, engine="scipy", format="NETCDF3_64BIT")
+    except (ValueError, UnicodeError) as e:
+        names = ", ".join(shown(n) for n in converted.columns if "/" in n or not n.isascii())
+        problem = f"a name that NetCDF does not allow ({names or 'see the log'})"
+        raise wrong(str(out), f"{problem}, expected names without '/'; write CSV or Parquet") from e

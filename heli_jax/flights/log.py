@@ -1,0 +1,120 @@
+"""A log as channels, whatever the file's format: each topic of an autopilot has a clock of its own.
+
+A text file of columns is a `Table` (`heli_jax/flights/table.py`), whose one clock is a column that
+the user names. Here times are known from the format, in seconds.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.errors import nearest
+from heli_jax.flights.table import shown, wrong
+
+
+class Channel(NamedTuple):
+    """One signal: `times` (N,) [s] and `values` (N,), both float64, NaN where one is missing."""
+
+    times: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """Channels that were written together.
+
+    Attributes:
+        name: what the autopilot calls them.
+        times: of the samples (N,) float64 [s], in the log's own count.
+        columns: the samples (N,) by the channel's full name, in the log's own type.
+        units: by the channel's full name, where the log states one.
+        clock: which field the times are, in words; empty where the rows have only an order.
+    """
+
+    name: str
+    times: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str] = field(default_factory=dict)
+    clock: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelLog:
+    """One flight of a file.
+
+    Attributes:
+        path: of the file.
+        format: its name, as `info` shows it.
+        size: of the file [bytes].
+        sha256: of the whole file.
+        topics: those that hold samples.
+        firmware: which wrote it, in its own words.
+        parameters: the firmware's settings, by name.
+        notes: what was lost or assumed when it was read, in sentences.
+        flight: which flight of the file it is, from 1, and of how many.
+        start: when the logger began [s], in the log's own count, where the log says so.
+    """
+
+    path: str
+    format: str
+    size: int
+    sha256: str
+    topics: tuple[Topic, ...]
+    firmware: str = ""
+    parameters: Mapping[str, str | int | float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    flight: tuple[int, int] = (1, 1)
+    start: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The channels' full names, in the order of the log."""
+        return tuple(name for topic in self.topics for name in topic.columns)
+
+    @property
+    def first_time(self) -> float:
+        """The time [s] from which windows count: when the logger began, or the earliest sample."""
+        clocks = [t.times for t in self.topics if t.clock and t.times.size]
+        earliest = min((float(times[0]) for times in clocks), default=0.0)
+        latest = max((float(times[-1]) for times in clocks), default=0.0)
+        if self.start is not None and self.start <= latest:
+            return self.start
+        # What was published once, before the logger began, is older than the flight.
+        longest = [times for times in clocks if times.size > 1]
+        return min((float(times[0]) for times in longest), default=earliest)
+
+    def topic_of(self, name: str) -> Topic:
+        """The topic that holds a channel.
+
+        Raises:
+            InputError: there is no such channel; with the nearest name there is.
+        """
+        for topic in self.topics:
+            if name in topic.columns:
+                return topic
+        known = {n[:60] for n in self.names}
+        raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
+
+    def channel(self, name: str) -> Channel:
+        """Times and samples of one channel.
+
+        Raises:
+            InputError: there is no such channel, or its rows have no times.
+        """
+        topic = self.topic_of(name)
+        if not topic.clock:
+            problem = "its rows have an order and no times, so nothing can be fitted to them"
+            raise wrong(self.path, problem, f"channel {shown(name)}")
+        return Channel(topic.times, np.asarray(topic.columns[name], np.float64))
+
+
+def require_samples(path: str, topics: Sequence[Topic]) -> None:
+    """Refuse a log without any samples.
+
+    Raises:
+        InputError: naming the file.
+    """
+    if not any(topic.times.size for topic in topics):
+        raise wrong(path, "holds no samples, expected a flight")

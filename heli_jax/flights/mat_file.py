@@ -1,0 +1,172 @@
+"""MATLAB files to version 7.2, read with NumPy alone.
+
+Source: 'MAT-File Format' of The MathWorks, levels 4 and 5. SciPy's reader is not used: of a file
+with a few flipped bytes it ends the process. What is read are numbers, structures and cells; text,
+sparse arrays and objects are passed over.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+_NUMBERS = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 6, 15
+_LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
+_MOST_BYTES = 3 * 10**9
+"""of one array, which a few compressed bytes can claim"""
+_MOST_VALUES = 3 * 10**8
+_DEEPEST = 8
+"""structures within structures"""
+_MOST_ELEMENTS = 100
+"""of an array of structures: more are data of another shape than a log's"""
+
+
+class DamagedMatFile(Exception):
+    """The file is no MATLAB file, or not whole; in words what is wrong."""
+
+
+class _Element(NamedTuple):
+    """A piece of a file: its type and bytes, and where the next begins."""
+
+    kind: int
+    data: memoryview
+    end: int
+
+
+def read_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """The arrays of numbers of a file, by path: `log.roll.data`, `runs[0].phi`.
+
+    Raises:
+        DamagedMatFile: it cannot be read.
+    """
+    try:
+        mark = data[126:128]
+        if len(data) > 128 and mark in (b"IM", b"MI"):
+            return dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
+        return dict(_level_4(memoryview(data)))
+    except (struct.error, ValueError, UnicodeDecodeError, zlib.error) as e:
+        raise DamagedMatFile("a piece of it is no array") from e
+
+
+def _level_5(data: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
+    at = 128
+    while at + 8 <= len(data):
+        element = _element(data, at, order)
+        at = element.end
+        if element.kind == _COMPRESSED:
+            element = _element(_inflated(element.data), 0, order)
+        if element.kind == _MATRIX:
+            yield from _matrix(element.data, order, "", 0)
+
+
+def _inflated(data: memoryview) -> memoryview:
+    inflate = zlib.decompressobj()
+    content = inflate.decompress(data, _MOST_BYTES)
+    if inflate.unconsumed_tail:
+        raise DamagedMatFile(f"an array claims more than {_MOST_BYTES} bytes")
+    return memoryview(content)
+
+
+def _element(data: memoryview, at: int, order: str) -> _Element:
+    word, size = struct.unpack_from(f"{order}2I", data, at)
+    # A small element has its size in the upper half of the first word and its data in the second.
+    if word >> 16:
+        kind, size, begin, end = word & 0xFFFF, word >> 16, at + 4, at + 8
+        if size > 4:
+            raise DamagedMatFile("a small piece claims more than 4 bytes")
+    else:
+        kind, begin = word, at + 8
+        # All but compressed data are padded to 8 bytes.
+        end = begin + size + (0 if kind == _COMPRESSED else -size % 8)
+    if begin + size > len(data):
+        raise DamagedMatFile("it is cut off")
+    return _Element(kind, data[begin : begin + size], end)
+
+
+def _matrix(
+    data: memoryview, order: str, prefix: str, depth: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays in one matrix; `prefix` is its path, empty where it has a name of its own."""
+    if not data or depth > _DEEPEST:
+        return
+    flags = _element(data, 0, order)
+    kind = struct.unpack_from(f"{order}I", flags.data)[0] & 0xFF
+    shape, at = _numbers(data, flags.end, order)
+    if shape.size < 2 or shape.min() < 0 or np.prod(shape, dtype=float) > _MOST_VALUES:
+        raise DamagedMatFile(f"an array claims the shape {shape.tolist()[:8]}")
+    label = _element(data, at, order)
+    name = prefix or bytes(label.data).decode("utf-8", "replace")
+    if _FIRST_NUMERIC <= kind <= _LAST_NUMERIC:
+        values, _ = _numbers(data, label.end, order)
+        if values.size != np.prod(shape):
+            raise DamagedMatFile(f"an array of {values.size} values claims {np.prod(shape)}")
+        yield name, values.reshape(shape, order="F")
+    elif kind == _CELL:
+        yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
+    elif kind == _STRUCT:
+        width, at = _numbers(data, label.end, order)
+        fields = _element(data, at, order)
+        if width.size != 1 or not 0 < width[0] <= 1000:
+            raise DamagedMatFile("a structure has no names of fields")
+        names = _field_names(bytes(fields.data), int(width[0]))
+        paths = [[f"{each}.{field}" for field in names] for each in _indexed(name, shape)]
+        yield from _members(data, fields.end, order, paths, depth)
+
+
+def _field_names(text: bytes, width: int) -> list[str]:
+    pieces = [text[i : i + width] for i in range(0, len(text), width)]
+    return [piece.split(b"\0")[0].decode("utf-8", "replace") for piece in pieces]
+
+
+def _indexed(name: str, shape: np.ndarray) -> list[str]:
+    """A path for each element of a cell or an array of structures, of the first of them."""
+    count = int(np.prod(shape))
+    return [name] if count == 1 else [f"{name}[{i}]" for i in range(min(count, _MOST_ELEMENTS))]
+
+
+def _members(
+    data: memoryview, at: int, order: str, paths: list[list[str]], depth: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays in matrices that follow each other, by their paths."""
+    for path in (path for row in paths for path in row):
+        element = _element(data, at, order)
+        at = element.end
+        if element.kind != _MATRIX:
+            raise DamagedMatFile("a structure or cell holds something else than arrays")
+        yield from _matrix(element.data, order, path, depth + 1)
+
+
+def _numbers(data: memoryview, at: int, order: str) -> tuple[np.ndarray, int]:
+    """The numbers of a piece, in the machine's own order, and where the next begins."""
+    element = _element(data, at, order)
+    if element.kind not in _NUMBERS:
+        raise DamagedMatFile(f"numbers are of kind {element.kind}, which is none")
+    kind = np.dtype(order + _NUMBERS[element.kind])
+    return np.frombuffer(element.data, kind).astype(kind.newbyteorder("=")), element.end
+
+
+def _level_4(data: memoryview) -> Iterator[tuple[str, np.ndarray]]:
+    at = 0
+    order = "<" if len(data) >= 4 and data[0] < 100 and not data[3] else ">"
+    while at < len(data):
+        kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
+        thousands, precision, what = kind // 1000, kind // 10 % 10, kind % 10
+        begin = at + 20 + length
+        count = rows * columns
+        known = thousands in (0, 1) and kind // 100 % 10 == 0 and precision < len(_LEVEL_4)
+        if not known or min(rows, columns, length) < 0 or imaginary not in (0, 1) or what > 2:
+            raise DamagedMatFile("it begins with no array")
+        dtype = np.dtype(order + _LEVEL_4[precision])
+        at = begin + count * dtype.itemsize * (1 + imaginary)
+        if at > len(data) or not 0 < length < 1000:
+            raise DamagedMatFile("it is cut off")
+        name = bytes(data[begin - length : begin]).split(b"\0")[0].decode("latin-1")
+        if what == 0 and count:
+            values = np.frombuffer(data[begin : begin + count * dtype.itemsize], dtype)
+            yield name, values.astype(dtype.newbyteorder("=")).reshape((rows, columns), order="F")

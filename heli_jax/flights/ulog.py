@@ -1,0 +1,269 @@
+"""PX4 ULog files (.ulg), read with NumPy alone.
+
+Source: the ULog file format of the PX4 user guide. Numbers, names and the treatment of damage are
+those of pyulog, which is not used: what a damaged file claims has to be bounded before it is read.
+"""
+
+import hashlib
+import re
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax.flights.log import ChannelLog, Topic, require_samples
+from heli_jax.flights.table import wrong
+from heli_jax.regular_file import read_regular
+
+MAGIC = b"ULog\x01\x12\x35"
+_SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
+_LARGEST = 2 * 10**9
+_LONGEST_MESSAGE = 10_000
+"""bytes, of a kind that is not known: what claims more is damage"""
+_MOST_FIELDS = 5_000
+_DEEPEST = 8
+"""levels of types within types"""
+_MOST_TOPICS = 5_000
+_TYPES = {
+    "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
+    "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
+    "bool": "<i1", "char": "<i1",
+}  # fmt: skip
+_FIELD = re.compile(r"([A-Za-z_]\w*)(?:\[(\d{1,5})\])? ([A-Za-z_]\w*)")
+_KNOWN = frozenset(b"BFIMPQARDLCSO")
+
+
+class _Damaged(Exception):
+    """A message does not hold what its kind has to."""
+
+
+@dataclass
+class _Subscription:
+    """The messages of one topic's instance, and how their bytes are read."""
+
+    name: str
+    instance: int
+    dtype: np.dtype
+    longest: int
+    """bytes of a message with the padding that may be left out"""
+    data: bytearray = field(default_factory=bytearray)
+
+
+@dataclass
+class _Content:
+    formats: dict[str, list[tuple[str, int, str]]] = field(default_factory=dict)
+    subscriptions: dict[int, _Subscription] = field(default_factory=dict)
+    closed: list[_Subscription] = field(default_factory=list)
+    information: dict[str, str | int | float] = field(default_factory=dict)
+    parameters: dict[str, str | int | float] = field(default_factory=dict)
+    appended: list[int] = field(default_factory=list)
+    damaged: int = 0
+    dropouts: int = 0
+    dropped: int = 0
+    """ms"""
+
+
+def open_ulog(path: Path) -> ChannelLog:
+    """The flight of a ULog file.
+
+    A topic's times are `timestamp_sample`, of the sample itself, where there is one; otherwise
+    `timestamp`, when it was published.
+
+    Raises:
+        InputError: it is no ULog file, or one that nothing can be read of.
+        OSError: it cannot be read.
+    """
+    data = read_regular(path, "a ULog file", _LARGEST)
+    if len(data) < 16 or not data.startswith(MAGIC):
+        raise wrong(str(path), "is no ULog file, expected one that begins with its mark")
+    content = _Content()
+    _read_messages(str(path), data, content)
+    topics = _topics(content)
+    require_samples(str(path), topics)
+    notes = []
+    if content.damaged:
+        count = content.damaged
+        notes.append(f"{count} damaged message{'' if count == 1 else 's'} skipped")
+    if content.dropouts:
+        times = "once" if content.dropouts == 1 else f"{content.dropouts} times"
+        lost = f"{content.dropped * 1e-3:.3g} s in all"
+        notes.append(f"the logger dropped data {times}, {lost}")
+    information = content.information
+    parts = (information.get("sys_name", ""), information.get("ver_hw", ""), _version(information))
+    return ChannelLog(
+        path=str(path),
+        format="ulog",
+        size=len(data),
+        sha256=hashlib.sha256(data).hexdigest(),
+        topics=topics,
+        firmware=" ".join(str(part) for part in parts if part),
+        parameters=content.parameters,
+        notes=tuple(notes),
+        start=struct.unpack("<Q", data[8:16])[0] * 1e-6,
+    )
+
+
+def _version(information: dict[str, str | int | float]) -> str:
+    release = information.get("ver_sw_release")
+    if isinstance(release, int) and release >> 24 & 0xFF:
+        return f"{release >> 24 & 0xFF}.{release >> 16 & 0xFF}.{release >> 8 & 0xFF}"
+    return str(information.get("ver_sw", ""))[:12]
+
+
+def _read_messages(path: str, data: bytes, content: _Content) -> None:
+    """All messages, the parts that were appended after a crash included."""
+    end = _read_part(path, data, 16, len(data), content)
+    # Where an offset is named, the part before it ends with a message that was cut.
+    for offset in content.appended:
+        if end < offset <= len(data):
+            end = _read_part(path, data, offset, len(data), content)
+
+
+def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> int:
+    while at + 3 <= end:
+        size, kind = data[at] | data[at + 1] << 8, data[at + 2]
+        body, after = at + 3, at + 3 + size
+        limit = min((o for o in content.appended if o > at), default=end)
+        if kind not in _KNOWN and (not kind or not size or size > _LONGEST_MESSAGE):
+            content.damaged += 1
+            at = _next_sync(data, at)
+            continue
+        if after > limit:
+            # Cut off: by the end of the file or by the part that was appended.
+            content.damaged += 1
+            return at if limit == end else _read_part(path, data, limit, end, content)
+        if kind == 0x44:  # 'D', nearly all of them
+            number = data[body] | data[body + 1] << 8 if size > 1 else -1
+            topic = content.subscriptions.get(number)
+            if topic is not None and topic.dtype.itemsize <= size - 2 <= topic.longest:
+                topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
+            else:
+                content.damaged += 1
+        else:
+            try:
+                _take(path, chr(kind), data[body:after], content)
+            except (_Damaged, struct.error, IndexError):
+                content.damaged += 1
+        at = after
+    return at
+
+
+def _next_sync(data: bytes, at: int) -> int:
+    """Behind the next mark that the logger writes from time to time, or the end."""
+    found = data.find(_SYNC, at)
+    return found + len(_SYNC) if found >= 0 else len(data)
+
+
+def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
+    match kind:
+        case "F":
+            _take_format(body, content)
+        case "I":
+            key, value = _key_value(body)
+            content.information[key] = value
+        case "P":
+            key, value = _key_value(body)
+            content.parameters.setdefault(key, value)
+        case "A":
+            _take_subscription(body, content)
+        case "O":
+            content.dropped += struct.unpack("<H", body[:2])[0]
+            content.dropouts += 1
+        case "B":
+            flags = body[8:16]
+            if len(flags) < 8 or flags[0] & ~1 or any(flags[1:]):
+                raise wrong(path, "is a ULog file of a kind that is not known, expected version 1")
+            if flags[0] & 1 and len(body) >= 40:
+                offsets = struct.unpack("<3Q", body[16:40])
+                content.appended = sorted(o for o in offsets if o)
+
+
+def _take_format(body: bytes, content: _Content) -> None:
+    name, _, fields = body.decode("utf-8", "ignore").partition(":")
+    parsed = []
+    for text in filter(None, fields.split(";")):
+        match = _FIELD.fullmatch(text)
+        if not match:
+            raise _Damaged
+        parsed.append((match[1], int(match[2] or 1), match[3]))
+    content.formats[name] = parsed
+
+
+def _key_value(body: bytes) -> tuple[str, str | int | float]:
+    kind, _, key = body[1 : 1 + body[0]].decode("utf-8", "ignore").partition(" ")
+    raw = body[1 + body[0] :]
+    if kind.startswith("char["):
+        return key, raw.decode("utf-8", "ignore").rstrip("\0")
+    if kind not in _TYPES or len(raw) != np.dtype(_TYPES[kind]).itemsize or not key:
+        raise _Damaged
+    return key, np.frombuffer(raw, _TYPES[kind])[0].item()
+
+
+def _take_subscription(body: bytes, content: _Content) -> None:
+    instance, number = struct.unpack("<BH", body[:3])
+    name = body[3:].decode("utf-8", "ignore")
+    fields: list[tuple[str, str]] = []
+    _flatten("", name, content, fields, 0)
+    longest = sum(np.dtype(kind).itemsize for _, kind in fields)
+    while fields and fields[-1][0].startswith("_padding"):
+        fields.pop()
+    names = [field_name for field_name, _ in fields]
+    if "timestamp" not in names or len(set(names)) < len(names):
+        raise _Damaged
+    if len(content.subscriptions) + len(content.closed) >= _MOST_TOPICS:
+        raise _Damaged
+    before = content.subscriptions.get(number)
+    if before is not None:
+        content.closed.append(before)
+    content.subscriptions[number] = _Subscription(name, instance, np.dtype(fields), longest)
+
+
+def _flatten(
+    prefix: str, kind: str, content: _Content, fields: list[tuple[str, str]], depth: int
+) -> None:
+    """The fields of a type, those of types within it as `outer.inner` and `outer[0].inner`."""
+    if kind not in content.formats or depth > _DEEPEST:
+        raise _Damaged
+    for inner, count, name in content.formats[kind]:
+        for i in range(count):
+            if len(fields) >= _MOST_FIELDS:
+                raise _Damaged
+            full = f"{prefix}{name}[{i}]" if count > 1 else prefix + name
+            if inner in _TYPES:
+                fields.append((full, _TYPES[inner]))
+            else:
+                _flatten(f"{full}.", inner, content, fields, depth + 1)
+
+
+def _topics(content: _Content) -> tuple[Topic, ...]:
+    whole = [s for s in (*content.closed, *content.subscriptions.values()) if s.data]
+    whole.sort(key=lambda s: (s.name, s.instance))
+    merged: dict[tuple[str, int], list[np.ndarray]] = {}
+    for s in whole:
+        merged.setdefault((s.name, s.instance), []).append(np.frombuffer(s.data, s.dtype))
+    topics = []
+    for (name, instance), parts in merged.items():
+        rows = parts[0]
+        if len(parts) > 1 and all(p.dtype == rows.dtype for p in parts):
+            rows = np.concatenate(parts)
+        several = sum(other == name for other, _ in merged) > 1
+        shown = f"{name}[{instance}]" if several or instance else name
+        clock = _clock(rows)
+        columns = {
+            f"{shown}.{n}": rows[n] for n in rows.dtype.names or () if not n.startswith("_padding")
+        }
+        units = {f"{shown}.{n}": "us" for n in ("timestamp", "timestamp_sample")}
+        units = {n: unit for n, unit in units.items() if n in columns}
+        topics.append(Topic(shown, rows[clock] * 1e-6, columns, units, clock))
+    return tuple(topics)
+
+
+def _clock(rows: np.ndarray) -> str:
+    names = rows.dtype.names or ()
+    if "timestamp_sample" in names:
+        stamps = rows["timestamp_sample"]
+        # Some modules leave the field at zero, or publish one sample twice.
+        if stamps.dtype.kind == "u" and stamps[0] > 0 and np.all(stamps[1:] > stamps[:-1]):
+            return "timestamp_sample"
+    return "timestamp"

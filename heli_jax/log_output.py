@@ -1,0 +1,241 @@
+"""What `heli-jax info` prints of a log, as text of at most 80 columns or as JSON.
+
+Apart from `output.py`, which imports JAX: a look at a log need not wait for it.
+"""
+
+import dataclasses
+import fnmatch
+import json
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
+
+_WIDTH = 80
+_MOST_CHANNELS = 150
+"""that are listed without being asked for: a PX4 log has a thousand"""
+_MOST_LINES = 10
+"""of gaps, and of notes"""
+_MOST_FILTERS = 40
+_NUMBER = 10
+"""columns of the screen for a number"""
+
+
+def print_flights(flights: Sequence[LogInfo], pattern: str | None = None) -> None:
+    """The flights of one log on standard output.
+
+    Args:
+        flights: of one file, at least one.
+        pattern: of the channels' names, as a shell has them; all that are few enough without one.
+    """
+    log = flights[0]
+    rows = "" if log.topics else f", {log.n_rows} rows"
+    words = f"{log.format}, {log.size} bytes{rows}"
+    name = _plain(log.path)
+    # A path has no end that could be left out.
+    print(f"{name}: {words}" if len(name) + len(words) + 2 <= _WIDTH else f"{name}\n{words}")
+    print(f"sha256 {log.sha256}")
+    for flight in flights:
+        print("\n".join(_line(line) for line in _flight_lines(flight, len(flights), pattern)))
+
+
+def as_json(flights: Sequence[LogInfo]) -> str:
+    """The flights of one log as JSON, without channels twice; what is no number is null."""
+    log = flights[0]
+    content = {
+        "path": log.path,
+        "format": log.format,
+        "size": log.size,
+        "sha256": log.sha256,
+        "flights": [_flight_content(flight) for flight in flights],
+    }
+    return json.dumps(_finite(content), indent=1, allow_nan=False)
+
+
+def _flight_content(flight: LogInfo) -> dict[str, Any]:
+    """Any: text, numbers, lists and records, as JSON has them."""
+    whole = {"number": flight.flight[0], "of": flight.flight[1], "firmware": flight.firmware}
+    whole |= {"duration": flight.duration, "notes": flight.notes}
+    # A table of rows is shown as a log of one topic, so that a script needs to know one shape.
+    topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
+    whole["topics"] = [_topic_content(topic) for topic in topics]
+    return whole | {"filters": dict(flight.filters), "parameters": dict(flight.parameters)}
+
+
+def _topic_content(topic: TopicInfo) -> dict[str, Any]:
+    channels = []
+    for channel in topic.columns:
+        content = dataclasses.asdict(channel)
+        content["nan_share"] = _nan_share(channel)
+        channels.append(content)
+    time = None if topic.time is None else dataclasses.asdict(topic.time)
+    return {"name": topic.name, "rows": topic.n_rows, "time": time, "channels": channels}
+
+
+def _finite(value: Any) -> Any:
+    """The same with None for what JSON has no number for."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return value
+
+
+def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[str]:
+    if not flight.topics:
+        yield from _clock_lines(flight.time)
+        yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
+        return
+    number, of = flight.flight
+    if of > 1:
+        yield ""
+        yield f"flight {number} of {of}" + (f" ({count} with samples)" if count < of else "")
+    if flight.firmware:
+        yield f"firmware: {flight.firmware}"
+    length = "unknown: no topic has times" if math.isnan(flight.duration) else ""
+    yield f"duration: {length or f'{flight.duration:.6g} s'}"
+    yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
+    yield from _topic_lines(flight.topics)
+    yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
+    yield from _setting_lines(flight)
+
+
+def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
+    if clock is None:
+        yield "time: no column looks like a clock; --time NAME says which is one"
+        return
+    if clock.problem:
+        yield f"time: {clock.column} [{clock.unit}]"
+        yield f"! {clock.problem}"
+    else:
+        uniform = "uniform" if clock.uniform else "not uniform"
+        yield (
+            f"time: {clock.column} [{clock.unit}], {clock.duration:.6g} s at {clock.rate:.6g} Hz, "
+            f"{uniform}"
+        )
+        yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
+    if clock.guessed:
+        yield f"the unit {clock.unit} is guessed; --time-unit says which it is"
+    for gap in clock.gaps[:_MOST_LINES]:
+        yield f"gap of {gap.length:.4g} s at {gap.start:.6g} s"
+    if len(clock.gaps) > _MOST_LINES:
+        yield f"and {len(clock.gaps) - _MOST_LINES} more gaps"
+
+
+def _gap_words(clock: TimeInfo) -> str:
+    if not clock.gaps:
+        return "no gaps"
+    longest = max(gap.length for gap in clock.gaps)
+    return f"{len(clock.gaps)} gaps, the longest {longest:.4g} s"
+
+
+def _topic_lines(topics: Sequence[TopicInfo]) -> Iterator[str]:
+    yield ""
+    head = f"{'topic':30} {'channels':>8} {'rows':>7} {'rate Hz':>8} {'jitter':>7} {'gaps':>5}"
+    yield f"{head} {'longest':>8}"
+    for topic in topics:
+        clock = topic.time
+        start = f"{_cut(topic.name, 30):30} {len(topic.columns):>8} {topic.n_rows:>7}"
+        if clock is None:
+            yield f"{start} no times, only an order"
+        elif clock.problem:
+            yield f"{start} {clock.problem}"
+        else:
+            gaps = max((gap.length for gap in clock.gaps), default=0.0)
+            longest = f"{gaps:.3g} s" if gaps else ""
+            jitter = _percent(clock.jitter)
+            yield f"{start} {clock.rate:>8.4g} {jitter:>7} {len(clock.gaps):>5} {longest:>8}"
+
+
+def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInfo]:
+    if pattern is None:
+        return list(columns) if len(columns) <= _MOST_CHANNELS else []
+    # The brackets of gyroADC[0] are meant as they stand: of patterns only * and ? are known.
+    literal = pattern.replace("[", "[[]")
+    return [c for c in columns if fnmatch.fnmatchcase(c.name, literal)]
+
+
+def _channel_lines(
+    shown: list[ColumnInfo], columns: Sequence[ColumnInfo], pattern: str | None
+) -> Iterator[str]:
+    yield ""
+    if not shown:
+        which = (
+            f"none is named {pattern!r}" if pattern else "--channels 'att*' lists those of a name"
+        )
+        yield f"{len(columns)} channels; {which}"
+        return
+    units = max((len(_cut(c.unit, 8)) for c in shown), default=0)
+    units = max(units, 4) if units else 0
+    name = _WIDTH - 3 * (_NUMBER + 1) - 6 - (units + 1 if units else 0)
+    name = min(name, max(7, *(len(_plain(c.name)) for c in shown)))
+    unit = f" {'unit':{units}}" if units else ""
+    heads = "".join(f" {word:>{_NUMBER}}" for word in ("min", "max", "mean"))
+    yield f"{'channel':{name}}{unit}{heads} {'NaN %':>5}"
+    for channel in shown:
+        unit = f" {_cut(channel.unit, 8):{units}}" if units else ""
+        if channel.kind == "text":
+            yield f"{_squeezed(channel.name, name):{name}}{unit} text in {channel.count} rows"
+            continue
+        numbers = (channel.min, channel.max, channel.mean)
+        cells = "".join(f" {_number(v):>{_NUMBER}}" for v in numbers)
+        yield f"{_squeezed(channel.name, name):{name}}{unit}{cells} {_share(channel):>5}"
+
+
+def _setting_lines(flight: LogInfo) -> Iterator[str]:
+    if not flight.parameters:
+        return
+    yield ""
+    names = list(flight.filters)
+    count = len(flight.parameters)
+    yield f"{count} settings of the firmware (--json has all), {len(names)} of filters"
+    for name in names[:_MOST_FILTERS]:
+        yield f"  {name} = {flight.filters[name]}"
+    if len(names) > _MOST_FILTERS:
+        yield f"  and {len(names) - _MOST_FILTERS} more"
+
+
+def _nan_share(channel: ColumnInfo) -> float:
+    return channel.n_nan / channel.count if channel.count else 0.0
+
+
+def _share(channel: ColumnInfo) -> str:
+    share = 100 * _nan_share(channel)
+    # A single one of a million is not none.
+    return "0" if not channel.n_nan else f"{share:.2g}" if share >= 0.01 else "<.01"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.4g}"
+
+
+def _percent(share: float) -> str:
+    if math.isnan(share):
+        return "-"
+    return "0 %" if share < 1e-7 else f"{100 * share:.2g} %"  # below is the rounding of float64
+
+
+def _plain(text: str) -> str:
+    """Text from a file without what a terminal would obey."""
+    return re.sub(r"[^\x20-\x7e\xa1-\ud7ff\ue000-\uffef]", "?", text)
+
+
+def _cut(text: str, width: int) -> str:
+    text = _plain(text)
+    return text if len(text) <= width else f"{text[: width - 3]}..."
+
+
+def _squeezed(text: str, width: int) -> str:
+    """A name that is cut in its middle: the ends tell the topic and the field."""
+    text = _plain(text)
+    half = (width - 3) // 2
+    return text if len(text) <= width else f"{text[:half]}...{text[half + 3 - width :]}"
+
+
+def _line(text: str) -> str:
+    """A line of at most 80 columns, of which an end too long is left out."""
+    return _cut(text, _WIDTH).rstrip()

@@ -1,0 +1,125 @@
+"""MATLAB, NetCDF, HDF5 and columns with blanks between them, beside what SciPy and xarray wrote."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+import scipy.io
+import xarray
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights.open_log import open_log
+
+N = 50
+T = 3.0 + 0.02 * np.arange(N)
+ROLL = np.sin(T)
+SIGNALS = {
+    "inputs": {"stick": Signal("log.stick.data", "1", "1")},
+    "outputs": {"roll": Signal("log.roll.data", "deg", "rad")},
+}
+
+
+def mat_of(path, **changes):
+    log = {"time": T[:, None], "roll": {"data": ROLL, "unit": "deg"}, "stick": {"data": T**2}}
+    scipy.io.savemat(path, {"log": log | changes})
+    return path
+
+
+def test_structures_of_matlab(tmp_path):
+    path = mat_of(tmp_path / "flight.mat", matrix=np.arange(3.0 * N).reshape(N, 3))
+    flight = read_flight(path, time="log.time", **SIGNALS)
+    assert (flight.dt, flight.t0) == (pytest.approx(0.02), 3.0)
+    np.testing.assert_allclose(flight.outputs["roll"], np.deg2rad(ROLL), rtol=1e-15)
+    np.testing.assert_array_equal(flight.inputs["stick"], T**2)
+    # A matrix is its columns.
+    table = open_log(path)
+    column = table.numbers(["log.matrix[1]"])["log.matrix[1]"]
+    np.testing.assert_array_equal(column, 3.0 * np.arange(N) + 1)
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.format, info.time.column, info.time.rate) == ("mat", "log.time", pytest.approx(50))
+
+
+def test_arrays_of_different_lengths(tmp_path):
+    path = mat_of(tmp_path / "flight.mat", roll={"data": ROLL[:-1]})
+    with pytest.raises(InputError, match=r"'log\.roll\.data': has 49 samples, expected 50"):
+        read_flight(path, time="log.time", **SIGNALS)
+
+
+def test_netcdf(tmp_path):
+    path = tmp_path / "flight.nc"
+    times = ("time", T, {"units": "seconds since 2024-01-01"})
+    xarray.Dataset({"roll": ("time", ROLL)}, coords={"time": times}).to_netcdf(path, engine="scipy")
+    flight = read_flight(path, time="time", inputs={}, outputs={"roll": Signal("roll", "1", "1")})
+    np.testing.assert_array_equal(flight.outputs["roll"], ROLL)
+    assert flight.t0 == 3.0
+
+
+def test_version_7_3_needs_h5py_and_says_so(tmp_path, monkeypatch):
+    path = tmp_path / "flight.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"h5py is needed: pip install 'heli_jax\[logs\]'"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("name", ["flight.mat", "flight.h5"])
+def test_hdf5(tmp_path, name):
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    path = tmp_path / name
+    block = 512 if name.endswith(".mat") else 0
+    with h5py.File(path, "w", userblock_size=block) as file:
+        file["log/time"] = T[None]
+        file["log/roll/data"] = ROLL[None]
+        file["log/stick/data"] = T[None] ** 2
+    dot = "." if block else "/"
+    signals = {
+        "inputs": {"stick": Signal(f"log{dot}stick{dot}data", "1", "1")},
+        "outputs": {"roll": Signal(f"log{dot}roll{dot}data", "deg", "rad")},
+    }
+    flight = read_flight(path, time=f"log{dot}time", **signals)
+    np.testing.assert_array_equal(flight.inputs["stick"], T**2)
+
+
+@pytest.mark.parametrize("ending", [".asc", ".txt", ".dat"])
+def test_columns_with_blanks_between_them(tmp_path, ending):
+    path = tmp_path / f"flight{ending}"
+    rows = "\n".join(f"  {t:.2f}   {x!r}\t" for t, x in zip(T, ROLL.tolist(), strict=True))
+    path.write_text(f"# bench\n  t      roll\n{rows}\n")
+    flight = read_flight(path, time="t", inputs={}, outputs={"roll": Signal("roll", "1", "1")})
+    np.testing.assert_array_equal(flight.outputs["roll"], ROLL)
+
+
+@pytest.mark.parametrize("options", [{"do_compression": True}, {"format": "4"}, {}])
+def test_what_scipy_writes_is_read(tmp_path, options):
+    content = {"t": T, "x": np.float32(ROLL), "m": np.arange(2.0 * N).reshape(N, 2), "w": "text"}
+    if options.get("format") != "4":
+        cell = np.empty(2, object)
+        cell[0], cell[1] = T, np.arange(N, dtype=np.int16)
+        runs = np.array([(T,), (ROLL,)], [("phi", object)])
+        content |= {"cell": cell, "runs": runs, "e": np.zeros((0, 0)), "deep": {"a": {"b": T}}}
+    path = tmp_path / "flight.mat"
+    scipy.io.savemat(path, content, **options)
+    table = open_log(path)
+    wanted = {"t": T, "x": np.float32(ROLL), "m[1]": content["m"][:, 1]}
+    if options.get("format") != "4":
+        wanted |= {"cell[0]": T, "cell[1]": np.arange(N), "runs[1].phi": ROLL, "deep.a.b": T}
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(table.numbers([name])[name], values)
+    assert set(table.names) == wanted.keys() | {"m[0]"} | (
+        {"runs[0].phi"} if "deep.a.b" in wanted else set()
+    )
+
+
+def test_a_matlab_file_that_claims_much(tmp_path):
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"x": np.zeros((4, 4))})
+    data = bytearray(file.getvalue())
+    at = data.index((4).to_bytes(4, "little") * 2)
+    data[at : at + 8] = (2**30).to_bytes(4, "little") * 2
+    path = tmp_path / "claim.mat"
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"claims the shape \[1073741824, 1073741824\]"):
+        open_log(path)

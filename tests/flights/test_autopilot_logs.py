@@ -1,0 +1,230 @@
+"""ULog and DataFlash: what was written comes out, equal to pyulog's and pymavlink's own numbers."""
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights import Signal, read_flight
+from heli_jax.flights.open_log import open_flights, open_log, open_table
+
+from . import log_writers as writers
+
+DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
+ULOG, BIN = DATA / "ulog" / "sample_log_small.ulg", DATA / "dataflash" / "test.BIN"
+ABSENT = "the real logs are not at ../shared/data"
+
+GYRO = [("uint64_t", "timestamp"), ("uint64_t", "timestamp_sample"), ("float[3]", "xyz")]
+STICK = [("uint64_t", "timestamp"), ("float", "x"), ("uint8_t[2]", "_padding0")]
+T0 = 10_000_000
+GYRO_ROWS = [
+    (T0 + 4000 + 2500 * i, T0 + 2500 * i, math.sin(i / 20), i / 100, -1.0) for i in range(400)
+]
+STICK_ROWS = [(T0 + 20_000 * i, math.cos(i / 5), 0, 0) for i in range(50)]
+SECOND = [(T0 + 2500 * i + 7, T0 + 2500 * i, 2.0, 0.0, 1.0) for i in range(30)]
+TOPICS = [
+    ("vehicle_angular_velocity", 0, GYRO, GYRO_ROWS),
+    ("vehicle_angular_velocity", 1, GYRO, SECOND),
+    ("manual_control_setpoint", 0, STICK, STICK_ROWS),
+]
+SETTINGS = {"parameters": [("IMU_GYRO_CUTOFF", 40.0), ("SYS_HITL", 0)]}
+SETTINGS |= {"information": [("sys_name", "PX4"), ("ver_hw", "BOARD")]}
+
+MESSAGES = {
+    "FMTU": (200, "QBNN", "TimeUS,FmtType,UnitIds,MultIds"),
+    "UNIT": (201, "QbZ", "TimeUS,Id,Label"),
+    "MULT": (202, "Qbd", "TimeUS,Id,Mult"),
+    "PARM": (203, "QNf", "TimeUS,Name,Value"),
+    "MSG": (204, "QZ", "TimeUS,Message"),
+    "ATT": (210, "QcCf", "TimeUS,Roll,Yaw,Err"),
+    "IMU": (211, "QBf", "TimeUS,I,GyrX"),
+    "GPS": (212, "QBL", "TimeUS,I,Lat"),
+}
+ROWS = [
+    ("UNIT", (0, ord("s"), b"s")),
+    ("UNIT", (0, ord("d"), b"deg")),
+    ("UNIT", (0, ord("E"), b"rad/s")),
+    ("UNIT", (0, ord("#"), b"instance")),
+    ("MULT", (0, ord("F"), 1e-6)),
+    ("FMTU", (0, 210, b"sdd-", b"FBB-")),
+    ("FMTU", (0, 211, b"s#E", b"F--")),
+    ("PARM", (0, b"INS_GYRO_FILTER", 20.0)),
+    ("MSG", (0, b"ArduCopter V4.5.1 (heli)")),
+    *(("ATT", (1_000_000 + 40_000 * i, -100 * i, 36000 - i, 0.5 * i)) for i in range(30)),
+    *(("IMU", (1_000_000 + 20_000 * i, k, i + k / 2)) for i in range(60) for k in (0, 1)),
+    *(("GPS", (1_000_000 + 200_000 * i, 0, 473_000_000 + i)) for i in range(6)),
+]
+
+
+def written(tmp_path, data, name):
+    path = tmp_path / name
+    path.write_bytes(data)
+    return path
+
+
+def some_ulog(tmp_path, name="flight.ulg", **changes):
+    return written(tmp_path, writers.ulog(TOPICS, **(SETTINGS | changes)), name)
+
+
+def test_a_ulog_comes_back(tmp_path):
+    log = open_log(some_ulog(tmp_path, dropouts=[120, 30]))
+    assert (log.format, log.firmware) == ("ulog", "PX4 BOARD")
+    assert log.parameters == {"IMU_GYRO_CUTOFF": 40.0, "SYS_HITL": 0}
+    assert log.notes == ("the logger dropped data 2 times, 0.15 s in all",)
+    # Two instances are told apart, and the time is that of the sample, not of its publication.
+    times, p = log.channel("vehicle_angular_velocity[0].xyz[0]")
+    np.testing.assert_array_equal(times, [1e-6 * row[1] for row in GYRO_ROWS])
+    np.testing.assert_array_equal(p, np.float32([row[2] for row in GYRO_ROWS]).astype(float))
+    assert log.channel("vehicle_angular_velocity[1].xyz[0]").values.tolist() == [2.0] * 30
+    times, _ = log.channel("manual_control_setpoint.x")
+    np.testing.assert_array_equal(times, [1e-6 * row[0] for row in STICK_ROWS])
+    assert log.topic_of("manual_control_setpoint.x").clock == "timestamp"
+    assert "manual_control_setpoint._padding0[0]" not in log.names
+
+
+def test_channels_of_a_ulog_become_a_flight(tmp_path):
+    path = some_ulog(tmp_path)
+    signals = {
+        "inputs": {"stick": Signal("manual_control_setpoint.x", "1", "1")},
+        "outputs": {"p": Signal("vehicle_angular_velocity[0].xyz[0]", "rad/s", "rad/s")},
+    }
+    flight = read_flight(path, **signals, rate=100.0)
+    # Each from its own clock: at 100 Hz every fourth gyro sample, the stick on a straight line
+    # between its own 50 Hz.
+    np.testing.assert_allclose(flight.outputs["p"], np.sin(np.arange(99) * 4 / 20), atol=2e-2)
+    at = np.arange(99) / 100
+    wanted = np.interp(at, np.arange(50) / 50, np.cos(np.arange(50) / 5))
+    np.testing.assert_allclose(flight.inputs["stick"][:99], wanted, atol=1e-6)
+    assert flight.t0 == pytest.approx(10.0)
+    with pytest.raises(InputError, match=r"2 clocks .* expected a rate to which"):
+        read_flight(path, **signals)
+    with pytest.raises(InputError, match="expected no time to be stated"):
+        read_flight(path, time="t", **signals, rate=100.0)
+    wrong = {"outputs": {"p": Signal("vehicle_angular_velocity[0].xyz[9]", "rad/s", "rad/s")}}
+    with pytest.raises(InputError, match="did you mean 'vehicle_angular_velocity"):
+        read_flight(path, **(signals | wrong), rate=100.0)
+
+
+def test_a_dataflash_log_comes_back(tmp_path):
+    path = written(tmp_path, writers.dataflash(MESSAGES, ROWS), "00000012.BIN")
+    log = open_log(path)
+    assert (log.format, log.notes) == ("dataflash", ())
+    assert log.firmware == "ArduCopter V4.5.1 (heli)"
+    assert log.parameters == {"INS_GYRO_FILTER": 20.0}
+    times, roll = log.channel("ATT.Roll")
+    np.testing.assert_array_equal(times, [1e-6 * (1_000_000 + 40_000 * i) for i in range(30)])
+    np.testing.assert_array_equal(roll, [-100 * i * 0.01 for i in range(30)])
+    assert log.channel("ATT.Yaw").values[1] == 35999 * 0.01
+    assert log.channel("GPS.Lat").values[1] == 473_000_001 * 1e-7
+    # Where the log says which field counts instances, each is a topic.
+    np.testing.assert_array_equal(log.channel("IMU[1].GyrX").values, np.arange(60) + 0.5)
+    units = {t.name: t.units for t in log.topics}
+    assert units["ATT"]["ATT.Roll"] == "deg"
+    assert units["IMU[0]"]["IMU[0].GyrX"] == "rad/s"
+
+
+def test_a_dataflash_log_as_text(tmp_path):
+    messages = {"ATT": (210, "Qcf", "TimeUS,Roll,Err"), "MSG": (204, "QZ", "TimeUS,Message")}
+    rows = [("ATT", (1_000_000 + 40_000 * i, -0.5 * i, 0.25)) for i in range(20)]
+    rows.append(("MSG", (0, "ArduCopter V4.5.1, with a comma")))
+    log = open_log(written(tmp_path, writers.dataflash_text(messages, rows), "12.log"))
+    # In text a centidegree is written as degrees.
+    np.testing.assert_array_equal(log.channel("ATT.Roll").values, [-0.5 * i for i in range(20)])
+    assert log.channel("ATT.Roll").times[-1] == 1e-6 * 1_760_000
+    assert log.firmware == "ArduCopter V4.5.1, with a comma"
+
+
+def test_old_text_has_only_an_order(tmp_path):
+    messages = {"ATT": (1, "ccC", "RollIn,Roll,Yaw")}
+    rows = [("ATT", (0.0, i / 2, 3.0)) for i in range(20)]
+    path = written(tmp_path, writers.dataflash_text(messages, rows), "old.log")
+    log = open_log(path)
+    assert log.topics[0].columns["ATT.Roll"].tolist() == [i / 2 for i in range(20)]
+    signals = {"inputs": {}, "outputs": {"roll": Signal("ATT.Roll", "deg", "rad")}}
+    with pytest.raises(InputError, match="an order and no times, so nothing can be fitted"):
+        read_flight(path, **signals)
+
+
+def test_a_format_is_known_by_its_content_too(tmp_path):
+    assert open_log(some_ulog(tmp_path, "download.txt")).format == "ulog"
+    data = writers.dataflash(MESSAGES, ROWS)
+    assert open_log(written(tmp_path, data, "flight.log")).format == "dataflash"
+    with pytest.raises(InputError, match="is a log of ulog, expected a table"):
+        open_table(some_ulog(tmp_path))
+    with pytest.raises(InputError, match="holds one flight"):
+        open_log(written(tmp_path, b"t,x\n0,1\n1,2\n", "bench.csv"), 2)
+
+
+def test_damage_is_counted(tmp_path):
+    data = bytearray(writers.dataflash(MESSAGES, ROWS))
+    at = data.index(b"\xa3\x95" + bytes([210]), 1000)
+    data[at : at + 2] = b"\0\0"
+    log = open_log(written(tmp_path, bytes(data), "cut.bin"))
+    assert log.notes == ("1 damaged place skipped",)
+    assert log.channel("ATT.Roll").values.size == 29
+    cut = writers.ulog(TOPICS, **SETTINGS)[:-5]
+    log = open_log(written(tmp_path, cut, "cut.ulg"))
+    assert log.notes == ("1 damaged message skipped",)
+
+
+def test_names_that_a_terminal_would_obey(tmp_path):
+    hostile = dict(MESSAGES) | {"ATT": (210, "Qcf", "TimeUS,\x1b[2J,Err")}
+    rows = [row for row in ROWS if row[0] != "ATT"]
+    log = open_log(written(tmp_path, writers.dataflash(hostile, rows), "h.bin"))
+    assert not any("\x1b" in name for name in log.names)
+    assert "damaged" in log.notes[0]
+
+
+@pytest.mark.skipif(not ULOG.exists(), reason=ABSENT)
+def test_the_real_ulog_has_all_its_messages():
+    # Counted once more by hand: the file is whole, so each message leads to the next.
+    data, at, names, counts = ULOG.read_bytes(), 16, {}, {}
+    while at + 3 <= len(data):
+        size, kind = struct.unpack_from("<HB", data, at)
+        body = data[at + 3 : at + 3 + size]
+        if kind == ord("A"):
+            names[struct.unpack_from("<H", body, 1)[0]] = (body[3:].decode(), body[0])
+        elif kind == ord("D"):
+            key = names[struct.unpack_from("<H", body)[0]]
+            counts[key] = counts.get(key, 0) + 1
+        at += 3 + size
+    (log,) = open_flights(ULOG)
+    several = {name for name, instance in counts if instance}
+    wanted = {f"{n}[{i}]" if n in several else n: count for (n, i), count in counts.items()}
+    assert {topic.name: topic.times.size for topic in log.topics} == wanted
+    q = np.array([log.channel(f"vehicle_attitude.q[{i}]").values for i in range(4)])
+    np.testing.assert_allclose(np.linalg.norm(q, axis=0), 1.0, atol=1e-6)
+
+
+@pytest.mark.skipif(not ULOG.exists(), reason=ABSENT)
+def test_the_numbers_are_pyulogs():
+    pyulog = pytest.importorskip("pyulog", reason="pyulog is not installed")
+    (log,) = open_flights(ULOG)
+    theirs = pyulog.ULog(str(ULOG))
+    assert theirs.start_timestamp == round(log.start * 1e6)
+    assert theirs.initial_parameters == log.parameters
+    several = {d.name for d in theirs.data_list if d.multi_id}
+    names = set()
+    for data in theirs.data_list:
+        topic = f"{data.name}[{data.multi_id}]" if data.name in several else data.name
+        for field, values in data.data.items():
+            names.add(f"{topic}.{field}")
+            np.testing.assert_array_equal(log.channel(f"{topic}.{field}").values, values)
+    assert names == set(log.names)
+
+
+@pytest.mark.skipif(not BIN.exists(), reason=ABSENT)
+def test_the_numbers_are_pymavlinks():
+    reader = pytest.importorskip("pymavlink.DFReader", reason="pymavlink is not installed")
+    (log,) = open_flights(BIN)
+    theirs, rows = reader.DFReader_binary(str(BIN)), {}
+    while (message := theirs.recv_msg()) is not None:
+        rows.setdefault(message.get_type(), []).append(message.to_dict())
+    for topic in log.topics:
+        for name, values in topic.columns.items():
+            field = name.removeprefix(f"{topic.name}.")
+            wanted = [row[field] for row in rows[topic.name]]
+            np.testing.assert_array_equal(values, wanted, err_msg=name)
