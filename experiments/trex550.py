@@ -16,7 +16,6 @@ import jax
 import numpy as np
 
 from heli_jax import (
-    Fit,
     Flight,
     Free,
     Problem,
@@ -91,10 +90,9 @@ def read(path: str, **options: Any) -> Flight:
     )
 
 
-def agreement(model: Model, params: Any, estimate: Fit, whole: Flight) -> dict[str, float]:
+def agreement(model: Model, params: Any, whole: Flight) -> dict[str, float]:
     """VAF in the fitted window, of the whole record, and of the record without the window."""
-    values = {n: e.value for n, e in estimate.estimates.items()}
-    flown = simulate(model, naming.replace(params, **values), whole).outputs.p
+    flown = simulate(model, params, whole).outputs.p
     simulated, measured = np.asarray(flown), np.asarray(whole.outputs["p"])
     t = np.arange(measured.size) * whole.dt
     fitted = (t >= WINDOW[0]) & (t <= WINDOW[1])
@@ -116,7 +114,8 @@ def main(path: str) -> None:
     )
     for model, params, free in candidates:
         estimate = fit(Problem(model, params, [window], free))
-        seen = agreement(model, params, estimate, whole)
+        values = {n: e.value for n, e in estimate.estimates.items()}
+        seen = agreement(model, naming.replace(params, **values), whole)
         numbers = ", ".join(
             f"{n} {e.value:.3g}" + ("" if e.sd is None else f" +- {e.sd:.1g}")
             for n, e in estimate.estimates.items()

@@ -302,3 +302,45 @@ def test_devices_keep_what_a_model_knows():
 def test_errors_are_sentences(make, sentence):
     with pytest.raises(ValueError, match=sentence):
         make(ROLL.model)
+
+
+class Body(NamedTuple):
+    u: Annotated[Scalar, "m/s", "speed forward"]
+    v: Annotated[Scalar, "m/s", "speed to the right"]
+    w: Annotated[Scalar, "m/s", "speed downwards"]
+    p: Annotated[Scalar, "rad/s", "roll rate"]
+    q: Annotated[Scalar, "rad/s", "pitch rate"]
+    r: Annotated[Scalar, "rad/s", "yaw rate"]
+    phi: Annotated[Scalar, "rad", "roll angle"]
+    theta: Annotated[Scalar, "rad", "pitch angle"]
+
+
+class Gravity(NamedTuple):
+    g: Annotated[Scalar, "m/s^2", "gravity"]
+
+
+def test_an_accelerometer_in_a_body_that_turns():
+    """A body on which a known force acts: that over its mass, and the lever, is what is felt."""
+    force, turning = np.array([1.0, 2.0, -9.5]), np.array([0.3, -0.2, 0.1])
+
+    def field(p, s, u):
+        gravity = p.g * jnp.stack(
+            [
+                -jnp.sin(s.theta),
+                jnp.cos(s.theta) * jnp.sin(s.phi),
+                jnp.cos(s.theta) * jnp.cos(s.phi),
+            ]
+        )
+        omega, speed = jnp.stack([s.p, s.q, s.r]), jnp.stack([s.u, s.v, s.w])
+        du, dv, dw = force + gravity - jnp.cross(omega, speed)
+        return Body(du, dv, dw, *turning, phi=s.p, theta=s.q)
+
+    body = Model("body", field, lambda p, s, u: s, Gravity, Body, Inputs, Body)
+    model = models.with_sensors(body, imu=True)
+    at = np.array([0.1, -0.2, 0.3])
+    p = model.Params(g=9.81, x_imu=at[0], y_imu=at[1], z_imu=at[2])
+    state = model.State(*np.array([5.0, -1.0, 2.0, 0.5, -1.5, 2.0, 0.4, -0.3]))
+    y = model.output(p, state, model.Inputs(u=0.0))
+    omega = np.array([0.5, -1.5, 2.0])
+    expected = force + np.cross(turning, at) + np.cross(omega, np.cross(omega, at))
+    np.testing.assert_allclose([y.ax, y.ay, y.az], expected, rtol=1e-12)
