@@ -12,7 +12,7 @@ class StartValue(NamedTuple):
 
     value: float
     sd: float | None
-    """standard error of the regression; None where the value is not from it"""
+    """standard error of the regression, without its bias; None where the value is not from it"""
     unit: str
     origin: Origin
     reason: str
@@ -50,7 +50,7 @@ def _sentences(start: EquationErrorStart) -> list[str]:
     sentences = [
         f"Start by equation error of {', '.join(taken) or 'nothing'} (variance explained in the "
         f"equations of {fits}; smoothed over {start.half_width:.2g} s to either side). "
-        "Measurement noise biases these values: the fit begins there, they are not its result."
+        "Noise and gusts bias these values: the fit begins there, they are not its result."
     ]
     if start.hidden:
         sentences.append(

@@ -45,6 +45,11 @@ def whole_segments(flight: Flight, names: Sequence[str]) -> tuple[list[slice], d
     return smoothing.segments({n: flight.outputs[n] for n in names})
 
 
+def shortest(half: int) -> int:
+    """Samples of the shortest segment that is worth smoothing."""
+    return 2 * smoothing.margin(half) + 6 * half
+
+
 def width(flights: Sequence[Flight]) -> int:
     """The half width of the kernel for all flights [samples], by the noise of their outputs."""
     widths = []
@@ -72,7 +77,7 @@ def record(
     """
     outputs = structure.signals[: -len(naming.names(model.Inputs))]
     parts, bridged = whole_segments(flight, outputs)
-    least = 2 * smoothing.margin(half) + 2 * half
+    least = shortest(half)
     parts = sorted((p for p in parts if p.stop - p.start >= least), key=lambda p: p.start - p.stop)
     made = [
         _segment(flight, structure, {n: bridged[n][p] for n in outputs}, p, (half, late))

@@ -1,8 +1,8 @@
 """A first guess of a linear model's parameters from the records themselves, without a vehicle.
 
 Equation error: each state's derivative is regressed on states and inputs. It needs no start, but
-measurement noise on the regressors biases it and hidden time constants are beyond it: a start for
-a fit, never a result.
+measurement noise on the regressors biases it, gusts do (states follow them), and hidden time
+constants are beyond it: a start for a fit, never a result.
 """
 
 import math
@@ -76,7 +76,8 @@ def equation_error_start(
             and what to do.
     """
     setup = _setup(model, vehicle, [f for f in flights if not f.hold_out], free)
-    fixed = held(model, setup.base, setup.structures)
+    # Any value will do for what has none: only where a parameter stands is asked.
+    fixed = held(model, {**setup.base, **dict.fromkeys(free, 1.0)}, setup.structures)
     reasons = {n: _why_held(model, n) for n in free if n in fixed}
     names = [n for n in free if n not in fixed]
     if not names or not any(s.rows for s in setup.structures):
@@ -146,7 +147,7 @@ def _regression(setup: _Setup, names: Sequence[str]) -> Regression:
     if not made:
         raise ValueError(
             "start: equation-error: no stretch without missing samples is as long as the "
-            f"smoothing needs ({6 * setup.half} samples): expected a start of each free parameter"
+            f"smoothing needs ({records.shortest(setup.half)} samples): expected a start of each free parameter"
         )
     return Regression(setup.model, setup.base, tuple(names), tuple(made))
 

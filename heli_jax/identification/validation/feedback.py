@@ -1,10 +1,10 @@
 """Whether inputs follow the response: feedback, by a pilot or a controller.
 
 Innovations are what a record's own past cannot foretell of its outputs: the residuals of a
-multivariable ARX model of the record itself, so that a poor model of the machine is no alarm. Under
-feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999, 13.4
-and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the rest is
-correlated with sums of past innovations. The variance of such a correlation between two
+multivariable ARX model of the record itself, so that a poor model of the machine is no alarm.
+Under feedback an input depends on past innovations (L. Ljung, System Identification, 2nd ed. 1999,
+13.4 and 16.5); without it, it does not. Each input is freed of what its own past foretells, and the
+rest is correlated with sums of past innovations. The variance of such a correlation between two
 autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
 """

@@ -1,0 +1,276 @@
+"""Starts by equation error: against least squares by hand and known truth, with gaps, hidden
+states, stepwise selection, and in sentences where nothing can be done."""
+
+import json
+import math
+from dataclasses import replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, linear_model, load_config, models, run_fit
+from heli_jax.config import problem
+from heli_jax.errors import InputError
+from heli_jax.identification.equation_error.errors import basis_of, covariance, partial_f
+from heli_jax.identification.equation_error.regression import Rows
+from heli_jax.identification.equation_error.smoothing import segments, smoothed, smoothed_input
+from heli_jax.identification.equation_error.start import equation_error_start
+from heli_jax.naming import Scalar
+
+DT = 0.02
+UNKNOWN = Free()
+
+
+class Params(NamedTuple):
+    Lp: Annotated[Scalar, "1/s", "roll damping"]
+    Lda: Annotated[Scalar, "1/s^2", "aileron's effect"]
+    Lphi: Annotated[Scalar, "1/s^2", "a stiffness that no aircraft has"]
+
+
+class State(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "roll rate"]
+    phi: Annotated[Scalar, "rad", "bank angle"]
+
+
+class Inputs(NamedTuple):
+    da: Annotated[Scalar, "rad", "aileron"]
+
+
+def vector_field(q, x, u):
+    return State(p=q.Lp * x.p + q.Lphi * x.phi + q.Lda * u.da, phi=x.p)
+
+
+def both(q, x, u):
+    return State(p=x.p, phi=x.phi)
+
+
+ROLL = Model("roll", vector_field, both, Params, State, Inputs, State, linear=True)
+NOTHING = Params(math.nan, math.nan, math.nan)
+FREE = {"Lp": UNKNOWN, "Lda": UNKNOWN, "Lphi": UNKNOWN}
+
+
+def record(seed=0, n=1500, gust=0.0, noise=0.0):
+    """p' = -4 p + 25 da + gust with a held input, by its exact recursion; phi by Simpson."""
+    rng = np.random.default_rng(seed)
+    da = np.repeat(rng.uniform(-0.1, 0.1, n // 10), 10)
+    a = math.exp(-4.0 * DT)
+    keeps = math.exp(-DT / 0.3)
+    w = scipy.signal.lfilter(
+        [gust * math.sqrt(1 - keeps**2)], [1, -keeps], rng.standard_normal(da.size)
+    )
+    pushed = (1 - a) / 4.0 * (25.0 * da + w)
+    p = np.r_[0.0, scipy.signal.lfilter([1.0], [1.0, -a], pushed)[:-1]]
+    # phi' = p exactly, with p = -p'/4 + (25 da + w)/4 between samples.
+    phi = -(p - p[0]) / 4.0 + np.r_[0.0, np.cumsum(25.0 * da + w)[:-1]] * DT / 4.0
+    y = {n: v + noise * rng.standard_normal(da.size) for n, v in (("p", p), ("phi", phi))}
+    return Flight(dt=DT, inputs={"da": da}, outputs=y)
+
+
+def values(start):
+    return {n: v.value for n, v in start.values.items()}
+
+
+@pytest.mark.parametrize("half", [4, 8, 16])
+def test_smoothing_keeps_polynomials_and_a_held_equation(half):
+    t = DT * np.arange(200)
+    y, first, second = smoothed(1.0 + 2.0 * t - 3.0 * t**2, DT, half)
+    np.testing.assert_allclose(second, -6.0, rtol=1e-9)
+    inner = t[half + 2 : -half - 2]
+    np.testing.assert_allclose(first, 2.0 - 6.0 * inner, atol=1e-9)
+    # The mean of s^2 under the kernel moves a parabola by a constant, its shape stays.
+    assert np.ptp(y - (1.0 + 2.0 * inner - 3.0 * inner**2)) < 1e-9
+    flight = record(n=600)
+    p = smoothed(flight.outputs["p"], DT, half)
+    da = smoothed_input(flight.inputs["da"], DT, half, held=True)
+    by_hand = np.linalg.lstsq(np.stack([p[0], da[0]], axis=1), p[1], rcond=None)[0]
+    np.testing.assert_allclose(by_hand, [-4.0, 25.0], rtol=0.006)
+
+
+def test_a_delayed_input_is_shifted():
+    t = DT * np.arange(300)
+    late = smoothed_input(np.sin(5.0 * t), DT, 8, held=False, late=0.033)[0]
+    on_time = smoothed(np.sin(5.0 * (t - 0.033)), DT, 8)[0]
+    np.testing.assert_allclose(late[5:], on_time[5:], atol=2e-4)
+
+
+def test_short_gaps_are_bridged_and_long_ones_part_segments():
+    y = np.arange(40.0)
+    y[10:12] = y[20:26] = np.nan
+    parts, bridged = segments({"y": y})
+    assert parts == [slice(0, 20), slice(26, 40)]
+    np.testing.assert_allclose(bridged["y"][10:12], [10.0, 11.0])
+
+
+def test_without_any_value_it_finds_what_least_squares_by_hand_finds():
+    flight = record(noise=1e-3)
+    start = equation_error_start(ROLL, NOTHING, [flight], FREE)
+    # By hand: the exact difference equation of the held input, whose coefficients give Lp and Lda.
+    p, da = flight.outputs["p"], flight.inputs["da"]
+    a, b = np.linalg.lstsq(np.stack([p[:-1], da[:-1]], axis=1), p[1:], rcond=None)[0]
+    by_hand = {"Lp": math.log(a) / DT, "Lda": b * math.log(a) / DT / (a - 1.0)}
+    found = values(start)
+    assert found["Lp"] == pytest.approx(by_hand["Lp"], rel=0.02)
+    assert found["Lda"] == pytest.approx(by_hand["Lda"], rel=0.02)
+    assert found["Lp"] == pytest.approx(-4.0, rel=0.02)
+    assert abs(found["Lphi"]) < 0.05
+    assert [e.name for e in start.equations] == ["p"]
+    assert start.equations[0].r_squared > 0.99
+    assert "the fit begins there, they are not its result" in start.sentences[0]
+
+
+def test_standard_errors_allow_for_residuals_with_a_memory():
+    """Ordinary ones would be three times too small: regressors and residuals both are slow."""
+    rng, off = np.random.default_rng(3), []
+    for _ in range(60):
+        slow = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal((3, 1500)))
+        X, y = slow[:2].T, slow[:2].T @ [1.0, -2.0] + slow[2]
+        theta = np.linalg.lstsq(X, y, rcond=None)[0]
+        rows = Rows(y - X @ theta, -X, np.arange(1500), np.zeros(1500, int))
+        off.append((theta - [1.0, -2.0]) / np.sqrt(np.diag(covariance(rows))))
+        assert partial_f(basis_of(X[:, :1]), y, X[:, 1], rows.times) == pytest.approx(
+            theta[1] ** 2 / covariance(rows)[1, 1], rel=0.1
+        )
+    assert 0.8 < np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def test_an_angle_alone_shows_its_rate_and_gaps_do_no_harm():
+    flight = record(noise=1e-4)
+    phi = flight.outputs["phi"].copy()
+    phi[300:340] = phi[700:702] = phi[1100:1190] = np.nan
+    gappy = replace(flight, outputs={"phi": phi})
+    found = values(equation_error_start(ROLL, NOTHING, [gappy], FREE))
+    assert found["Lp"] == pytest.approx(-4.0, rel=0.05)
+    assert found["Lda"] == pytest.approx(25.0, rel=0.05)
+
+
+def test_stepwise_leaves_out_the_term_that_is_not_there():
+    flights = [record(seed, gust=0.3, noise=1e-3) for seed in (1, 2)]
+    start = equation_error_start(ROLL, NOTHING, flights, FREE, stepwise=(20.0, 20.0))
+    assert start.selection.selected == ("Lp", "Lda")
+    assert (start.values["Lphi"].value, start.values["Lphi"].origin) == (0.0, "not selected")
+    assert [(s.parameter, s.entered) for s in start.selection.steps] == [("Lphi", False)]
+    ratios = start.selection.f_ratios
+    assert ratios["Lp"] > 1000 > 20 > ratios["Lphi"]
+
+
+def test_products_with_a_state_that_is_not_measured():
+    """The rotor's flapping: Lb and Blat act as a product, and Lb by itself."""
+    file = linear_model("roll-flybarless")
+    p = file.vehicle().params
+    truth = {n: float(getattr(p, n)) for n in ("Lb", "Blat", "tau_f")}
+    rng = np.random.default_rng(4)
+    lat = np.repeat(rng.uniform(-0.2, 0.2, 150), 10)
+    # phi p b with b' = -p - b/tau + Blat/tau lat, discretised by scipy.
+    A = np.array([[0, 1, 0], [0, 0, truth["Lb"]], [0, -1, -1 / truth["tau_f"]]])
+    B = np.array([[0], [0], [truth["Blat"] / truth["tau_f"]]])
+    Ad, Bd, *_ = scipy.signal.cont2discrete((A, B, np.eye(3), np.zeros((3, 1))), DT)
+    x, states = np.zeros(3), []
+    for u in lat:
+        states.append(x)
+        x = Ad @ x + Bd[:, 0] * u
+    phi, rate, _ = np.array(states).T
+    flight = Flight(dt=DT, inputs={"lat": lat}, outputs={"phi": phi, "p": rate})
+    start = equation_error_start(file.model, p, [flight], dict.fromkeys(truth, UNKNOWN))
+    found = start.values
+    assert found["Lb"].value == pytest.approx(truth["Lb"], rel=0.05)
+    assert found["Blat"].value == pytest.approx(truth["Blat"], rel=0.05)
+    assert (found["tau_f"].value, found["tau_f"].origin) == (truth["tau_f"], "vehicle")
+    assert start.hidden == ("b",)
+    # A time constant of what is not measured needs a value from somewhere.
+    without = p._replace(tau_f=math.nan)
+    with pytest.raises(ValueError, match=r"free\.tau_f\.start: missing.*time constant"):
+        equation_error_start(file.model, without, [flight], dict.fromkeys(truth, UNKNOWN))
+
+
+def test_what_cannot_be_regressed_is_said(bench30):
+    flight = record(n=300)
+    sum_alone = Model("sum", vector_field, total, Params, State, Inputs, Total, linear=True)
+    only = Flight(dt=DT, inputs=flight.inputs, outputs={"total": flight.outputs["p"]})
+    with pytest.raises(ValueError, match=r"no output \(total\) shows a state.*expected a start"):
+        equation_error_start(sum_alone, NOTHING, [only], FREE)
+    with pytest.raises(ValueError, match=r"is for linear models, and .* is none"):
+        equation_error_start(models.helicopter("paper"), bench30, [flight], {"Ixx": UNKNOWN})
+    short = Flight(
+        dt=DT,
+        inputs={"da": flight.inputs["da"][:20]},
+        outputs={"p": flight.outputs["p"][:20], "phi": flight.outputs["phi"][:20]},
+    )
+    with pytest.raises(ValueError, match="no stretch without missing samples"):
+        equation_error_start(ROLL, NOTHING, [short], FREE)
+
+
+class Total(NamedTuple):
+    total: Annotated[Scalar, "rad", "of both states"]
+
+
+def total(q, x, u):
+    return Total(total=x.p + x.phi)
+
+
+MODEL = """
+name: aileron
+states: {p: rad/s}
+inputs: {da: rad}
+outputs: {p: rad/s}
+parameters: {Lp: {value: -1, unit: 1/s}, Lda: {value: 1, unit: 1/s^2}}
+A: {p: {p: Lp}}
+B: {p: {da: Lda}}
+"""
+CONFIG = """
+model: {linear: aileron.yaml}
+flights:
+  - log: log.csv
+    signals:
+      time: {signal: t}
+      inputs: {da: {signal: da, unit: rad, hold: zero-order}}
+      outputs: {p: {signal: p, unit: rad/s}}
+fit:
+  start: {method: equation-error, stepwise: true}
+  free: {Lp: {}, Lda: {lower: 26.0}}
+rls: null
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    flight = record(n=600, noise=2e-3)
+    table = np.stack([flight.times, flight.inputs["da"], flight.outputs["p"]], axis=1)
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,da,p", comments="")
+    (tmp_path / "aileron.yaml").write_text(MODEL)
+    (tmp_path / "fit.yaml").write_text(CONFIG)
+    return tmp_path / "fit.yaml"
+
+
+def test_a_configuration_without_starts_is_fitted(config, capsys):
+    from heli_jax.output import print_fit
+
+    said = []
+    run = run_fit(config, config.parent / "run", progress=said.append)
+    assert any("Start by equation error of Lp, Lda" in line for line in said)
+    assert run.fit.estimates["Lp"].value == pytest.approx(-4.0, rel=0.1)
+    content = json.loads((config.parent / "run" / "fit.json").read_text())
+    guess = content["equation_error_start"]
+    assert guess["values"]["Lp"]["origin"] == "equation error"
+    assert guess["values"]["Lp"]["sd"] > 0
+    assert guess["values"]["Lda"]["value"] > 26.0  # moved inside its bound
+    assert content["parameters"]["Lp"]["start"] == guess["values"]["Lp"]["value"]
+    page = (config.parent / "run" / "report.html").read_text()
+    assert "By equation error: where the fit began, not its result" in page
+    print_fit(run)
+    assert "Where the fit began, by equation error (no result)" in capsys.readouterr().out
+    # The copy runs again: what was left out is left out there too.
+    again = problem(load_config(config.parent / "run" / "config.yaml"))
+    assert again.free["Lp"].start == run.problem.free["Lp"].start
+
+
+def test_wrong_starts_are_said_in_a_sentence(config):
+    for override, words in (
+        ({"fit.start": "given"}, r"fit\.free\.Lp\.start: missing, expected a number"),
+        ({"fit.start": "guess"}, r"fit\.start\.method.*'guess'"),
+        ({"fit.start": {"method": "given", "stepwise": True}}, "stepwise: expected method"),
+        ({"fit.start.f_remove": 30}, "f_remove: expected at most f_enter"),
+    ):
+        with pytest.raises(InputError, match=words):
+            problem(load_config(config, override))
