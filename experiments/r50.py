@@ -128,7 +128,7 @@ def identifiability(records: int, seconds: float) -> str:
     return "\n".join(f"- {sentence}" for sentence in verdict.sentences)
 
 
-def main(fits: int = 3, records: int = 1, seconds: float = 60.0, folder: str = "runs/r50") -> None:
+def main(fits: int, records: int, seconds: float, folder: str) -> None:
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     lines = out / f"fits-{records}x{seconds:g}.jsonl"
@@ -145,5 +145,5 @@ def main(fits: int = 3, records: int = 1, seconds: float = 60.0, folder: str = "
 
 
 if __name__ == "__main__":
-    kinds = (int, int, float, str)
-    main(*(kind(value) for kind, value in zip(kinds, sys.argv[1:], strict=False)))
+    given = sys.argv[1:] + ["3", "1", "60", "runs/r50"][len(sys.argv) - 1 :]
+    main(int(given[0]), int(given[1]), float(given[2]), given[3])
