@@ -187,7 +187,10 @@ def _random_steps(rng: np.random.Generator, N: int) -> np.ndarray:
 
 
 def problem(
-    flights: list[Flight], factors: dict[str, float] | None = None, taus: bool = True
+    flights: list[Flight],
+    factors: dict[str, float] | None = None,
+    taus: bool = True,
+    fixed: tuple[str, ...] = FIXED,
 ) -> Problem:
     """33 derivatives, the turbulence and the measurement noise from records.
 
@@ -195,14 +198,15 @@ def problem(
         flights: the records.
         factors: of the starts, by parameter; 1 begins at the truth.
         taus: whether the correlation times are estimated too.
+        fixed: the parameters that are known.
     """
     values, factors = naming.asdict(truth()), factors or {}
     starts = {n: float(v) * factors.get(n, 1.0) for n, v in values.items()}
-    fixed = {*FIXED, "sigma_w", "tau_w"} | (set() if taus else {_tau(a) for a in AXES})
+    known = {*fixed, "sigma_w", "tau_w"} | (set() if taus else {_tau(a) for a in AXES})
     # sigma_w and tau_w are unknowns by themselves, which begin where the vehicle has them.
     own = {n: np.float64(starts[n]) for n in ("sigma_w", *(["tau_w"] if taus else []))}
     start = turbulent().Params(**values | own)
-    free = {n: Free(v) for n, v in starts.items() if n not in fixed}
+    free = {n: Free(v) for n, v in starts.items() if n not in known}
     return Problem(
         turbulent(),
         start,

@@ -49,7 +49,7 @@ def gaussian(decay, noise, seen=1.0, R: Any = 0.04):
 
 def records():
     rng = np.random.default_rng(3)
-    u, y, x0 = (rng.standard_normal(shape) for shape in ((N, 1, 2), (N, 2, 2), (2, 2)))
+    u, y, x0 = (rng.standard_normal(shape) for shape in ((N, 2, 1), (N, 2, 2), (2, 2)))
     return Records(*(jnp.asarray(v) for v in (u, u, y, x0)))
 
 
@@ -59,20 +59,20 @@ def by_hand(system):
     U, acting, y, x0 = (np.asarray(v) for v in records())
     total = 0.0
     for j in range(2):
-        x, P = x0[:, j], P0
+        x, P = x0[j], P0
         for k in range(N):
-            nu = y[k, :, j] - C @ x - D @ acting[k, :, j]
+            nu = y[k, j] - C @ x - D @ acting[k, j]
             S = C @ P @ C.T + np.diag(R)
             K = P @ C.T @ np.linalg.inv(S)
             total -= 0.5 * (nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(2 * np.pi * S)[1])
-            x = Ad @ (x + K @ nu) + B @ U[k, :, j]
+            x = Ad @ (x + K @ nu) + B @ U[k, j]
             P = Ad @ (P - K @ C @ P) @ Ad.T + Q
     return total
 
 
 def likelihood(system):
     error, variance = filtered_records(system, records())
-    s = variance[:, :, None]
+    s = variance[:, None, :]
     return -0.5 * jnp.sum(jnp.square(error) / s + jnp.log(2 * jnp.pi * s)), variance
 
 

@@ -35,13 +35,13 @@ def innovations_together(
     drives = [driven(layout, data, u, i) for i in group]
     system, U, acting = _system(layout, drives, noise, u, group)
     dtype = U.dtype
-    y = jnp.stack([_columns([by_name[n] for by_name in measured]) for n in names], axis=1)
-    x0 = jnp.stack([_first_state(layout, drive, dtype) for drive in drives], axis=1)
+    y = jnp.stack([_columns([by_name[n] for by_name in measured]) for n in names], axis=2)
+    x0 = jnp.stack([_first_state(layout, drive, dtype) for drive in drives])
     error, variance = filtered_records(system, Records(U, acting, y, x0))
     lengths = [by_name[names[0]].shape[0] for by_name in measured]
     return [
         Innovations(
-            {n: error[:N, k, j] for k, n in enumerate(names)},
+            {n: error[:N, j, k] for k, n in enumerate(names)},
             {n: variance[:N, k] for k, n in enumerate(names)},
         )
         for j, N in enumerate(lengths)
@@ -51,7 +51,7 @@ def innovations_together(
 def _system(
     layout: Layout, drives: list[Drive], noise: Noise, u: Unknowns, group: tuple[int, ...]
 ) -> tuple[Gaussian, Array, Array]:
-    """The model as the filter takes it, what B multiplies and the inputs that act, (N, ., m)."""
+    """The model as the filter takes it, what B multiplies and the inputs that act, (N, m, .)."""
     # Parameters, sample time and holds are the same in all, or they were no group.
     model, params, dt = layout.model, drives[0].params, drives[0].dt
     names = layout.outputs[group[0]]
@@ -61,7 +61,7 @@ def _system(
     def held(inputs: Any) -> Any:
         return held_columns(model, params, inputs, dt, u.shift, linear)
 
-    Ad, B, U, acting = jax.vmap(held, -1, (None, None, -1, -1))(inputs)
+    Ad, B, U, acting = jax.vmap(held, -1, (None, None, 1, 1))(inputs)
     _, _, C, D = jacobians(model, params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
     Q = process_noise(model, params, dt)

@@ -24,15 +24,15 @@ stays: derivatives converge later than values, by a factor of about the samples 
 
 
 class Records(NamedTuple):
-    """m records of N samples, side by side in the last axis."""
+    """m records of N samples, side by side."""
 
-    U: Float[Array, "N r m"]
+    U: Float[Array, "N m r"]
     """what `Gaussian.B` multiplies"""
-    acting: Float[Array, "N i m"]
+    acting: Float[Array, "N m i"]
     """the inputs that act at the samples themselves"""
-    y: Float[Array, "N p m"]
+    y: Float[Array, "N m p"]
     """measured; no NaN"""
-    x0: Float[Array, "n m"]
+    x0: Float[Array, "m n"]
     """mean of the state at the first sample"""
 
 
@@ -63,14 +63,14 @@ class _Gain(NamedTuple):
 class _State(NamedTuple):
     """The filter between two chunks."""
 
-    x: Float[Array, "n m"]
+    x: Float[Array, "m n"]
     P: Float[Array, "n n"]
     gain: _Gain
     steady: Bool[Array, ""]
 
 
 def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
-    """Errors (N, p, m) and variances (N, p) of the innovations.
+    """Errors (N, m, p) and variances (N, p) of the innovations.
 
     Outputs of one sample are taken one after another, as in `kalman.innovations`: the error of each
     is what the samples before and the outputs before it leave.
@@ -79,8 +79,8 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
         system: n states, p outputs.
         records: m of them, no sample missing.
     """
-    N, p, m = records.y.shape
-    n, count = records.x0.shape[0], -(-N // _CHUNK)
+    N, m, p = records.y.shape
+    n, count = records.x0.shape[1], -(-N // _CHUNK)
 
     def chunk(state: _State, part: Any) -> tuple[_State, Any]:
         return jax.lax.cond(state.steady, _frozen, _transient, system, state, *part)
@@ -97,7 +97,7 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
     none = _Gain(jnp.zeros((n, p), dtype), jnp.zeros((p, p), dtype))
     begin = _State(records.x0, system.P0, none, jnp.asarray(False))
     _, (error, sd) = jax.lax.scan(chunk, begin, parts)
-    error, sd = error.reshape(-1, p, m)[:N], sd.reshape(-1, p)[:N]
+    error, sd = error.reshape(-1, m, p)[:N], sd.reshape(-1, p)[:N]
     return error, jnp.square(sd)
 
 
@@ -111,13 +111,14 @@ def _transient(
         x, P, _ = carry
         U, acting, y = now
         P, gain = riccati(Ad, C, Q, R, P)
-        nu = y - D @ acting - C @ x
-        return (Ad @ x + gain.G @ nu + B @ U, P, gain), (gain.white @ nu, jnp.diagonal(gain.white))
+        nu = y - acting @ D.T - x @ C.T
+        x = x @ Ad.T + nu @ gain.G.T + U @ B.T
+        return (x, P, gain), (nu @ gain.white.T, jnp.diagonal(gain.white))
 
     carry = (state.x, state.P, state.gain)
     (x, P, gain), (white, scale) = jax.lax.scan(step, carry, (U, acting, y))
     sd = 1.0 / scale
-    return _State(x, P, gain, _converged(state.P, P)), (white * sd[:, :, None], sd)
+    return _State(x, P, gain, _converged(state.P, P)), (white * sd[:, None, :], sd)
 
 
 def _frozen(
@@ -125,12 +126,10 @@ def _frozen(
 ) -> tuple[_State, tuple[Array, Array]]:
     """A chunk with the gain that there is."""
     G, white = state.gain
-    v = y - jnp.einsum("pi,kim->kpm", system.D, acting)
-    forcing = jnp.einsum("np,kpm->knm", G, v) + jnp.einsum("nr,krm->knm", system.B, U)
-    x, X = recurrence(system.Ad - G @ system.C, forcing, state.x)
-    nu = v - jnp.einsum("pn,knm->kpm", system.C, X)
+    v = y - acting @ system.D.T
+    x, X = recurrence(system.Ad - G @ system.C, v @ G.T + U @ system.B.T, state.x)
     sd = 1.0 / jnp.diagonal(white)
-    error = jnp.einsum("qp,kpm->kqm", white * sd[:, None], nu)
+    error = (v - X @ system.C.T) @ (white * sd[:, None]).T
     return state._replace(x=x), (error, jnp.broadcast_to(sd, (U.shape[0], sd.shape[0])))
 
 
@@ -205,14 +204,14 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def recurrence(F: Array, forcing: Array, x0: Array) -> tuple[Array, Array]:
-    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, n, m) at all of them.
+    """x[k+1] = F x[k] + forcing[k]: x after the last of K samples, and x (K, m, n) at all of them.
 
     Args:
         F: (n, n).
-        forcing: (K, n, m).
-        x0: (n, m).
+        forcing: (K, m, n), of m records.
+        x0: (m, n).
     """
-    return jax.lax.scan(lambda x, f: (F @ x + f, x), x0, forcing)
+    return jax.lax.scan(lambda x, f: (x @ F.T + f, x), x0, forcing)
 
 
 @recurrence.defjvp
@@ -220,5 +219,5 @@ def _recurrence_jvp(primals: Any, tangents: Any) -> Any:
     (F, _, _), (dF, d_forcing, dx0) = primals, tangents
     x, X = recurrence(*primals)
     # All samples' dF x at once, in place of a product more in every step.
-    driven = jnp.einsum("ij,kjm->kim", dF, X) + d_forcing
+    driven = X @ dF.T + d_forcing
     return (x, X), recurrence(F, driven, dx0)
