@@ -74,8 +74,8 @@ class SignalsConfig(_Strict):
 class FlightConfig(_Strict):
     log: str
     signals: SignalsConfig
-    number: Annotated[int, Field(ge=1)] | None = None
-    """which flight of a log that holds several"""
+    flight: Annotated[int, Field(ge=1)] | None = None
+    """which flight of a log that holds several, from 1"""
     name: str | None = None
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.
