@@ -9,7 +9,6 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Disturbance, Model, axes_of
-from heli_jax.errors import nearest
 from heli_jax.naming import Record, Scalar
 
 
@@ -161,11 +160,7 @@ def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) ->
             f"model {model.name}: the derivative of {name!r} is kinematics, made of states "
             f"alone, which nothing can push; {expected}"
         )
-    near = nearest(name, known)
-    raise ValueError(
-        f"model {model.name} has no axis or state {name!r} to disturb"
-        + (near if "mean" in near else f", {expected}")
-    )
+    raise ValueError(f"model {model.name} has no axis or state {name!r} to disturb, {expected}")
 
 
 def _pushed_unit(model: Model, state: str) -> str:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float
 
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
@@ -18,6 +19,8 @@ from heli_jax.identification.estimation.noise_covariance import (
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
+from heli_jax.identification.estimation.which_disturbances import those_that_show
+from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
@@ -75,6 +78,7 @@ def check(problem: Problem) -> Check:
     notes = excitation.notes(problem, runs, guess.noise.sd)
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
+    notes += tuple(of_disturbances(guess.layout, guess.e))
     notes += other_hold(problem, Solution(*guess[:4]), guess.e, skip=not_identifiable)
     guessed = tuple(
         f"{label}/{name}"
@@ -120,7 +124,7 @@ def fit(
     before = verdict_of(problem, layout, guess.e)
     report(f"fitting {', '.join(layout.of_interest)}")
     points = starting.draw(layout, problem, guess.z, starts, seed)
-    disturbed = "sigma_w" in layout.disturbance
+    disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     search = starting.Search(
@@ -138,6 +142,8 @@ def fit(
     optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
     if disturbed:
-        optimum = disturbance_or_none(search, optimum)
+        several = len(disturbances_of(problem.model)) > 1
+        which = those_that_show if several else disturbance_or_none
+        optimum = which(search, optimum)
     timing = {"fit": time.perf_counter() - began}
     return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))

@@ -133,7 +133,7 @@ def test_pitch_has_its_own_axis(bench30):
     [
         ("yaw", 1, "no axis or state 'yaw' to disturb, expected one of roll"),
         ("heave", 1, "no axis or state 'heave'"),
-        ("pitch", 1, "no axis 'pitch'"),
+        ("pitch", 1, "no axis or state 'pitch'"),
         ("roll", 0, "poles must be 1 or 2, got 0"),
         ("roll", 3, "poles must be 1 or 2, got 3"),
     ],
