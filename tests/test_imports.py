@@ -115,7 +115,7 @@ def test_imports_point_one_way(name):
 ROOMS = (
     "methods", "free", "push_scale", "problem", "unknowns", "estimation", "identifiability",
     "validation", "equation_error", "result", "uncertainty", "agreement", "assemble", "fit",
-    "model_selection",
+    "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 
