@@ -35,6 +35,21 @@ class Axis(NamedTuple):
     """the states of the flybar that belong to it"""
 
 
+class Disturbance(NamedTuple):
+    """A random push on the derivative of one state, by the names of what a model has of it."""
+
+    name: str
+    """as it was asked for: an axis or a state"""
+    state: str
+    """whose derivative it adds to"""
+    sigma: str
+    """the parameter that is its standard deviation"""
+    tau: str
+    """the parameter that is its correlation time [s]"""
+    lags: tuple[str, ...] = ()
+    """its own states, the one that is driven by white noise first"""
+
+
 class SteadyFlight(NamedTuple):
     """What trim solves for, by name: as many unknowns as equations."""
 
@@ -96,6 +111,8 @@ class Model(eqx.Module):
     parameter that is its delay [s]"""
     positive: tuple[str, ...] = eqx.field(static=True, default=())
     """the parameters that are above zero whatever else may change its sign"""
+    disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
+    """what `with_disturbance` added; filter error estimates its parameters by itself"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
