@@ -30,7 +30,7 @@ def load(tmp_path):
 @pytest.mark.parametrize(
     ("name", "model"),
     [
-        ("helicopter", "helicopter-consistent"),
+        ("helicopter", "helicopter-full"),
         ("helicopter-consistent", "helicopter-consistent"),
         ("helicopter-paper", "helicopter-paper"),
     ],

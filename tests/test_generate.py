@@ -20,7 +20,7 @@ HOVER_THROTTLE, HOVER_YAW = 0.49980745, -0.54833409
 def made(tmp_path):
     """made(key=value, ...) -> the table of a run of two seconds with these keys in `simulate`."""
 
-    def made(model="helicopter", disturbance=None, **simulate):
+    def made(model="helicopter-consistent", disturbance=None, **simulate):
         path = tmp_path / "xcell.yaml"
         content = {
             "model": model,
@@ -117,7 +117,11 @@ def test_keys_of_the_whole_helicopter_alone(made, key):
 def test_a_vehicle_without_what_the_model_needs(tmp_path):
     path = tmp_path / "bench.yaml"
     bench = str(ROOT / "configs" / "vehicles" / "bench-30.yaml")
-    content = {"model": "helicopter", "vehicle": bench, "simulate": {"duration": 1, "rate": 50}}
+    content = {
+        "model": "helicopter-consistent",
+        "vehicle": bench,
+        "simulate": {"duration": 1, "rate": 50},
+    }
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(InputError, match=r"bench.yaml: vehicle: m, .* missing, model helicopter"):
         generate.generate(configuration.load(path))

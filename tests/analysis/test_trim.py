@@ -47,7 +47,7 @@ def test_hover_has_the_numbers_of_the_reading(hovers, xcell):
     s, u = hovers["consistent"].state, hovers["consistent"].inputs
     how = whole.Corrections(*[True] * 11)
     air = whole.flow(how, xcell, s, u, whole.motion(how, s, u))
-    force = whole.main_rotor(xcell, s, u, air)
+    force = whole.main_rotor(how, xcell, s, u, air)
     theta0 = xcell.K_theta0 * u.x_throttle
     Q = whole.aero.torque(xcell, s.Omega, theta0, air, force.inflow)
     assert np.degrees(float(theta0)) == pytest.approx(8.65, rel=5e-3)
@@ -69,7 +69,7 @@ def test_eigenvalues_are_those_of_the_reading(variant, hovers, xcell):
 
 
 def test_modes_have_names(hovers, xcell):
-    model, found = models.helicopter(), hovers["consistent"]
+    model, found = models.helicopter("consistent"), hovers["consistent"]
     named = eigenmodes(model, xcell, found.state, found.inputs)
     by_name = {m.name: m for m in named}
     assert by_name["roll with flybar roll"].frequency == pytest.approx(18.5, rel=0.01)
@@ -82,7 +82,7 @@ def test_modes_have_names(hovers, xcell):
 
 def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
     found = hovers["consistent"]
-    lin = linearize(models.helicopter(), xcell, found.state, found.inputs)
+    lin = linearize(models.helicopter("consistent"), xcell, found.state, found.inputs)
     system = lin.to_control()
     assert isinstance(system, control.StateSpace)
     assert system.state_labels == list(lin.states)
@@ -110,7 +110,7 @@ def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
 )
 def test_steady_flights_are_steady(condition, xcell):
     """With drag, by the second program's derivatives."""
-    model = models.helicopter()
+    model = models.helicopter("consistent")
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
     found = trim(model, p, condition)
     s = {n: float(v) for n, v in naming.asdict(found.state).items()}
@@ -143,14 +143,14 @@ def test_the_old_names_of_the_speeds_are_accepted_with_a_warning():
 
 def test_hover_in_a_wind_is_flight_the_other_way(xcell):
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
-    still = trim(models.helicopter(), p, Condition(forward_speed=6.0))
-    blown = trim(models.helicopter(wind=True), p, wind=(-6.0, 0.0, 0.0))
+    still = trim(models.helicopter("consistent"), p, Condition(forward_speed=6.0))
+    blown = trim(models.helicopter("consistent", wind=True), p, wind=(-6.0, 0.0, 0.0))
     assert float(blown.state.theta) == pytest.approx(float(still.state.theta), abs=1e-12)
     assert float(blown.inputs.x_throttle) == pytest.approx(float(still.inputs.x_throttle))
 
 
 def test_trim_has_the_derivative_of_a_root(xcell):
-    model = models.helicopter()
+    model = models.helicopter("consistent")
 
     def throttle(m):
         return equilibrium(model, naming.replace(xcell, m=m)).inputs.x_throttle
@@ -172,17 +172,17 @@ def test_trim_has_the_derivative_of_a_root(xcell):
 def test_a_vehicle_that_cannot_hover_is_refused_with_the_reason(xcell, changes, words):
     changed = naming.replace(xcell, **{n: jnp.asarray(v) for n, v in changes.items()})
     with pytest.raises(ValueError, match=f"no trim of hover: expected {words}"):
-        trim(models.helicopter(), changed)
+        trim(models.helicopter("consistent"), changed)
 
 
 def test_flights_that_do_not_exist_are_refused(xcell, bench30):
     with pytest.raises(ValueError, match=r"within the model's range: vortex ring"):
-        trim(models.helicopter(), xcell, Condition(climb=-4.0))
+        trim(models.helicopter("consistent"), xcell, Condition(climb=-4.0))
     with pytest.raises(ValueError, match="exists for this vehicle: the nearest leaves"):
-        trim(models.helicopter(), naming.replace(xcell, m=jnp.asarray(400.0)))
+        trim(models.helicopter("consistent"), naming.replace(xcell, m=jnp.asarray(400.0)))
     with pytest.raises(ValueError, match=r"expected the full nonlinear model, .* got roll"):
         trim(models.roll, bench30)
     with pytest.raises(ValueError, match="has no stick 'x_rudder'"):
-        trim(models.helicopter(), xcell, sticks={"x_rudder": (-1.0, 1.0)})
+        trim(models.helicopter("consistent"), xcell, sticks={"x_rudder": (-1.0, 1.0)})
     with pytest.raises(ValueError, match=r"Iyy, .* missing"):
-        trim(models.helicopter(), bench30)
+        trim(models.helicopter("consistent"), bench30)
