@@ -134,11 +134,14 @@ def test_a_shipped_manoeuvre_from_the_command_line(tmp_path, capsys):
     assert "wrote 200 samples" in capsys.readouterr().err
     head, *rows = out.read_text().splitlines()
     names = head.replace('"', "").split(",")
-    assert names[:6] == ["t", "stick_roll", "stick_pitch", "stick_yaw", "throttle", "phi"]
+    sticks = ["stick_roll", "stick_pitch", "stick_yaw", "collective", "throttle"]
+    assert names[:7] == ["t", *sticks, "phi"]
     numbers = np.array([[float(v) for v in row.split(",")] for row in rows])
     table = dict(zip(names, numbers.T, strict=True))
     assert set(np.round(table["stick_roll"], 9)) == {-0.5, 0.0, 0.5}
-    np.testing.assert_allclose(table["throttle"], 100 * HOVER_THROTTLE, atol=1e-4)
+    # The governor is asked for the whole speed; the collective is that of hover.
+    np.testing.assert_allclose(table["throttle"], 100.0, atol=1e-4)
+    np.testing.assert_allclose(table["collective"], 49.9596, atol=1e-3)
     # The rate is the angle's slope, both with their noise.
     slope = np.gradient(table["phi"], table["t"])
     assert np.corrcoef(slope, table["p"])[0, 1] > 0.95

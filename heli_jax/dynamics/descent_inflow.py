@@ -12,7 +12,7 @@ zero outside the range and with a continuous first derivative at its ends, so th
 windmill brake are joined by one curve with one root. k = 0.37 and k_V = 5.8 are fitted to the
 measured curve as W. Johnson gives it (NASA TP-2005-213477, and the theory of NDARC, NASA
 TP-2009-215402): in units of the induced velocity of hover,
-$W + v_i = W(0.373 W^2 + 0.598 V^2 - 0.991)$ where $1.5 V^2 + (2W + 3)^2 < 1$. It is met within 7 %,
+$W + v_i = W(0.373 W^2 + 0.598 V^2 - 0.991)$ where $1.5 V^2 + (2W + 3)^2 < 1$. It is met within 8 %,
 and where nothing goes through the rotor (W = -1.63, autorotation) within 4 %.
 """
 
