@@ -11,6 +11,7 @@ from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.analysis.trim import Condition, equilibrium
 from heli_jax.config.schema import StartConfig
 from heli_jax.dynamics import helicopter as whole
+from tests.dynamics import full_helicopter as second
 from tests.dynamics import whole_helicopter as oracle
 
 # As listed in the paper's reading; it has 0.006 for the slowest pair of `consistent`, which comes
@@ -186,3 +187,117 @@ def test_flights_that_do_not_exist_are_refused(xcell, bench30):
         trim(models.helicopter("consistent"), xcell, sticks={"x_rudder": (-1.0, 1.0)})
     with pytest.raises(ValueError, match=r"Iyy, .* missing"):
         trim(models.helicopter("consistent"), bench30)
+
+
+# The variant `full`.
+
+
+@pytest.fixture(scope="module")
+def full(xcell):
+    model = models.helicopter()
+    return model, trim(model, xcell)
+
+
+def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
+    """Weight along the body's y axis, the tilted thrust and the tail rotor's thrust add to zero."""
+    model, found = full
+    assert found.residual < 1e-10
+    s = {n: float(v) for n, v in naming.asdict(found.state).items()}
+    u = {n: float(v) for n, v in naming.asdict(found.inputs).items()}
+    rates = second.rates(second.FULL, s, u)
+    assert max(abs(rates[n]) for n in model.steady_flight.equations) < 1e-9
+    # The tail rotor pulls to the right (it turns the nose to the left), so the machine banks left.
+    weight = second.FULL["m"] * second.FULL["g"]
+    tail = weight * np.sin(-s["phi"]) * np.cos(s["theta"]) - weight * s["b1"]
+    assert tail == pytest.approx(3.52, rel=0.05)  # as models.md has it
+    assert np.degrees(-s["phi"]) == pytest.approx(2.3, abs=0.3)
+    assert s["Omega"] == pytest.approx(157.1)
+    assert u["x_throttle"] == pytest.approx(1.0)
+
+
+def test_hover_has_the_modes_of_a_helicopter(full, xcell):
+    """Between the R-50 and what models.md has of the X-Cell, and named."""
+    model, found = full
+    by_name = {m.name: m for m in eigenmodes(model, xcell, found.state, found.inputs)}
+    phugoid = by_name["phugoid"]
+    # -0.03 +- 0.69j with speed stability added by hand, 0.3 +- 0.1j of the R-50.
+    assert -0.03 < phugoid.eigenvalue.real < 0.4
+    assert 0.1 < phugoid.eigenvalue.imag < 0.7
+    roll = next(m for n, m in by_name.items() if n.startswith("roll flapping"))
+    pitch = next(m for n, m in by_name.items() if n.startswith("pitch flapping"))
+    # The R-50's are at 11.9 and 8.4 rad/s, the X-Cell's roll at about 20.
+    assert 11.9 < roll.frequency < 23.0
+    assert 8.4 < pitch.frequency < roll.frequency
+    assert 0.2 < roll.damping < 0.7
+    assert {"yaw", "heave", "lateral phugoid"} <= set(by_name)
+
+
+def johnson_descent(inflow):
+    """The descent, over the induced velocity of hover, at which W + v is `inflow` over the same:
+    the measured curve of axial flight (W. Johnson, NASA TP-2005-213477)."""
+    c = np.linspace(-2.0, -1.0, 100001)
+    return -c[np.argmin(np.abs(c * (0.373 * c**2 - 0.991) - inflow))]
+
+
+def test_autorotation_sinks_as_measured(full, xcell):
+    """Straight down the rotor's power is nil where thrust times inflow makes up for the drag of
+    main blades and tail; the measured curve says how fast it sinks for that."""
+    model, _ = full
+    found = trim(model, xcell, power_off=True)
+    assert found.residual < 1e-10
+    assert float(found.inputs.x_throttle) == 0.0
+    assert float(found.state.Omega) == pytest.approx(157.1)
+    v = second.FULL
+    s = {n: float(x) for n, x in naming.asdict(found.state).items()}
+    u = {n: float(x) for n, x in naming.asdict(found.inputs).items()}
+    rates = second.rates(v, s, u)
+    assert max(abs(rates[n]) for n in model.steady_flight.equations) < 1e-9
+    drag = v["rho"] / 2 * v["Sz"] * s["dz"] ** 2
+    T = v["m"] * v["g"] - drag
+    hover = np.sqrt(T / (2 * v["rho"] * np.pi * v["R"] ** 2))
+    profile = v["rho"] * v["c"] * v["R"] ** 4 * v["Omega"] ** 3 * v["Cd0"] / 4
+    tail = v["K_Omega"] ** 3 * v["rho"] * v["c_T"] * v["R_T"] ** 4 * v["Omega"] ** 3 * v["Cd0"] / 4
+    wanted = johnson_descent(-(profile + tail) / T / hover) * hover
+    assert -s["dz"] == pytest.approx(wanted, rel=0.1)
+
+
+def test_autorotation_in_forward_flight_is_that_of_momentum_theory(full, xcell):
+    """Past the wake's ring the measured curve is momentum theory: the power balance with it."""
+    model, _ = full
+    found = trim(model, xcell, Condition(forward_speed=10.0), power_off=True)
+    v, s = second.FULL, {n: float(x) for n, x in naming.asdict(found.state).items()}
+    V, sink = 10.0, -s["dz"]
+    T = v["m"] * v["g"]
+    hover2 = T / (2 * v["rho"] * np.pi * v["R"] ** 2)
+    tail = v["K_Omega"] ** 3 * v["c_T"] * v["R_T"] ** 4 + v["c"] * v["R"] ** 4
+    profile = tail * v["rho"] * v["Omega"] ** 3 * v["Cd0"] / 4
+    fuselage = v["rho"] / 2 * np.hypot(V, sink) * (v["Sx"] * V**2 + v["Sz"] * sink**2)
+    induced = hover2 / V  # the flow through the rotor is little beside V
+    assert sink * T == pytest.approx(profile + fuselage + T * induced, rel=0.1)
+    assert not any(bool(x) for x in model.limits(xcell, found.state, found.inputs).values())
+
+
+@pytest.mark.parametrize("climb", [-4.0, -8.0, -12.0])
+def test_steep_descents_are_inside_the_range(climb, full, xcell):
+    model, hover = full
+    found = trim(model, xcell, Condition(climb=climb))
+    assert found.residual < 1e-10
+    assert float(found.inputs.x_throttle) == pytest.approx(1.0)
+    assert float(found.state.governor) < float(hover.state.governor)
+
+
+def test_power_off_needs_a_collective_stick(xcell):
+    with pytest.raises(ValueError, match="power_off: expected a model with x_collective"):
+        trim(models.helicopter("consistent"), xcell, power_off=True)
+
+
+def test_a_flybarless_machine_hovers(vehicles_folder):
+    trex = load_vehicle(vehicles_folder / "t-rex-550.yaml")
+    model = models.helicopter(flybarless=True)
+    found = trim(model, trex)
+    assert 0.2 < float(found.state.governor) < 0.8
+    assert 0.2 < float(found.inputs.x_collective) < 0.9
+    names = {m.name for m in eigenmodes(model, trex, found.state, found.inputs)}
+    assert {"yaw", "heave"} <= names
+    with pytest.raises(ValueError, match=r"If, R1.* missing"):
+        trim(models.helicopter(), trex)
