@@ -147,7 +147,7 @@ def test_a_shipped_manoeuvre_from_the_command_line(tmp_path, capsys):
     np.testing.assert_allclose(table["collective"], 49.9596, atol=1e-3)
     # The rate is the angle's slope, both with their noise.
     slope = np.gradient(table["phi"], table["t"])
-    assert np.corrcoef(slope, table["p"])[0, 1] > 0.95
+    assert np.corrcoef(slope, table["p"])[0, 1] > 0.9
     assert 5 < np.ptp(table["phi"]) < 60
 
 

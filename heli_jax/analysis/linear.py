@@ -148,10 +148,15 @@ def _mode_name(shares: dict[str, float], motions: dict[str, str]) -> str:
         motion = motions.get(name, name)
         by_motion[motion] = by_motion.get(motion, 0.0) + share
     ordered = sorted(by_motion, key=lambda m: -by_motion[m])
-    part = [m for m in ordered if by_motion[m] >= _TAKES_PART]
+    part = [m for m in ordered if by_motion[m] >= _threshold(m)]
     # The body before what moves with it.
     part = sorted(part or ordered[:1], key=lambda m: m.startswith(("flybar", "rotor", "inflow")))
     return " with ".join(_known(part))
+
+
+def _threshold(motion: str) -> float:
+    # The tilt is one state where a body has two, an angle and its rate.
+    return 0.75 * _TAKES_PART if motion.endswith("flapping") else _TAKES_PART
 
 
 def _known(part: list[str]) -> list[str]:

@@ -164,6 +164,8 @@ def trim(
             return best
         offset = rng.standard_normal(offset.size)
     left = "" if best is None else f": the nearest leaves an acceleration of {best.residual:.3g}"
+    if "governor" in naming.names(model.State):
+        left += "; its governor has a throttle of 0 to 1 to hold Omega, and no brake"
     raise ValueError(f"no trim of {_words(condition)} exists for this vehicle{left}")
 
 
