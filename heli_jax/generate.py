@@ -288,8 +288,10 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
         return []
     notes = []
     for name, (low, high) in STICKS.items():
+        if not hasattr(run.inputs, name):
+            continue
         stick = np.asarray(getattr(run.inputs, name))[flown]
-        beyond = (stick < low) | (stick > high)
+        beyond = (stick < low - _MIDDLE) | (stick > high + _MIDDLE)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
             notes.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")

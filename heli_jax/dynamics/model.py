@@ -33,6 +33,8 @@ class Axis(NamedTuple):
     """the input that turns the machine about this axis"""
     flybar: tuple[str, ...] = ()
     """the states of the flybar that belong to it"""
+    tilt: tuple[str, ...] = ()
+    """the states of the main rotor's tip-path plane that belong to it"""
 
 
 class Disturbance(NamedTuple):
@@ -158,9 +160,18 @@ def zeros(record: type, dtype: DTypeLike | None = None) -> Record:
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
 
 
-ROLL = Axis("roll", "dphi", "phi", "Ixx", "Ixx_added", "x_roll", ("beta_roll", "dbeta_roll"))
+ROLL = Axis(
+    "roll", "dphi", "phi", "Ixx", "Ixx_added", "x_roll", ("beta_roll", "dbeta_roll"), ("b1",)
+)
 PITCH = Axis(
-    "pitch", "dtheta", "theta", "Iyy", "Iyy_added", "x_pitch", ("beta_pitch", "dbeta_pitch")
+    "pitch",
+    "dtheta",
+    "theta",
+    "Iyy",
+    "Iyy_added",
+    "x_pitch",
+    ("beta_pitch", "dbeta_pitch"),
+    ("a1",),
 )
 YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
 """The axes under the names that they have in the models here."""
@@ -178,6 +189,7 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
         axis._replace(
             angle=axis.angle if axis.angle in states else None,
             flybar=tuple(n for n in axis.flybar if n in states),
+            tilt=tuple(n for n in axis.tilt if n in states),
         )
         for axis in (ROLL, PITCH, YAW)
         if axis.rate in states
