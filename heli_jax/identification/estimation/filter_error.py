@@ -263,7 +263,7 @@ def filtered_flights(
     small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
         # One record of a small model: written out in rows the exact filter takes as long, and two
-        # seconds less to compile .
+        # seconds less to compile.
         if not (small and len(group) == 1):
             found = innovations_together(layout, data, noise, u, group)
             together |= dict(zip(group, found, strict=True))
