@@ -114,7 +114,7 @@ def one_run(seed: int, n: int) -> dict[str, Any]:
     truth |= {f"tau_w_{k}": v for k, v in TIMES.items()} | TRUTH
     covers = {}
     for name, estimate in {**whole.nuisance, **whole.estimates}.items():
-        if name in truth and estimate.lower95 is not None:
+        if name in truth and estimate.lower95 is not None and estimate.upper95 is not None:
             covers[name] = bool(estimate.lower95 < truth[name] < estimate.upper95)
     left_out = {}
     for name, candidate in sets.items():
