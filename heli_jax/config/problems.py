@@ -132,7 +132,7 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
             return disturbed_sets(fitted, model, asked, stated)
         except ValueError as e:
             raise InputError(f"{experiment.path}: disturbance: {e}") from e
-    axis, *_ = asked
+    axis = next(iter(asked))
     # Whether there is a stand is in question only where its stiffness is.
     bare = model.without_stand if "kappa" in fitted.free else None
     return alternatives(fitted, model, axis, without_stand=bare)
