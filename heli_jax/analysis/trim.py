@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
+from heli_jax.analysis.trim_guess import first_guess
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing, zeros
 from heli_jax.vehicle import of_helicopter
@@ -204,7 +205,7 @@ def _equilibrium(
     names, rates = _require(model, power_off)
     dtype = offset.dtype
     # In units of their sizes: a rotor's speed is a thousand times a flapping angle.
-    guess, scale = _guess(model, params, condition, power_off)
+    guess, scale = first_guess(model, params, condition.climb, power_off)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
     scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
     cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
@@ -311,40 +312,6 @@ def _require(model: Model, power_off: bool = False) -> SteadyFlight:
     return steady._replace(
         unknowns=tuple("climb" if n == "x_throttle" else n for n in steady.unknowns)
     )
-
-
-def _guess(
-    model: Model, p: Any, condition: Condition, power_off: bool
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight."""
-    # Momentum theory in hover, then blade-element theory solved for the collective pitch.
-    area = jnp.pi * p.R**2
-    vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
-    tip = p.R * p.Omega
-    sigma = 2.0 * p.c / (jnp.pi * p.R)
-    loading = 2.0 * p.m * p.g / (p.rho * area * tip**2 * p.a * sigma)
-    # In autorotation hardly anything goes through the rotor.
-    inflow = 0.0 * tip if power_off else (vi + condition.climb) / tip
-    theta0 = 3.0 / p.B**3 * (loading + 0.5 * p.B**2 * inflow)
-    stick = theta0 / p.K_theta0
-    guess = {
-        "Omega": p.Omega, "vi": vi, "climb": -1.7 * vi,
-        "x_collective": stick, "x_throttle": stick, "x_yaw": -0.5 * stick,
-    }  # fmt: skip
-    sizes = {
-        "Omega": p.Omega, "vi": vi, "climb": vi, "governor": 0.5,
-        "x_collective": stick, "x_throttle": stick, "x_yaw": stick,
-        "x_roll": 0.1 * p.L1, "x_pitch": 0.1 * p.L1,
-    }  # fmt: skip
-    if "x_collective" in naming.names(model.Inputs):
-        # The throttle that carries induced and half as much of other power; the governor's stick
-        # asks for the whole speed.
-        power = 1.5 * p.m * p.g * vi / (p.Ir * p.K_throttle * p.Omega)
-        governed = "governor" in naming.names(model.State)
-        guess |= {"x_throttle": 1.0 if governed else power, "governor": power}
-        guess["governor"] = 0.0 if power_off else power
-        sizes |= {"x_throttle": 0.5}
-    return guess, sizes
 
 
 def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
