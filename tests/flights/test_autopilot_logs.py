@@ -223,6 +223,8 @@ def test_the_numbers_are_pymavlinks():
     theirs, rows = reader.DFReader_binary(str(BIN)), {}
     while (message := theirs.recv_msg()) is not None:
         rows.setdefault(message.get_type(), []).append(message.to_dict())
+    theirs.data_map.close()
+    theirs.filehandle.close()
     for topic in log.topics:
         for name, values in topic.columns.items():
             field = name.removeprefix(f"{topic.name}.")
