@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import core
 
 from heli_jax import naming
+from heli_jax.dynamics.check_names import check_names
 from heli_jax.dynamics.model import Model
 
 _RECORDS = ("Params", "State", "Inputs", "Outputs")
@@ -71,6 +72,9 @@ class _Parts(NamedTuple):
     noise_intensity: Any
     initial_sd: Any
     limits: Any
+    delays: Any
+    axes: Any
+    positive: Any
 
 
 @functools.lru_cache(maxsize=256)
@@ -102,6 +106,7 @@ def _check(model: _Parts, traceable: bool) -> None:
     # The classes first: functions are traced with records of them.
     for role in _RECORDS:
         _check_record(model, role)
+    check_names(model)
 
     def of(role: str, *arguments: str) -> _Function:
         return _Function(model, role, arguments, traceable)

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from heli_jax import Flight, Free, Model, Problem, linearize, simulate, sweep, t
 from heli_jax.cli import main
 from heli_jax.dynamics import check_model as checks
 from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.model import Axis
 from heli_jax.models import on_stand
 from heli_jax.sweeps import Range, Reduce, sobol
 
@@ -21,6 +22,11 @@ from heli_jax.sweeps import Range, Reduce, sobol
 class Params(NamedTuple):
     Lp: float
     La: float
+
+
+class Timed(NamedTuple):
+    Lp: Annotated[float, "s"]
+    La: Annotated[float, "m"]
 
 
 class State(NamedTuple):
@@ -134,6 +140,23 @@ BROKEN = {
     "sd of a stranger": ({"initial_sd": lambda p: {"q": p.Lp}}, ["initial_sd", "'q'", "phi, p"]),
     "limits that are none": ({"limits": lambda p, s, u: s.p > 1.0}, ["limits", "dictionary"]),
     "parameters that are no class": ({"Params": {"Lp": 1.0}}, ["Params", "NamedTuple", "a dict"]),
+    "a delay of a stranger": ({"delays": (("ail", "Lp"),)}, ["delays", "'ail'", "'aileron'?"]),
+    "a delay by a stranger": (
+        {"delays": (("aileron", "tau"),)}, ["delays of aileron: no parameter 'tau'", "La, Lp"],
+    ),
+    "delays in a dictionary": ({"delays": {"aileron": "Lp"}}, ["a tuple", "got {'aileron'"]),
+    "delays that are no pairs": ({"delays": ("aileron", "Lp")}, ["pairs", "got 'aileron'"]),
+    "two delays": ({"delays": (("aileron", "Lp"), ("aileron", "La"))}, ["one delay", "two"]),
+    "a delay in metres": (
+        {"Params": Timed, "delays": (("aileron", "La"),)}, ["delays of aileron", "got 'm'"],
+    ),
+    "an axis of no state": ({"axes": (Axis("roll", rate="q"),)}, ["roll.rate: no state 'q'"]),
+    "an axis of no stick": (
+        {"axes": (Axis("roll", rate="p", stick="lat"),)}, ["roll.stick: no input 'lat'"],
+    ),
+    "an axis alone": ({"axes": Axis("roll", rate="p")}, ["axes", "a tuple"]),
+    "axes by name": ({"axes": ("p",)}, ["axes", "an Axis", "got 'p'"]),
+    "positive strangers": ({"positive": ("Lq",)}, ["positive", "'Lq'"]),
     "states that are an object": ({"State": State(0.0, 0.0)}, ["State", "NamedTuple"]),
 }  # fmt: skip
 
@@ -225,6 +248,8 @@ def test_sound_models_pass():
     check_model(made(vector_field=lambda p, s, u: State(phi=0.0, p=1)))
     check_model(made(output=lambda p, s, u: Elsewhere(s.p)))
     check_model(made(limits=lambda p, s, u: {"fast": s.p > 1.0}, initial_sd=lambda p: {"p": p.La}))
+    axis = Axis("roll", rate="p", angle="phi", inertia="Lp", stick="aileron")
+    check_model(made(Params=Timed, delays=(("aileron", "Lp"),), axes=(axis,), positive=("La",)))
     with jax.numpy_dtype_promotion("strict"):
         check_model(made(output=lambda p, s, u: Outputs(2 * s.p)))
 
