@@ -140,6 +140,20 @@ def _check_record(model: _Parts, role: str) -> None:
     # A machine without inputs may fall; one without states has nothing to integrate.
     if not names and role != "Inputs":
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
+    if _is_leaf(record, names):
+        raise ValueError(
+            f"model {model.name!r}: {role}: {expected} or an eqx.Module, got {record.__name__}, "
+            "which is no pytree; @jax.tree_util.register_dataclass makes one of a dataclass"
+        )
+
+
+def _is_leaf(record: type, names: tuple[str, ...]) -> bool:
+    """Whether JAX takes a record for one value, not for the values of its fields."""
+    try:
+        made = record(**dict.fromkeys(names, 1.0))
+    except Exception:  # a class that looks at its values has to do without this check
+        return False
+    return jax.tree_util.all_leaves([made])
 
 
 class _Function:

@@ -1,5 +1,6 @@
 """Mistakes in a model of one's own end in a sentence that names the function and the remedy."""
 
+import dataclasses
 import functools
 import math
 from typing import Annotated, NamedTuple
@@ -27,6 +28,18 @@ class Params(NamedTuple):
 class Timed(NamedTuple):
     Lp: Annotated[float, "s"]
     La: Annotated[float, "m"]
+
+
+@dataclasses.dataclass
+class Plain:
+    Lp: float
+    La: float
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Registered(Plain):
+    pass
 
 
 class State(NamedTuple):
@@ -157,6 +170,9 @@ BROKEN = {
     "an axis alone": ({"axes": Axis("roll", rate="p")}, ["axes", "a tuple"]),
     "axes by name": ({"axes": ("p",)}, ["axes", "an Axis", "got 'p'"]),
     "positive strangers": ({"positive": ("Lq",)}, ["positive", "'Lq'"]),
+    "parameters in a plain dataclass": (
+        {"Params": Plain}, ["Params", "got Plain", "@jax.tree_util.register_dataclass"],
+    ),
     "states that are an object": ({"State": State(0.0, 0.0)}, ["State", "NamedTuple"]),
 }  # fmt: skip
 
@@ -252,6 +268,12 @@ def test_sound_models_pass():
     check_model(made(Params=Timed, delays=(("aileron", "Lp"),), axes=(axis,), positive=("La",)))
     with jax.numpy_dtype_promotion("strict"):
         check_model(made(output=lambda p, s, u: Outputs(2 * s.p)))
+
+
+def test_a_registered_dataclass_serves_as_parameters():
+    run = simulate(made(Params=Registered), Registered(-3.0, 20.0), flight())
+    same = simulate(made(), Params(-3.0, 20.0), flight())
+    np.testing.assert_array_equal(run.outputs.roll_rate, same.outputs.roll_rate)
 
 
 def test_parameters_that_stay_numbers_may_be_branched_on_in_a_simulation():
