@@ -30,7 +30,7 @@ from heli_jax.stick_inputs import factor_to_si, stick_inputs
 from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
-"""of a stick's travel: what trim leaves of one in the middle, 1e-79, is for no reader of a log"""
+"""of a stick's travel: a trimmed stick nearer to its middle (trim leaves 1e-79) is written as 0"""
 
 
 class Simulated(NamedTuple):

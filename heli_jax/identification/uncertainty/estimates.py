@@ -164,8 +164,8 @@ def extreme_noise_notes(layout: Layout, data: Data, z: Float[Array, " q"]) -> li
         value = np.exp(min(max(at, low), high))
         meaning = {
             # Shorter than a sample, or longer than the record.
-            ("tau_w", True): "to this record the disturbance is white noise",
-            ("tau_w", False): "to this record the disturbance is a random walk",
+            ("tau_w", True): "in this record the disturbance cannot be told from white noise",
+            ("tau_w", False): "in this record the disturbance cannot be told from a random walk",
         }.get((name, at <= low), "the record bounds it to one side at most")
         unit = naming.unit(layout.model.Params, name) or ""
         notes.append(f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}.")
