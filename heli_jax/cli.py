@@ -130,7 +130,11 @@ def _add_config(command: argparse.ArgumentParser) -> None:
 
 
 def _add_simulate_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--out", metavar="FILE", help=".csv or .parquet (default: CSV on stdout)")
+    command.add_argument(
+        "--out",
+        metavar="FILE",
+        help=".csv or .parquet (default: CSV on stdout); missing folders on its way are made",
+    )
     command.add_argument(
         "--view",
         nargs="?",

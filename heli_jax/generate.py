@@ -30,13 +30,14 @@ from heli_jax.stick_inputs import factor_to_si, stick_inputs
 from heli_jax.sweeps.spec import Trimmed
 
 _MIDDLE = 1e-14
-"""of a stick's travel: what trim leaves of one in the middle, 1e-79, is for no reader of a log"""
+"""of a stick's travel: a trimmed stick nearer to its middle (trim leaves 1e-79) is written as 0"""
 
 
 class Simulated(NamedTuple):
     """Columns of simulated runs under the names and in the units of a log."""
 
     columns: dict[str, np.ndarray]
+    """inputs as they were commanded: they act later where the model has delays"""
     model: Model
     """what was simulated, with wind where there is some, and without the disturbance"""
     runs: dict[str, Trajectory]
@@ -54,8 +55,10 @@ def generate(experiment: Experiment) -> Simulated:
     """The run of the configuration's `simulate`, with noise and disturbance.
 
     Its columns have the names and units of the first flight's `signals`, so that the same
-    configuration reads it back; without flights, the model's names in SI. A whole helicopter
-    begins in a trimmed flight, and its sticks are those of the trim and what is added to them.
+    configuration reads it back; without flights, the model's names in SI. Its inputs are those that
+    were commanded: where the model has delays, they act later than the log shows them, as in a log
+    of a machine. A whole helicopter begins in a trimmed flight, and its sticks are those of the
+    trim and what is added to them, by the configuration and by the pilot who holds the attitude.
 
     Raises:
         InputError: an input or output that the model lacks, a unit of the wrong kind, a vehicle
@@ -77,7 +80,7 @@ def generate(experiment: Experiment) -> Simulated:
     driven = stick_inputs(experiment, settings, n, rng, where)
     _check_full_nonlinear(experiment, settings, where)
     flown = in_wind(experiment) if settings.wind is not None else experiment
-    run = _run(flown, settings, n, driven, where)
+    run, commanded = _run(flown, settings, n, driven, where)
     if not bool(run.finite):
         raise InputError(f"{where}: {_diverged(experiment, run)}")
     # A log ends where the machine is on the ground; the frozen state after it is no flight.
@@ -91,9 +94,11 @@ def generate(experiment: Experiment) -> Simulated:
         # Drawn for the whole record, so that a ground does not change the noise of what is left.
         draws = noise.sd * scale * rng.standard_normal(n)
         outputs[name] = outputs[name] + draws[: outputs[name].size]
-    acted = {k: np.asarray(getattr(run.inputs, k)) for k in driven}
-    columns = _as_logged(experiment, np.asarray(run.times), acted, outputs)
-    notes = (*notes, *_held_notes(experiment, acted))
+    # As commanded, not as they acted: a delay in the log as well as in the model would be fitted as
+    # none. Wind is an input of `flown`, and in no log.
+    logged = {k: np.asarray(commanded[k])[: run.times.size] for k in driven}
+    columns = _as_logged(experiment, np.asarray(run.times), logged, outputs)
+    notes = (*notes, *_held_notes(experiment, logged))
     return Simulated(columns, flown.model, {experiment.path.stem: run}, notes)
 
 
@@ -155,8 +160,9 @@ def _run(
     n: int,
     driven: dict[str, np.ndarray],
     where: str,
-) -> Trajectory:
-    """The run as NumPy arrays, without measurement noise."""
+) -> tuple[Trajectory, dict[str, Any]]:
+    """The run as NumPy arrays, without measurement noise; and its inputs as they were commanded, in
+    arrays of as many samples."""
     # Said by name: what is missing is NaN, and the run would only be called not finite.
     missing = needed_but_missing(experiment.model, experiment.vehicle.params)
     if missing:
@@ -197,7 +203,10 @@ def _run(
     # operation. The key and the rate are constants of that one program.
     run = jax.device_get(jax.jit(fly)(params, inputs, start, pilot))
     # In float64 whatever the run was in: k/rate to the last digit, as a log has it.
-    return run._replace(times=np.arange(n) / settings.rate)
+    run = run._replace(times=np.arange(n) / settings.rate)
+    # What a pilot adds depends on the states, so it is known from the run alone; `simulate` takes
+    # no feedback where an input is late.
+    return run, driven if pilot is None else naming.asdict(run.inputs)
 
 
 def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
@@ -298,7 +307,7 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
     return notes
 
 
-def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[str]:
+def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[str]:
     """Sticks are held here whatever they do; what to say where a reader of the log would not know.
 
     A chirp and a pilot's feedback move at every sample, as sampled sticks do.
@@ -306,8 +315,8 @@ def _held_notes(experiment: Experiment, acted: dict[str, np.ndarray]) -> list[st
     if not experiment.config.flights:
         return []
     signals = experiment.config.flights[0].signals.inputs
-    auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in acted]
-    moving = [n for n in auto if decide(acted[n]).hold == "linear"]
+    auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
+    moving = [n for n in auto if decide(logged[n]).hold == "linear"]
     if not moving:
         return []
     return [

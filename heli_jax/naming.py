@@ -1,8 +1,9 @@
 """Names and units of a record class: what makes a model's parameters, states, inputs and outputs
 readable by the configuration, the readers and the report.
 
-A record class is any class built by keyword with one scalar a field: an `eqx.Module`, a
-`NamedTuple`, a dataclass. Units and meanings are optional and stand in the annotation:
+A record class is any class built by keyword with one scalar a field: a `NamedTuple`, an
+`eqx.Module`. A model's classes have to be known to JAX as pytrees, as these are; a dataclass is
+with `jax.tree_util.register_dataclass`. Units and meanings are optional, in the annotation:
 `roll: Annotated[Scalar, "rad", "roll angle"]`.
 """
 

@@ -46,6 +46,8 @@ def print_fit(run: FitRun) -> None:
     rows = [_row(name, e) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     _table((*head[:3], fit.interval, *head[4:]), rows)
+    if note := report_tables.prior_note(problem, fit):
+        print(f"! {note}")
     for c in fit.verdict.combinations:
         print(_determined(c))
     if supplementary.intervals is not None:

@@ -44,6 +44,15 @@ rpm = turn / minute
 g_0 = 9.80665 * meter / second ** 2 = gee
 slug = 14.593902937206 * kilogram
 pound_force = 4.4482216152605 * newton = lbf
+nautical_mile = 1852 * meter = nmi
+mile = 1609.344 * meter = mi
+knot = nautical_mile / hour = kt = kn
+joule = newton * meter = J
+ampere = [current] = A
+volt = watt / ampere = V
+ohm = volt / ampere
+henry = volt * second / ampere = H
+farad = ampere * second / volt = F
 """
 
 
@@ -60,31 +69,12 @@ def _registry() -> Any:
 # A unit is names with small whole exponents, multiplied or divided: nothing that computes.
 _FACTOR = r"(?:1|[A-Za-zµ°%_]+)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/·]\s*{_FACTOR}|\s+{_FACTOR})*")
-_EXAMPLES = [
-    "m",
-    "mm",
-    "cm",
-    "km",
-    "s",
-    "ms",
-    "us",
-    "min",
-    "rad",
-    "mrad",
-    "deg",
-    "rev",
-    "rpm",
-    "Hz",
-    "kg",
-    "g",
-    "N",
-    "W",
-    "Pa",
-    "lb",
-    "ft",
-    "in",
-    "stick",
-]
+_EXAMPLES = (
+    *("m", "mm", "cm", "km", "in", "ft", "mi", "nmi", "s", "ms", "us", "min", "h"),
+    *("rad", "mrad", "deg", "rev", "rpm", "Hz", "kt", "kg", "g", "lb", "slug", "N", "lbf", "gee"),
+    *("Pa", "J", "W", "A", "V", "ohm", "H", "F", "%", "stick"),
+)
+"""what is said to be known; docs/units.md has all"""
 
 
 # Any, as pint's quantities have no type that can be imported without pint.
@@ -99,6 +89,8 @@ def _parse(unit: str) -> Any:
         if len(text) > 60 or not _UNIT.fullmatch(text):
             raise ValueError
         expression = text.replace("%", "percent").replace("°", "degree")
+        if _unknown_names(expression):
+            raise ValueError
         quantity = registry.Quantity(
             1.0 * registry.parse_expression(expression, case_sensitive=True)
         )
@@ -106,7 +98,40 @@ def _parse(unit: str) -> Any:
             raise ValueError
         return quantity
     except Exception as e:  # pint raises many kinds for text that is no unit
-        raise ValueError(f"unknown unit {unit[:60]!r}{nearest(text[:60], _EXAMPLES)}") from e
+        raise ValueError(_unknown(unit, text)) from e
+
+
+def _unknown_names(expression: str) -> list[str]:
+    """The names in an expression that stand for no unit."""
+    return [n for n in re.findall(r"[A-Za-zµ°_]+", expression) if not _is_known(n)]
+
+
+def _is_known(name: str) -> bool:
+    registry = _registry()
+    meanings = registry.parse_unit_name(name, case_sensitive=True)
+    # pint takes an s at the end for a plural. Of a whole word it is one (degrees); `rads` may have
+    # been meant for rad/s.
+    if name.endswith("s") and len(name) > 1:
+        singular = registry.parse_unit_name(name[:-1], case_sensitive=True)
+        meanings = [m for m in meanings if m not in singular or name.endswith(f"{m[1]}s")]
+    return bool(meanings)
+
+
+def _unknown(unit: str, text: str) -> str:
+    """What to say of a unit that cannot be read: the name that is wrong, and what is near it."""
+    wrong, place = text[:60], ""
+    if len(text) <= 60 and _UNIT.fullmatch(text):
+        names = _unknown_names(text.replace("%", "percent").replace("°", "degree"))
+        wrong = names[0] if names else wrong
+    if wrong != text[:60]:
+        place = f" in {unit[:60]!r}"
+    # Case first: `hz` is nearer to Hz than to h.
+    alike = [n for n in _EXAMPLES if n.lower() == wrong.lower()]
+    near = nearest(wrong, alike or _EXAMPLES)
+    # `nearest` cuts a long list off; units are few enough to be all of use.
+    if not near.startswith("; did you mean"):
+        near = f"; known are {', '.join(_EXAMPLES)} and their products, as N m/A"
+    return f"unknown unit {(wrong if place else unit[:60])!r}{place}{near}"
 
 
 def factor(unit: str, si: str) -> float:
@@ -148,6 +173,14 @@ _SI = [
     "Pa",
     "1/rad",
     "kg/m^3",
+    "A",
+    "V",
+    "ohm",
+    "H",
+    "F",
+    "J",
+    "N*m/A",
+    "N*m*s/rad",
 ]
 
 
@@ -165,11 +198,11 @@ def si_of(unit: str) -> str:
     raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
 
 
-_BASE = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad"}
+_BASE = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad", "[current]": "A"}
 
 
 def base_of(unit: str) -> dict[str, int]:
-    """The exponents of kg, m, s and rad in a unit of any kind, those that are not zero.
+    """The exponents of kg, m, s, rad and A in a unit of any kind, those that are not zero.
 
     Raises:
         ValueError: the unit is unknown.
@@ -179,7 +212,7 @@ def base_of(unit: str) -> dict[str, int]:
 
 
 def as_text(exponents: Mapping[str, int]) -> str:
-    """The SI unit with these exponents of kg, m, s and rad: `kg m^2/s^2`."""
+    """The SI unit with these exponents of kg, m, s, rad and A: `kg m^2/s^2`."""
 
     def power(unit: str, n: int) -> str:
         return unit if n == 1 else f"{unit}^{n}"
@@ -211,6 +244,8 @@ _KINDS = {
     "m/s": "a speed",
     "kg": "a mass",
     "kg m^2": "a moment of inertia",
+    "A": "a current",
+    "V": "a voltage",
     "1": "a plain number",
 }
 

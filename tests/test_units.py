@@ -1,7 +1,9 @@
 """Units against the definitions of SI, not against the package's own table."""
 
 import math
+import re
 import time
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -44,6 +46,17 @@ FACTORS = [
     ("gee", "m/s^2", 9.80665),
     ("1/ms^2", "1/s^2", 1e6),
     ("lbf", "N", 4.4482216152605),
+    ("kt", "m/s", 1852.0 / 3600.0),
+    ("kn", "m/s", 1852.0 / 3600.0),
+    ("mi/h", "m/s", 1609.344 / 3600.0),
+    ("mA", "A", 1e-3),
+    ("mN m/A", "N m/A", 1e-3),
+    ("V s/rad", "N m s/A/s/rad", 1.0),
+    ("ohm", "V/A", 1.0),
+    ("mH", "V s/A", 1e-3),
+    ("V A", "W", 1.0),
+    ("degrees", "rad", math.pi / 180.0),
+    ("kilometers", "m", 1e3),
     ("kg", "kg", 1.0),
     ("", "1", 1.0),
     ("-", "1", 1.0),
@@ -85,11 +98,38 @@ def test_radians_do_not_pass_for_a_plain_number():
 
 
 @pytest.mark.parametrize(
-    ("unit", "near"), [("Deg", "deg"), ("radd", "rad"), ("RPM", "rpm"), ("hz", "Hz"), ("mmm", "mm")]
+    ("unit", "near"),
+    [
+        ("Deg", "deg"),
+        ("radd", "rad"),
+        ("RPM", "rpm"),
+        ("hz", "Hz"),
+        ("mmm", "mm"),
+        ("fts", "ft"),
+        ("rads", "rad"),
+    ],
 )
 def test_unknown_unit_names_the_nearest(unit, near):
     with pytest.raises(ValueError, match=rf"unknown unit '{unit}'; did you mean '{near}'\?"):
         units.factor(unit, "rad")
+
+
+def test_the_unknown_name_of_a_product_is_said_and_all_that_is_known():
+    with pytest.raises(ValueError, match=r"unknown unit 'quux' in 'N m/quux'; ") as e:
+        units.factor("N m/quux", "N m/A")
+    assert "known are m, mm" in str(e.value)
+    assert "..." not in str(e.value)
+
+
+def test_every_unit_that_the_docs_list_is_known():
+    text = (Path(__file__).parents[1] / "docs/units.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    named = {name for row in rows for name in re.findall(r"`([^`]*)`", row)}
+    assert len(named) > 30
+    for name in named:
+        units.base_of(name)
+    assert units.base_of("V") == {"kg": 1, "m": 2, "s": -3, "A": -1}
+    assert units.si_of("mV") == "V"
 
 
 HOSTILE = [

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import core
 
 from heli_jax import naming
+from heli_jax.dynamics.check_names import check_names
 from heli_jax.dynamics.model import Model
 
 _RECORDS = ("Params", "State", "Inputs", "Outputs")
@@ -71,6 +72,9 @@ class _Parts(NamedTuple):
     noise_intensity: Any
     initial_sd: Any
     limits: Any
+    delays: Any
+    axes: Any
+    positive: Any
 
 
 @functools.lru_cache(maxsize=256)
@@ -102,6 +106,7 @@ def _check(model: _Parts, traceable: bool) -> None:
     # The classes first: functions are traced with records of them.
     for role in _RECORDS:
         _check_record(model, role)
+    check_names(model)
 
     def of(role: str, *arguments: str) -> _Function:
         return _Function(model, role, arguments, traceable)
@@ -135,6 +140,20 @@ def _check_record(model: _Parts, role: str) -> None:
     # A machine without inputs may fall; one without states has nothing to integrate.
     if not names and role != "Inputs":
         raise ValueError(f"model {model.name!r}: {role}: {expected}, got one without fields")
+    if _is_leaf(record, names):
+        raise ValueError(
+            f"model {model.name!r}: {role}: {expected} or an eqx.Module, got {record.__name__}, "
+            "which is no pytree; @jax.tree_util.register_dataclass makes one of a dataclass"
+        )
+
+
+def _is_leaf(record: type, names: tuple[str, ...]) -> bool:
+    """Whether JAX takes a record for one value, not for the values of its fields."""
+    try:
+        made = record(**dict.fromkeys(names, 1.0))
+    except Exception:  # a class that looks at its values has to do without this check
+        return False
+    return jax.tree_util.all_leaves([made])
 
 
 class _Function:

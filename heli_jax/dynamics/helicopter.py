@@ -108,7 +108,9 @@ def helicopter(
         if on != getattr(_VARIANTS[variant], n)
     ]
     return Model(
-        f"helicopter-{variant}" + "".join(changed) + ("+wind" if wind else ""),
+        ("helicopter" if variant == "full" else f"helicopter-{variant}")
+        + "".join(changed)
+        + ("+wind" if wind else ""),
         functools.partial(_field, corrections, State),
         functools.partial(_output, corrections),
         Helicopter,

@@ -25,9 +25,9 @@ _MOST = 100
 """states, inputs or outputs: dense matrices beyond take minutes to compile"""
 _TAKEN = ("seed", "sigma_w", "tau_w")
 """names that a sweep or a disturbance adds"""
-BASE_UNITS = ("kg", "m", "s")
-PLAIN: Dimension = (0, 0, 0)
-TIME: Dimension = (0, 0, 1)
+BASE_UNITS = ("kg", "m", "s", "A")
+PLAIN: Dimension = (0, 0, 0, 0)
+TIME: Dimension = (0, 0, 1, 0)
 
 
 class Signal(NamedTuple):

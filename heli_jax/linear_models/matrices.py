@@ -199,7 +199,8 @@ class _Matrices:
     ) -> Entry:
         node = self.tree(place, given)
         said = f"{place}: {given!r:.80}"
-        expected = _over(of, self.columns[column] if per is None else per)
+        over = self.columns[column] if per is None else per
+        expected = _over(of, over)
         if not expression.parameters_of(node):
             if not of.bare:
                 raise InputError(
@@ -213,7 +214,8 @@ class _Matrices:
             raise InputError(f"{said}: {e}") from e
         if found != expected.dimension:
             raise InputError(
-                f"{said}: expected {_unit_text(expected.dimension)} (row over column), got "
+                f"{said}: expected {_unit_text(expected.dimension)} ({_unit_text(of.dimension)} of "
+                f"the row over {_unit_text(over.dimension)} of the column), got "
                 f"{_unit_text(found)}"
             )
         return Entry(row, column, node, 1.0, said)

@@ -47,7 +47,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     """Every line: parameters, their relations, agreement, whiteness, excitation."""
     lines: list[Gate] = []
     for name, estimate in fit.estimates.items():
-        lines += _of_parameter(name, estimate)
+        lines += _of_parameter(name, estimate, own_prior=problem.free[name].prior is not None)
     lines += _of_relations(fit)
     estimator = estimator_of(fit.method)
     # With process noise estimated, a simulation departs from the record even with the true
@@ -63,7 +63,7 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
         for name, m in metrics.items():
             lines += _of_agreement(name, m, source, judged=judged)
     lines += _of_disturbance(fit)
-    lines += _of_whiteness(fit, f"whiteness of {estimator.errors} (p)")
+    lines += _of_whiteness(fit, f"whiteness of {estimator.errors}, p-value")
     lines += _of_excitation(problem, fit)
     return tuple(lines)
 
@@ -103,7 +103,7 @@ def _least(what: str, of: str, value: float, unit: str, least: float, remark: st
     return Gate(what, of, value, unit, gate, bool(value >= least), remark)
 
 
-def _of_parameter(name: str, estimate: Estimate) -> list[Gate]:
+def _of_parameter(name: str, estimate: Estimate, *, own_prior: bool) -> list[Gate]:
     def share(sd: float | None) -> float:
         # An estimate of exactly zero has no relative deviation.
         return 100.0 * abs(sd / estimate.value) if sd is not None and estimate.value else math.nan
@@ -123,7 +123,9 @@ def _of_parameter(name: str, estimate: Estimate) -> list[Gate]:
         _most("insensitivity", name, share(estimate.sd_alone), "%", INSENSITIVITY, remark),
     ]
     if estimate.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
-        remark = "share of the prior in the posterior precision"
+        remark = "share of the priors in the posterior precision"
+        if not own_prior:
+            remark += "; it has none itself, biases and initial states have weak ones"
         lines.append(Gate("prior share", name, 100 * estimate.prior_share, "%", "", None, remark))
     return lines
 

@@ -185,8 +185,8 @@ def whiteness_note(fit: Fit) -> str:
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
-            "residuals' autocorrelation. They are honest about a poor estimate"
-            + (": filter-error makes a better one." if fit.disturbable else ".")
+            "residuals' autocorrelation"
+            + (", which filter-error would use for a better estimate." if fit.disturbable else ".")
         )
     else:
         consequence = "The intervals count every sample as news and are too narrow."

@@ -166,6 +166,7 @@ def render(
         warnings=tables.warnings(fit),
         remark=tables.model_remark(problem),
         parameters=tables.parameters(fit),
+        prior_note=tables.prior_note(problem, fit),
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),

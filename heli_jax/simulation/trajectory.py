@@ -29,7 +29,8 @@ class Trajectory(NamedTuple):
     outputs: Record
     """the model's Outputs with arrays (N,)"""
     inputs: Record
-    """the model's Inputs with arrays (N,), as they acted"""
+    """the model's Inputs with arrays (N,), as they acted at each sample: with the feedback's part,
+    and where there are delays, what was commanded that much earlier"""
     result: dfx.RESULTS
     """diffrax's result: `diffrax.RESULTS.successful`, or why the integration stopped"""
     finite: Bool[Array, ""]

@@ -1,8 +1,9 @@
 """Mistakes in a model of one's own end in a sentence that names the function and the remedy."""
 
+import dataclasses
 import functools
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from heli_jax import Flight, Free, Model, Problem, linearize, simulate, sweep, t
 from heli_jax.cli import main
 from heli_jax.dynamics import check_model as checks
 from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.model import Axis
 from heli_jax.models import on_stand
 from heli_jax.sweeps import Range, Reduce, sobol
 
@@ -21,6 +23,23 @@ from heli_jax.sweeps import Range, Reduce, sobol
 class Params(NamedTuple):
     Lp: float
     La: float
+
+
+class Timed(NamedTuple):
+    Lp: Annotated[float, "s"]
+    La: Annotated[float, "m"]
+
+
+@dataclasses.dataclass
+class Plain:
+    Lp: float
+    La: float
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Registered(Plain):
+    pass
 
 
 class State(NamedTuple):
@@ -134,6 +153,26 @@ BROKEN = {
     "sd of a stranger": ({"initial_sd": lambda p: {"q": p.Lp}}, ["initial_sd", "'q'", "phi, p"]),
     "limits that are none": ({"limits": lambda p, s, u: s.p > 1.0}, ["limits", "dictionary"]),
     "parameters that are no class": ({"Params": {"Lp": 1.0}}, ["Params", "NamedTuple", "a dict"]),
+    "a delay of a stranger": ({"delays": (("ail", "Lp"),)}, ["delays", "'ail'", "'aileron'?"]),
+    "a delay by a stranger": (
+        {"delays": (("aileron", "tau"),)}, ["delays of aileron: no parameter 'tau'", "La, Lp"],
+    ),
+    "delays in a dictionary": ({"delays": {"aileron": "Lp"}}, ["a tuple", "got {'aileron'"]),
+    "delays that are no pairs": ({"delays": ("aileron", "Lp")}, ["pairs", "got 'aileron'"]),
+    "two delays": ({"delays": (("aileron", "Lp"), ("aileron", "La"))}, ["one delay", "two"]),
+    "a delay in metres": (
+        {"Params": Timed, "delays": (("aileron", "La"),)}, ["delays of aileron", "got 'm'"],
+    ),
+    "an axis of no state": ({"axes": (Axis("roll", rate="q"),)}, ["roll.rate: no state 'q'"]),
+    "an axis of no stick": (
+        {"axes": (Axis("roll", rate="p", stick="lat"),)}, ["roll.stick: no input 'lat'"],
+    ),
+    "an axis alone": ({"axes": Axis("roll", rate="p")}, ["axes", "a tuple"]),
+    "axes by name": ({"axes": ("p",)}, ["axes", "an Axis", "got 'p'"]),
+    "positive strangers": ({"positive": ("Lq",)}, ["positive", "'Lq'"]),
+    "parameters in a plain dataclass": (
+        {"Params": Plain}, ["Params", "got Plain", "@jax.tree_util.register_dataclass"],
+    ),
     "states that are an object": ({"State": State(0.0, 0.0)}, ["State", "NamedTuple"]),
 }  # fmt: skip
 
@@ -225,8 +264,16 @@ def test_sound_models_pass():
     check_model(made(vector_field=lambda p, s, u: State(phi=0.0, p=1)))
     check_model(made(output=lambda p, s, u: Elsewhere(s.p)))
     check_model(made(limits=lambda p, s, u: {"fast": s.p > 1.0}, initial_sd=lambda p: {"p": p.La}))
+    axis = Axis("roll", rate="p", angle="phi", inertia="Lp", stick="aileron")
+    check_model(made(Params=Timed, delays=(("aileron", "Lp"),), axes=(axis,), positive=("La",)))
     with jax.numpy_dtype_promotion("strict"):
         check_model(made(output=lambda p, s, u: Outputs(2 * s.p)))
+
+
+def test_a_registered_dataclass_serves_as_parameters():
+    run = simulate(made(Params=Registered), Registered(-3.0, 20.0), flight())
+    same = simulate(made(), Params(-3.0, 20.0), flight())
+    np.testing.assert_array_equal(run.outputs.roll_rate, same.outputs.roll_rate)
 
 
 def test_parameters_that_stay_numbers_may_be_branched_on_in_a_simulation():

@@ -9,7 +9,7 @@ import xarray as xr
 import yaml
 
 from heli_jax import config as configuration
-from heli_jax import generate
+from heli_jax import fit, generate
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
@@ -151,3 +151,22 @@ def test_a_model_with_a_delay_flies(written, tmp_path, capsys, command):
     if command == "sweep":
         store = xr.open_zarr(tmp_path / "out.csv/sweep.zarr", consolidated=False, chunks=None)
         assert len(set(np.asarray(store.peak))) == 2  # the delay is a parameter like any other
+
+
+def test_the_log_of_a_model_with_a_delay_gives_the_delay_back(written, tmp_path):
+    """The log holds what was commanded: a log of delayed inputs would be fitted with no delay."""
+    content = yaml.safe_load((FILES / "heave.yaml").read_text())
+    content["parameters"]["tau"] = {"value": 0.13, "unit": "s"}
+    content["delays"] = {"col": "tau"}
+    (tmp_path / "late.yaml").write_text(yaml.safe_dump(content))
+    steps = {"kind": "3-2-1-1", "amplitude": 10, "unit": "%", "step": 1.0, "pause": 2.0}
+    simulate = {**HEAVE["simulate"], "inputs": {"col": steps}}
+    free = {**HEAVE["fit"]["free"], "tau": {"start": 0.3}}
+    path = written(model={"linear": "late.yaml"}, simulate=simulate, fit={"free": free})
+    assert main(["simulate", str(path), "--out", str(tmp_path / "heave.csv")]) == 0
+    time, stick, _ = np.loadtxt(tmp_path / "heave.csv", delimiter=",", skiprows=1).T
+    np.testing.assert_allclose(time[np.argmax(stick != 0)], 2.0)
+    estimates = fit(configuration.problem(configuration.load(path))).estimates
+    for name, truth in {"tau": 0.13, "Zw": -0.6141, "Zcol": -45.84 * 0.3048}.items():
+        estimate = estimates[name]
+        assert abs(estimate.value - truth) < 3 * estimate.sd < 0.1 * abs(truth)

@@ -192,7 +192,7 @@ def drop(*keys):
         (put("A", "u", "u", "Xu/(k - k)"), ["A.u.u", "not finite"]),
         (put("A", "u", "u", True), ["A.u.u: expected a number or an expression, got True"]),
         (put("A", "u", "u", ["Xu"]), ["A.u.u: expected a number or an expression"]),
-        (put("A", "u", "u", "tau"), ["A.u.u: 'tau': expected 1/s", "got s"]),
+        (put("A", "u", "u", "tau"), ["A.u.u: 'tau': expected 1/s (m/s^2 of the row", "got s"]),
         (put("A", "u", "u", "Xu + 2"), ["A.u.u", "'+' joins terms of different kinds"]),
         (put("A", "u", "Xu"), ["A.u: expected names with values"]),
         (lambda c: (drop("A", "theta")(c), drop("B")(c)), ["A.theta: missing", "derivative"]),

@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 from heli_jax.report.card import card, failed, summary
+from heli_jax.report.tables import prior_note
 
 
 def test_a_sound_fit_passes(sound):
@@ -14,7 +15,7 @@ def test_a_sound_fit_passes(sound):
     assert {
         "Cramér-Rao", "insensitivity", "condition number", "largest correlation", "VAF",
         "NRMSE fit", "Theil coefficient", "Theil bias part", "Theil variance part",
-        "Theil covariance part", "whiteness of residuals (p)", "coherence",
+        "Theil covariance part", "whiteness of residuals, p-value", "coherence",
     } == asked  # fmt: skip
     by = {(g.what, g.of): g for g in lines}
     for name, estimate in fit.estimates.items():
@@ -22,6 +23,16 @@ def test_a_sound_fit_passes(sound):
         assert math.isclose(by["Cramér-Rao", name].value, 100 * estimate.sd / estimate.value)
         # Known others can only help.
         assert by["insensitivity", name].value <= by["Cramér-Rao", name].value * (1 + 1e-9)
+
+
+def test_the_prior_share_of_a_parameter_without_a_prior_says_whose_it_is(sound):
+    fit, problem, _ = sound
+    held = fit.estimates["Ixx"]._replace(prior_share=0.17)
+    weak = dataclasses.replace(fit, estimates={**fit.estimates, "Ixx": held})
+    [line] = [g for g in card(problem, weak) if g.what == "prior share"]
+    assert "it has none itself" in line.remark
+    assert prior_note(problem, fit) == ""
+    assert prior_note(problem, weak).startswith("Ixx: the prior share is that of the weak priors")
 
 
 def test_what_is_not_determined_fails(not_identifiable):

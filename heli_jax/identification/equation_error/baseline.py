@@ -249,7 +249,7 @@ def _combinations(
         or len(naming.names(model.State)) != 4
     ):
         return {}, [
-            "No way leads from its coefficients to physical parameters of this model and "
+            "Physical parameters cannot be computed from its coefficients for this model and "
             f"output ({output})."
         ]
     if den is None:

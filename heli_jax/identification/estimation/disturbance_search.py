@@ -53,10 +53,10 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
     if not bool(optimum.best.converged):
         # The search was cut short before it was known that there is something to find.
         optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
-    return _off_the_limit(search, optimum)
+    return _restarted_from_a_limit(search, optimum)
 
 
-def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
+def _restarted_from_a_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     """Where the correlation time ran to an end of what a record can show, the better of that and of
     a search begun anew with the disturbance at its start: white noise is a local optimum of short
     records."""

@@ -167,8 +167,8 @@ def extreme_noise_notes(
         value = np.exp(min(max(at, low), high))
         meaning = {
             # Shorter than a sample, or longer than the record.
-            (False, True): "to this record the disturbance is white noise",
-            (False, False): "to this record the disturbance is a random walk",
+            (False, True): "in this record the disturbance cannot be told from white noise",
+            (False, False): "in this record the disturbance cannot be told from a random walk",
         }.get((name in layout.sigmas, at <= low), "the record bounds it to one side at most")
         unit = naming.unit(layout.model.Params, name) or ""
         notes.append(f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}.")

@@ -1,8 +1,7 @@
 """Sticks that are not centred: which inputs get a constant offset of their own in every flight.
 
 On a stand an offset moves the output by a constant, and the bias takes it up. In free flight it is
-integrated: 1 % of the stick left out moves an inertia by a fifth, with an interval that says
-nothing of it.
+integrated: 0.7 % of the stick left out moves Ixx by up to a fifth (docs/inputs.md).
 """
 
 from typing import Any

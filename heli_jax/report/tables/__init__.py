@@ -8,6 +8,7 @@ from heli_jax.report.tables.estimates import (
     intervals,
     nuisances,
     parameters,
+    prior_note,
     starts,
     verdict,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "origins",
     "pairs",
     "parameters",
+    "prior_note",
     "residuals",
     "selection_steps",
     "starts",

@@ -85,7 +85,7 @@ def residuals(fit: Fit, problem: Problem) -> Table:
         unit = pretty(naming.unit(problem.model.Outputs, output))
         sd = number(fit.noise.get(name), 3), number(stated.get(name), 3)
         rows.append((name, *sd, unit, *_whiteness(w)))
-    head = ("flight/output", "residual sd", "stated sd", "unit", "white", "p", "lags outside")
+    head = ("flight/output", "residual sd", "stated sd", "unit", "white", "p-value", "lags outside")
     return Table((*head, "at one sample"), rows)
 
 

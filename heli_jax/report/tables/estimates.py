@@ -4,11 +4,15 @@ import math
 from typing import NamedTuple
 
 from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.numbers import NOTHING, measured, number, percent, relative
 from heli_jax.report.style import pretty
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
+
+_SHARE = 0.005
+"""of the posterior precision: less is 0 % in the table, or 0.00"""
 
 
 def parameters(fit: Fit) -> Table:
@@ -24,6 +28,21 @@ def parameters(fit: Fit) -> Table:
         ]
         return Table((*head, "prior share", "at bound", "sd if white"), rows)
     return Table((*head, "prior share", "at bound"), rows)
+
+
+def prior_note(problem: Problem, fit: Fit) -> str:
+    """Where the prior share of parameters without a prior comes from; empty where there is none."""
+    names = [
+        n
+        for n, e in fit.estimates.items()
+        if problem.free[n].prior is None and e.prior_share >= _SHARE
+    ]
+    if not names:
+        return ""
+    return (
+        f"{', '.join(names)}: the prior share is that of the weak priors of biases, initial states "
+        "and input offsets (ten times the signal), since no prior was given."
+    )
 
 
 def _estimate(name: str, e: Estimate) -> tuple[str, ...]:
