@@ -195,6 +195,9 @@ def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
     if isinstance(coherence, str):
         return Gate("coherence", of, math.nan, "", "", None, coherence)
     remark = f"weighted by the expected response, {coherence.segments} segments"
+    # Of what lies below nothing is said: segments of this record are too short for it.
+    if coherence.lowest:
+        remark += f", from {coherence.lowest:.2g} rad/s on"
     what = "partial coherence" if coherence.others else "coherence"
     if not coherence.asked:
         remark = (

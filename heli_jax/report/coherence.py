@@ -44,6 +44,8 @@ class Coherence(NamedTuple):
     segments: int
     others: int
     """further inputs that move, whose part was taken out"""
+    lowest: float = 0.0
+    """rad/s from which on it is said where a mode is too slow for the segments, else 0"""
 
     @property
     def asked(self) -> bool:
@@ -95,6 +97,8 @@ class _Spectra(NamedTuple):
 
     omega: np.ndarray
     """(k,) [rad/s], above zero and below the Nyquist frequency"""
+    lowest: float
+    """rad/s, see `frequency.Segments`"""
     inputs: np.ndarray
     """(k, segments, inputs)"""
     measured: np.ndarray
@@ -112,16 +116,17 @@ def _spectra(
     if not np.isfinite(model).all():
         return "the simulation diverges"
     least = frequency.SEGMENTS + _MORE * (len(moving) - 1)
-    length = frequency.segment_length(y.size, dt, memory)
-    segments = 1 + (y.size - length) // (length // 2)
-    if segments < least:
-        duration = length * dt * (least + 1) / 2
-        return f"expected {least} segments of {length * dt:.3g} s, a record of {duration:.3g} s"
+    segments = frequency.segments_of(y.size, dt, memory, least)
+    if isinstance(segments, str):
+        return segments
     channels = np.stack([*(signals.inputs[n] for n in moving), y, model])
-    omega, transforms = segment_transforms(channels, dt, length)
-    # Without the mean, which was taken out, and Nyquist's frequency.
-    omega, transforms = omega[1:-1], transforms[1:-1]
-    return _Spectra(omega, transforms[..., :-2], transforms[..., -2], transforms[..., -1])
+    omega, transforms = segment_transforms(channels, dt, segments.length)
+    # Without the mean, which was taken out, and Nyquist's frequency; two periods in a segment are
+    # the second frequency above zero.
+    first = 2 if segments.lowest else 1
+    omega, transforms = omega[first:-1], transforms[first:-1]
+    inputs, measured, simulated = transforms[..., :-2], transforms[..., -2], transforms[..., -1]
+    return _Spectra(omega, segments.lowest, inputs, measured, simulated)
 
 
 def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
@@ -141,7 +146,8 @@ def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
         _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)
         for y in (record.measured, record.simulated)
     )
-    return Coherence(value, expected, share, record.inputs.shape[1], others.shape[2])
+    _, segments, others_count = others.shape
+    return Coherence(value, expected, share, segments, others_count, record.lowest)
 
 
 def _mean(coherence: np.ndarray, weights: np.ndarray) -> float:

@@ -29,6 +29,8 @@ SEGMENTS = 8
 """fewer half-overlapping segments than this make no average"""
 SHORTEST = 64
 """samples of a segment at least: fewer resolve nothing"""
+_BELOW = 1.0 - 1e-9
+"""a frequency counts as the lowest itself although rounding has it below"""
 _LONGEST = 4096
 """samples of a segment at most, unless the memory asks for more: further ones average better"""
 _MEMORIES = 16
@@ -45,6 +47,8 @@ class Empirical(NamedTuple):
     power: np.ndarray
     """spectral density of the input"""
     segments: int
+    lowest: float = 0.0
+    """rad/s that omega begins at where a mode is too slow for the segments, else 0"""
 
 
 class FittedFlight(NamedTuple):
@@ -198,16 +202,46 @@ def _needed(dt: float, memory: float) -> int:
     return max(SHORTEST, 2 ** int(np.ceil(np.log2(max(memory / dt, 1.0)))))
 
 
-def segment_length(samples: int, dt: float, memory: float) -> int:
-    """Samples of a segment: eight fit in the record, unless the memory asks for longer ones.
+class Segments(NamedTuple):
+    """How a record is cut into half-overlapping segments."""
+
+    length: int
+    """samples of each"""
+    count: int
+    lowest: float
+    """rad/s from which on their averages hold; 0 where a segment holds the whole memory"""
+
+
+def segments_of(samples: int, dt: float, memory: float, least: int = SEGMENTS) -> Segments | str:
+    """The segments of a record, or why it is too short for any.
+
+    As long as the memory where the record has enough of such; eight or more fit in the record
+    otherwise. Where a slow mode is remembered for longer, the longest of which there are enough:
+    they hold from two periods in a segment on (Tischler and Remple, 2012), since what is left of
+    the slow mode within one is smooth, and is all but gone at that frequency.
 
     Args:
         samples: of the record.
         dt: between two of them [s].
         memory: how long the machine remembers its input [s].
+        least: segments that make an average.
     """
     most = min(2 ** int(np.log2(max(samples / SEGMENTS, 1.0))), _LONGEST)
-    return max(_needed(dt, memory), most)
+    length, lowest = max(_needed(dt, memory), most), 0.0
+    if _count(samples, length) < least:
+        # Half-overlapping segments take half of (their number + 1) lengths; an even length.
+        length = samples // (least + 1) * 2
+        lowest = 4.0 * np.pi / (length * dt) if length else 0.0
+    if length < SHORTEST:
+        return (
+            f"expected {least} half-overlapping segments of {SHORTEST * dt:.3g} s, a record of "
+            f"{SHORTEST * dt * (least + 1) / 2:.3g} s; got {samples * dt:.3g} s"
+        )
+    return Segments(length, _count(samples, length), lowest)
+
+
+def _count(samples: int, length: int) -> int:
+    return 1 + (samples - length) // (length // 2)
 
 
 def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empirical | str:
@@ -219,27 +253,24 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
         dt: sample time [s].
         memory: how long the machine remembers its input [s].
     """
-    # A segment shorter than the memory answers to what the stick did before it began: the average
-    # is then biased, however many segments there are.
     if not np.std(u) > 0:
         return "the input does not move"
     if np.isnan(y).any():
         return "samples are missing"
-    needed = _needed(dt, memory)
-    length = segment_length(u.size, dt, memory)
-    segments = 1 + (u.size - length) // (length // 2)
-    if segments < SEGMENTS:
-        least = needed * dt * (SEGMENTS + 1) / 2
-        return (
-            f"expected {SEGMENTS} half-overlapping segments of {needed * dt:.3g} s, a record of "
-            f"{least:.3g} s; got {u.size * dt:.3g} s"
-        )
-    omega, Suu, Syy, Suy = spectra(u, y, dt, length)
+    # A segment shorter than the memory answers to what the stick did before it began: the average
+    # is then biased at its lowest frequencies, however many segments there are.
+    segments = segments_of(u.size, dt, memory)
+    if isinstance(segments, str):
+        return segments
+    omega, Suu, Syy, Suy = spectra(u, y, dt, segments.length)
     # Where the input has no power the quotient is rounding alone, and of zero frequency the
     # segments' straight lines left nothing.
-    useful = (omega > 0) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
+    useful = (
+        (omega > 0) & (omega >= _BELOW * segments.lowest) & (Suu > 1e-12 * Suu.max()) & (Syy > 0)
+    )
     omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
-    return Empirical(omega, Suy / Suu, np.abs(Suy) ** 2 / (Suu * Syy), Suu, segments)
+    coherence = np.abs(Suy) ** 2 / (Suu * Syy)
+    return Empirical(omega, Suy / Suu, coherence, Suu, segments.count, segments.lowest)
 
 
 def phase(H: np.ndarray) -> np.ndarray:

@@ -24,7 +24,19 @@ MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
 
 
-_GROUPS = ("response", "residual", "bode", "correlation", "starts", "rls", "intervals")
+_CAPTIONS = {
+    "response": "From above, over time: measured and simulated, what is left between them, inputs.",
+    "residual": "From above, by lag: its correlation with itself, then with each input; of white "
+    "noise 99 % of the lags lie within the band.",
+    "bode": "Magnitude and phase of the fitted model, of the recursive least squares where there "
+    "are some, and of the record where its coherence allows.",
+    "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
+    "starts": "The misfit that each start of the optimiser reached, best first.",
+    "rls": "Each coefficient while the record goes by: one to be trusted settles.",
+    "intervals": "Of each parameter, by every method; the dotted line is the estimate.",
+}
+"""by group, what a figure shows, after its title"""
+_GROUPS = tuple(_CAPTIONS)
 # The template asks for figures by what their names begin with: no group may begin another's name.
 
 
@@ -44,6 +56,12 @@ class Picture(NamedTuple):
     title: str
     data: str
     """SVG in base64"""
+
+    @property
+    def caption(self) -> str:
+        """What the figure shows, and the name of its files."""
+        [words] = [w for group, w in _CAPTIONS.items() if self.name.startswith(group)]
+        return f"{self.title}. {words} (figures/{self.name}.svg, .png)"
 
 
 def write_report(
@@ -163,6 +181,7 @@ def render(
         problem=problem,
         baseline=baseline,
         headline=tables.headline(fit),
+        sentences=tables.further_sentences(fit),
         warnings=tables.warnings(fit),
         remark=tables.model_remark(problem),
         parameters=tables.parameters(fit),

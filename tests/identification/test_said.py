@@ -9,7 +9,8 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, fit
 from heli_jax.identification.identifiability.analysis import analyse
-from heli_jax.identification.identifiability.verdict import Unknown
+from heli_jax.identification.identifiability.sentences import _tied_together
+from heli_jax.identification.identifiability.verdict import Pair, Unknown
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
 
@@ -110,3 +111,39 @@ def test_what_rests_on_its_prior_is_not_called_determined_by_the_data():
     verdict = analyse(sensitivity, unknowns("a", "B", a=100.0))
     assert "The data determine B." in verdict.text
     assert "a rests on its prior" in verdict.text
+
+
+def test_parameters_that_are_correlated_as_a_group_have_one_sentence():
+    # Three change together along one direction, two along another, F alone.
+    rng = np.random.default_rng(0)
+    names = ("a", "Ixx", "Iyy", "Ir", "K", "F")
+    covariance = 1e-6 * np.eye(6)
+    together = np.array([1.0, 1.1, 0.9, 0.0, 0.0, 0.0])
+    other = np.array([0.0, 0.0, 0.0, 1.0, -1.0, 0.0])
+    for direction in (together, other):
+        covariance += 1e-3 * np.outer(direction, direction)
+    root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    # Any rotation of the rows has the same covariance.
+    rotation = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    verdict = analyse(rotation @ root, unknowns(*names))
+    said = [s for s in verdict.sentences if "told apart" in s]
+    assert len(verdict.pairs) == 4
+    assert len(said) == 2
+    assert any(
+        s.startswith("Ir and K can hardly be told apart (correlation -0.99900)") for s in said
+    )
+    [group] = [s for s in said if s.startswith("a, Ixx and Iyy can hardly be told apart")]
+    # The oracle: c_i c_j / sqrt((c_i^2 + e)(c_j^2 + e)), e = 1e-3.
+    c = together[:3]
+    r = [
+        c[i] * c[j] / np.sqrt((c[i] ** 2 + 1e-3) * (c[j] ** 2 + 1e-3))
+        for i in range(3)
+        for j in range(i)
+    ]
+    assert f"correlations of all 3 pairs from {min(r):.5f} to {max(r):.5f} in size" in group
+    assert group.endswith("fix one of a, Ixx, Iyy or give it a prior.")
+
+
+def test_pairs_that_a_later_one_joins_are_one_group():
+    pairs = [Pair("a", "b", 0.999), Pair("c", "d", 0.998), Pair("e", "f", 0.997)]
+    assert _tied_together([*pairs, Pair("b", "c", -0.995)]) == [set("abcd"), set("ef")]

@@ -6,6 +6,7 @@ import matplotlib
 import matplotlib.image
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +15,8 @@ from heli_jax.analysis.lti import c2d
 from heli_jax.dynamics.roll import roll_transfer_function
 from heli_jax.identification.fit import Signals, StartRow
 from heli_jax.identification.validation.metrics import lags_for
-from heli_jax.report import figures, frequency, style
+from heli_jax.report import card, figures, frequency, style
+from heli_jax.report.coherence import Coherence, _spectra
 from heli_jax.report.frequency import FittedFlight
 
 
@@ -150,6 +152,32 @@ def test_record_shows_the_machine_and_lies_on_the_fit_s_branch(bench30):
     assert clear.sum() > 5
     assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.1)
     assert np.median(np.degrees(np.angle(ratio))) == pytest.approx(0.0, abs=8.0)
+
+
+def test_a_slow_mode_leaves_the_response_from_two_periods_of_a_segment_on():
+    dt, n = 0.04, 3000
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)
+    # A spiral of 0.013 1/s beside a roll of 2 1/s: the record is remembered whole.
+    b, a, _ = scipy.signal.cont2discrete(([1.0, 1.0], np.polymul([1.0, 0.013], [1.0, 2.0])), dt)
+    y = scipy.signal.lfilter(np.ravel(b), a, u)
+    noisy = y + 0.01 * np.std(y) * rng.standard_normal(n)
+    response = frequency.empirical(u, noisy, dt, 4.0 / 0.013)
+    assert isinstance(response, frequency.Empirical)
+    # The longest even segments of which eight fit: 2 (N // 9) samples.
+    assert response.lowest == pytest.approx(4.0 * np.pi / (666 * dt))
+    assert response.omega[0] == pytest.approx(response.lowest)
+    assert response.segments == frequency.SEGMENTS
+    low = response.omega < 4.0
+    assert low.sum() > 5
+    _, exact = scipy.signal.freqz(np.ravel(b), a, response.omega[low] * dt)
+    assert response.coherence[low].min() > 0.85
+    np.testing.assert_allclose(np.abs(response.H[low] / exact), 1.0, atol=0.15)
+    s = Signals("f", False, np.arange(n) * dt, {"u": u}, {"y": noisy}, {"y": y})
+    found = _spectra(s, ["u"], "y", dt, 4.0 / 0.013)
+    assert found.omega[0] == pytest.approx(found.lowest) == pytest.approx(response.lowest)
+    said = card._of_coherence("u to y", Coherence(0.9, 0.9, 0.5, 8, 0, found.lowest))
+    assert f"from {found.lowest:.2g} rad/s on" in said.remark
 
 
 def test_empirical_response_says_why_it_is_missing():

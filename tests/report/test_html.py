@@ -87,6 +87,33 @@ def test_verdict_comes_first(sound_page):
     assert text.count("Estimates") >= 1
 
 
+def test_the_headline_is_not_said_twice(sound, sound_page, tmp_path):
+    assert words(sound_page[0]).count("the data determine Ixx and If") == 1
+    assert "The data determine Ixx and If" not in words(sound_page[0])
+    fit = sound[0]
+    verdict = dataclasses.replace(
+        fit.verdict,
+        identifiable=False,
+        undetermined=("If",),
+        sentences=(
+            "The data do not determine If: fix If or give it a prior.",
+            "The data determine Ixx.",
+        ),
+    )
+    text = words(page(sound, tmp_path, status="not-identifiable", verdict=verdict)[0])
+    assert text.lower().count("the data do not determine if") == 1
+    assert "Fix If or give it a prior." in text
+    assert "The data determine Ixx." in text
+
+
+def test_captions_are_words(sound_page):
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", sound_page[0])
+    assert len(captions) == len(sound_page[1])
+    for name in sound_page[1]:
+        [caption] = [c for c in captions if f"(figures/{name}.svg, .png)" in c]
+        assert len(caption.split()) > 8
+
+
 def test_paper_s_factor_is_told(sound_page):
     assert "cyclic_moment" in words(sound_page[0])
 

@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     relaxed_from,
 )
 from heli_jax.identification.estimation.noise_search import noise_guess_at
-from heli_jax.identification.unknowns.layout import Layout, Noise, disturbance_limits
+from heli_jax.identification.unknowns.layout import Layout, disturbance_limits, unpack
 
 NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
@@ -41,7 +41,7 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
         return optimum
     without = without_disturbance(search, optimum)
     alone = evaluate(layout, data, without.noise, without.best.z)
-    if bool(np.isfinite(alone.r).all()) and not _corrects(alone, without.noise):
+    if bool(np.isfinite(alone.r).all()) and not _corrects(search, without, alone):
         likelihood = layout.estimator.log_likelihood(layout, data, without.noise, alone)
         ratio = 2.0 * (layout.estimator.log_likelihood(layout, data, optimum.noise, e) - likelihood)
         # Negated comparisons: a ratio that is NaN is none that speaks for a disturbance.
@@ -167,15 +167,22 @@ def with_noise_guess(search: Search, optimum: RelaxedOptimum) -> Float[Array, " 
     return noise_guess_at(layout, search.data, optimum.noise, z)
 
 
-def _corrects(e: Evaluation, noise: Noise) -> bool:
+def _corrects(search: Search, without: RelaxedOptimum, e: Evaluation) -> bool:
     """Whether the filter corrects its state even where there is no disturbance.
 
     It does in an unstable model, whose error grows from nothing: that is no output error.
+
+    Args:
+        search: the optimiser over the problem.
+        without: the optimum without a disturbance.
+        e: at that optimum.
     """
+    # The noise of each output but the first has a factor of its own among the unknowns.
+    scales = unpack(search.layout, search.data, without.best.z).scales
     # Without a state to correct the innovation's variance is that of the measurement.
     return any(
-        float(np.nanmax(s / sd[n] ** 2)) > 1.01
-        for flight, sd in zip(e.innovations, noise.sd, strict=True)
+        float(np.nanmax(s / (sd[n] * float(scales.get(n, 1.0))) ** 2)) > 1.01
+        for flight, sd in zip(e.innovations, without.noise.sd, strict=True)
         for n, s in flight.variance.items()
     )
 

@@ -95,12 +95,38 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
 
 
 def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:
-    return [
-        f"{pair.first} and {pair.second} can hardly be told apart (correlation "
-        f"{pair.correlation:+.5f}): {way_out((pair.first, pair.second), facts, 1)}."
-        for pair in facts.pairs
-        if not {pair.first, pair.second} <= covered
-    ]
+    """One sentence for every group of parameters that correlated pairs tie together."""
+    pairs = [pair for pair in facts.pairs if not {pair.first, pair.second} <= covered]
+    lines = []
+    for names in _tied_together(pairs):
+        inside = [pair for pair in pairs if pair.first in names]
+        ordered = [u.name for u in facts.unknowns if u.name in names]
+        how = f"correlation {inside[0].correlation:+.5f}"
+        if len(inside) > 1:
+            members = len(names) * (len(names) - 1) // 2
+            count = f"all {members}" if len(inside) == members else f"{len(inside)} of {members}"
+            sizes = [abs(pair.correlation) for pair in inside]
+            how = f"correlations of {count} pairs from {min(sizes):.5f} to {max(sizes):.5f} in size"
+        lines.append(
+            f"{listed(ordered)} can hardly be told apart ({how}): "
+            f"{way_out(tuple(ordered), facts, 1)}."
+        )
+    return lines
+
+
+def _tied_together(pairs: list[Pair]) -> list[set[str]]:
+    """The connected components of a graph whose edges are the pairs, in the pairs' order."""
+    groups: list[set[str]] = []
+    for pair in pairs:
+        both = {pair.first, pair.second}
+        touched = [group for group in groups if group & both]
+        if not touched:
+            groups.append(both)
+            continue
+        # A pair may join two groups that had nothing in common until now.
+        touched[0].update(both, *touched[1:])
+        groups = [group for group in groups if group not in touched[1:]]
+    return groups
 
 
 def _leaning_on_weak_priors(facts: Facts, not_determined: set[str]) -> list[str]:

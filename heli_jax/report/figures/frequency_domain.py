@@ -157,6 +157,8 @@ def _draw_record(
     axes[2].set_ylabel("coherence")
     # Short: with the operating point before it, the note must fit the figure's width.
     note = f"record: {record.segments} segments, coherence > {COHERENT}"
+    if record.lowest:
+        note += f", from {record.lowest:.2g} rad/s"
     if not coherent.any():
         note = f"no empirical response: coherence stays below {COHERENT}"
     # H = Suy / Suu is that of this input alone only where the others are uncorrelated with it.

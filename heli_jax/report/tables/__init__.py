@@ -13,7 +13,14 @@ from heli_jax.report.tables.estimates import (
     verdict,
 )
 from heli_jax.report.tables.first_guess import first_guess, selection_steps
-from heli_jax.report.tables.headline import Headline, adequate, headline, model_remark, warnings
+from heli_jax.report.tables.headline import (
+    Headline,
+    adequate,
+    further_sentences,
+    headline,
+    model_remark,
+    warnings,
+)
 from heli_jax.report.tables.provenance import Origin, constants, origins
 from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
 
@@ -32,6 +39,7 @@ __all__ = [
     "combinations",
     "constants",
     "first_guess",
+    "further_sentences",
     "headline",
     "intervals",
     "model_remark",

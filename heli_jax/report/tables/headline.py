@@ -32,6 +32,22 @@ def headline(fit: Fit) -> Headline:
     return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
 
 
+def further_sentences(fit: Fit) -> list[str]:
+    """The sentences of the verdict without what the headline has said already."""
+    said, lines = _determined(fit).text, []
+    for sentence in fit.verdict.sentences:
+        # Both begin with "the data": one of them as a sentence, the other after a colon.
+        words = f"t{sentence[1:]}" if sentence.startswith("The ") else sentence
+        claim, colon, remedy = words.removesuffix(".").partition(": ")
+        # Up to its end or a comma: "the data determine a" is not said by "... determine a and b".
+        repeated = said == claim or said.startswith(f"{claim}, but ")
+        if not repeated:
+            lines.append(sentence)
+        elif colon:
+            lines.append(f"{remedy[0].upper()}{remedy[1:]}.")
+    return lines
+
+
 def adequate(fit: Fit) -> str:
     """`yes`, `no (...)`; what stopped before an optimum and looks adequate was not judged."""
     return "not judged" if adequate_unjudged(fit) else fit.adequacy.summary
