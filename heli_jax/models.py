@@ -34,10 +34,11 @@ __all__ = [
 ]
 
 # By the names that a configuration, fit.json and the report use; in Python the names are
-# attributes. `helicopter-consistent` is the name that reports gave to `helicopter` before.
+# attributes. `helicopter-full` is the name that reports gave to `helicopter` before.
 _SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
-_HELICOPTERS: dict[str, Literal["paper", "consistent"]] = {
-    "helicopter": "consistent",
+_HELICOPTERS: dict[str, Literal["paper", "consistent", "full"]] = {
+    "helicopter": "full",
+    "helicopter-full": "full",
     "helicopter-consistent": "consistent",
     "helicopter-paper": "paper",
 }

@@ -31,7 +31,8 @@ def load(tmp_path):
     ("name", "model"),
     [
         ("helicopter", "helicopter"),
-        ("helicopter-consistent", "helicopter"),
+        ("helicopter-full", "helicopter"),
+        ("helicopter-consistent", "helicopter-consistent"),
         ("helicopter-paper", "helicopter-paper"),
     ],
 )
