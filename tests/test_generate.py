@@ -119,7 +119,7 @@ def test_a_pilot_cannot_fly_a_late_stick(made, monkeypatch):
     late = dataclasses.replace(models.helicopter("consistent"), delays=(("x_roll", "Ixx"),))
     load = configuration.load
     monkeypatch.setattr(configuration, "load", lambda p: load(p)._replace(model=late))
-    with pytest.raises(InputError, match="hold_attitude: .* without delays .* got one of x_roll"):
+    with pytest.raises(InputError, match=r"hold_attitude: .* without delays .* got one of x_roll"):
         made(hold_attitude=True)
 
 
