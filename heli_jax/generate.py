@@ -211,6 +211,12 @@ def _run(
 
 def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, where: str) -> None:
     if is_full_nonlinear(experiment.model):
+        late = [n for n, _ in experiment.model.delays]
+        if settings.hold_attitude and late:
+            raise InputError(
+                f"{where}.hold_attitude: expected a model without delays of inputs, got one of "
+                f"{', '.join(late)}"
+            )
         return
     keys = {
         "start": settings.start is not None,
@@ -221,7 +227,7 @@ def _check_full_nonlinear(experiment: Experiment, settings: SimulateConfig, wher
     for name in (n for n, given in keys.items() if given):
         raise InputError(
             f"{where}.{name}: model {experiment.model.name} is not the full nonlinear model, "
-            "expected model: helicopter or helicopter-paper"
+            "expected model: helicopter, helicopter-consistent or helicopter-paper"
         )
 
 

@@ -1,5 +1,6 @@
 """Runs of the whole helicopter by configuration: trimmed start, wind, pilot, ground, limits."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import yaml
 
 from heli_jax import config as configuration
-from heli_jax import generate
+from heli_jax import generate, models
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 
@@ -112,6 +113,14 @@ def test_keys_of_the_whole_helicopter_alone(made, key):
         InputError, match=rf"simulate.{next(iter(key))}: model roll is not the full"
     ):
         made(model="roll", **key)
+
+
+def test_a_pilot_cannot_fly_a_late_stick(made, monkeypatch):
+    late = dataclasses.replace(models.helicopter("consistent"), delays=(("x_roll", "Ixx"),))
+    load = configuration.load
+    monkeypatch.setattr(configuration, "load", lambda p: load(p)._replace(model=late))
+    with pytest.raises(InputError, match=r"hold_attitude: .* without delays .* got one of x_roll"):
+        made(hold_attitude=True)
 
 
 def test_a_vehicle_without_what_the_model_needs(tmp_path):

@@ -194,7 +194,7 @@ def flight():
     return Flight(dt=0.05, inputs={"aileron": u}, outputs={"roll_rate": np.cos(t)})
 
 
-def said_by(function, *arguments, error=ValueError, **how):
+def said_by(function, *arguments, error: type[Exception] = ValueError, **how):
     with pytest.raises(error) as e:
         function(*arguments, **how)
     assert type(e.value) is error

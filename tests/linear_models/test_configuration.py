@@ -169,4 +169,5 @@ def test_the_log_of_a_model_with_a_delay_gives_the_delay_back(written, tmp_path)
     estimates = fit(configuration.problem(configuration.load(path))).estimates
     for name, truth in {"tau": 0.13, "Zw": -0.6141, "Zcol": -45.84 * 0.3048}.items():
         estimate = estimates[name]
+        assert estimate.sd is not None
         assert abs(estimate.value - truth) < 3 * estimate.sd < 0.1 * abs(truth)
