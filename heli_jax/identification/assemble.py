@@ -28,6 +28,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
     bound_notes,
+    delay_notes,
     estimates_of,
     extreme_noise_notes,
     flight_nuisances,
@@ -262,6 +263,7 @@ def _notes(
         *stated_noise_notes(problem, numbers.noise),
         *_correlation_notes(correlated),
         *bound_notes(numbers.of_interest),
+        *delay_notes(problem, numbers.of_interest),
         *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),
     ]

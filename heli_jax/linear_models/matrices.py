@@ -67,9 +67,6 @@ def not_possible(
     for name, quantity in content.parameters.items():
         if quantity.positive and not values[name] > 0:
             return f"{name}: expected more than zero (positive: true), got {values[name]:g}"
-    for input_name, name in content.delays:
-        if values[name] < 0:
-            return f"{name}: expected a delay of {input_name} of zero or more, got {values[name]:g}"
     for entry in (one for entries in matrices.values() for one in entries):
         if not math.isfinite(_value(entry, values)):
             return f"{entry.place}: not finite with the parameters' values"

@@ -194,10 +194,9 @@ def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
 def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
     if isinstance(coherence, str):
         return Gate("coherence", of, math.nan, "", "", None, coherence)
-    remark = f"weighted by the expected response, {coherence.segments} segments"
     # Of what lies below nothing is said: segments of this record are too short for it.
-    if coherence.lowest:
-        remark += f", from {coherence.lowest:.2g} rad/s on"
+    band = f"; from {coherence.lowest:.2g} rad/s on" if coherence.lowest else ""
+    remark = f"weighted by the expected response, {coherence.segments} segments"
     what = "partial coherence" if coherence.others else "coherence"
     if not coherence.asked:
         remark = (
@@ -208,5 +207,5 @@ def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
         # than one of them, a nonlinear machine), and no measurement could have more.
         remark = f"not asked: in the simulation it is {coherence.expected:.2g} too"
     else:
-        return _least(what, of, coherence.value, "", COHERENCE, remark)
-    return Gate(what, of, coherence.value, "", "", None, remark)
+        return _least(what, of, coherence.value, "", COHERENCE, remark + band)
+    return Gate(what, of, coherence.value, "", "", None, remark + band)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Problem, fit
+from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
 from heli_jax.naming import Scalar, asdict
@@ -71,12 +71,13 @@ def fitted(seed: int, disturbance: float = 0.0):
     params = MODEL.Params(**{**asdict(Params(**start)), **noise})
     flight = Flight(dt=DT, inputs={"d": u}, outputs=outputs)
     free = {"L": Free(-1.5), "B": Free(2.0)}
-    return fit(Problem(MODEL, params, [flight], free, method="filter-error"))
+    # From rest and without biases, as it was made: fewer unknowns compile sooner.
+    none = Nuisance(initial_state=False, bias=False, input_offset=False)
+    return fit(Problem(MODEL, params, [flight], free, none, method="filter-error"))
 
 
-# Of seeds 0 to 99 two do not say so; held against the noise of the first output, 17 of the first 22
-# did not.
-@pytest.mark.parametrize("seed", range(6))
+# Without the outputs' own factors, four of the first twenty said so; with them 57 of the first 60.
+@pytest.mark.parametrize("seed", range(8))
 def test_white_noise_of_four_outputs_has_no_disturbance(seed):
     found = fitted(seed)
     assert any("No disturbance shows" in note for note in found.notes)

@@ -1,6 +1,7 @@
 """Files of linear models: what they become, units, and what is refused."""
 
 import copy
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,30 @@ def test_a_delayed_input_acts_late(read):
     plain = simulate(at_once.model, params, at_once.model.Inputs(lon=shifted), dt=0.1).states
     for name in naming.names(found.model.State):
         np.testing.assert_allclose(getattr(late, name), getattr(plain, name), rtol=1e-9, atol=1e-12)
+
+
+def test_a_negative_delay_acts_early_unless_it_is_positive(read):
+    """In the file and in a vehicle alike."""
+
+    def early(**quantity):
+        def change(content):
+            content["parameters"]["lead"] = {"value": -0.2, "unit": "s", **quantity}
+            content["delays"] = {"lon": "lead"}
+
+        return change
+
+    found = read(early())
+    params, stick = found.vehicle().params, np.random.default_rng(0).standard_normal(40)
+    assert float(params.lead) == -0.2
+    assert float(found.vehicle({"lead": -0.3}).params.lead) == -0.3
+    run = simulate(found.model, params, found.model.Inputs(lon=stick), dt=0.1).states
+    shifted = found.model.Inputs(lon=np.concatenate([stick[2:], np.full(2, stick[-1])]))
+    plain = dataclasses.replace(found.model, delays=())
+    at_once = simulate(plain, params, shifted, dt=0.1).states
+    for name in naming.names(found.model.State):
+        np.testing.assert_allclose(getattr(run, name), getattr(at_once, name), atol=1e-9)
+    with pytest.raises(InputError, match="lead: expected more than zero"):
+        read(early(positive=True))
 
 
 def test_axes_go_by_the_names_of_states_or_are_stated(read):

@@ -43,7 +43,7 @@ def _unknown(problem: Problem, name: str, value: float) -> Unknown:
     prior = reference / free.prior.sd if free.prior else 0.0
     # What a parameter may plausibly do: by its prior, or half its interval.
     scale = 1.0 / prior if prior else _interval(free.lower, free.upper, log)
-    symmetric = transforms.changes_sign(free)
+    symmetric = _through_zero(problem, name)
     # A coordinate in units of the reference becomes log |value| by the reference over the value.
     per_log = reference / abs(value) if symmetric and log else 1.0
     return Unknown(name, value, log, scale, prior, per_log=per_log, symmetric=symmetric)
@@ -64,11 +64,24 @@ def _reference(problem: Problem, name: str, value: float) -> tuple[float, bool]:
     # Between bounds of both signs neither a logarithm nor the start's size means anything.
     if low is not None and high is not None and low < 0 < high:
         return 0.5 * (high - low), False
-    if transforms.changes_sign(free):
+    if _through_zero(problem, name):
         # A value near zero is known as soon as it is known to be small beside the start.
         size = max(abs(value), transforms.scale(free))
+        if name in problem.model.delay_parameters:
+            # Or beside a sample, however small a delay the search began with.
+            size = max(size, problem.training[0].dt)
         return size, abs(value) > _NEAR_ZERO * size
     return abs(value), True
+
+
+def _through_zero(problem: Problem, name: str) -> bool:
+    """Whether zero is as good a value as any: where the sign may change, and of every delay.
+
+    A delay that is searched as a positive number may still be none at all. Its logarithm then says
+    nothing of it, while the delay itself is bounded by the record.
+    """
+    late = name in problem.model.delay_parameters
+    return late or transforms.changes_sign(problem.free[name])
 
 
 def references_of(problem: Problem, unknowns: tuple[Unknown, ...]) -> np.ndarray:

@@ -9,6 +9,7 @@ from heli_jax.identification.identifiability.sensitivity import references_of, u
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import (
     Data,
     Layout,
@@ -53,6 +54,9 @@ def estimates_of(
         white = float(np.sqrt(verdict.covariance[i, i]))
         relative = white * float(wider[i])
         sd, low, high = _interval95(u, relative, references[i], float(quantiles[i]))
+        if free is not None and u.name in problem.model.delay_parameters:
+            # Symmetric, as that of what may be zero; what it was not searched for it cannot be.
+            low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
         not_identifiable = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
         estimates[u.name] = Estimate(
@@ -124,6 +128,32 @@ def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
         for name, estimate in estimates.items()
         if estimate.at_bound
     ]
+
+
+def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
+    """Where a delay may be none, or is negative.
+
+    Args:
+        problem: its model says which parameters are delays.
+        estimates: of the free parameters.
+    """
+    notes = []
+    for name in problem.model.delay_parameters:
+        estimate = estimates.get(name)
+        if estimate is None or estimate.lower95 is None or estimate.upper95 is None:
+            continue
+        if estimate.upper95 < 0:
+            notes.append(
+                f"{name} is negative: its signal acts before the log has it. The clocks of inputs "
+                "and outputs differ, or the input does something else between samples than was "
+                "stated (hold)."
+            )
+        elif estimate.lower95 <= 0:
+            notes.append(
+                f"{name} cannot be told from zero: with 95 % probability it is below "
+                f"{estimate.upper95:.3g} s."
+            )
+    return notes
 
 
 _FAR = 3.0
