@@ -388,8 +388,7 @@ def _new_model(options: argparse.Namespace) -> int:
     from heli_jax.new_model import write_skeleton
 
     written = write_skeleton(options.name, options.out)
-    for path in written:
-        print(path)
+    print(*written, sep="\n")
     _say(
         f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
         f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"

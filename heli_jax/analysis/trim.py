@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from heli_jax import naming
 from heli_jax.analysis.trim_guess import first_guess
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing, zeros
+from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing
 from heli_jax.vehicle import of_helicopter
 
 STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0), "x_collective": (-1.0, 1.0)}
@@ -208,34 +208,25 @@ def _equilibrium(
     guess, scale = first_guess(model, params, condition.climb, power_off)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
     scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
-    cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
+    ground = _along_the_ground(condition)
 
     def point(z: Array, parameters: Any) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
-        # Speeds are along the heading, the states along the axes of the ground.
         fixed = {
-            "psi": condition.heading,
-            "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,
-            "dy": condition.forward_speed * spsi + condition.lateral_speed * cpsi,
+            **ground,
             "dz": values.get("climb", condition.climb),
             # An unknown only where one stick has to do for collective and throttle.
             "Omega": parameters.Omega,
+            "x_throttle": 0.0,
         }
-        fixed = {n: v for n, v in fixed.items() if n in naming.names(model.State)}
-        values = {"Omega": parameters.Omega, "x_throttle": 0.0, **values}
-        state = naming.replace(
-            zeros(model.State, dtype),
-            **{
-                n: jnp.asarray(v, dtype)
-                for n, v in {**fixed, **values}.items()
-                if n in naming.names(model.State)
-            },
+        air = {f"wind_{a}": w for a, w in zip("xyz", wind, strict=True)}
+        values = {**fixed, **air, **values}
+        state = {n: values.get(n, 0.0) for n in naming.names(model.State)}
+        inputs = {n: values[n] for n in naming.names(model.Inputs)}
+        return (
+            model.State(**{n: jnp.asarray(v, dtype) for n, v in state.items()}),
+            model.Inputs(**{n: jnp.asarray(v, dtype) for n, v in inputs.items()}),
         )
-        air = {f"wind_{a}": jnp.asarray(w, dtype) for a, w in zip("xyz", wind, strict=True)}
-        inputs = model.Inputs(
-            **{n: jnp.asarray({**air, **values}[n], dtype) for n in naming.names(model.Inputs)}
-        )
-        return state, inputs
 
     def fn(xi: Array, parameters: Any) -> Array:
         state, inputs = point(scales * xi, parameters)
@@ -259,6 +250,17 @@ def _equilibrium(
     xi, _ = jax.lax.scan(polish, xi, None, length=_POLISH)
     state, inputs = point(scales * xi, params)
     return Trim(state, inputs, jnp.max(jnp.abs(fn(xi, params))))
+
+
+def _along_the_ground(condition: Condition) -> dict[str, Any]:
+    """The heading and the velocities along the axes of the ground."""
+    # Speeds of a condition are along the heading.
+    cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
+    return {
+        "psi": condition.heading,
+        "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,
+        "dy": condition.forward_speed * spsi + condition.lateral_speed * cpsi,
+    }
 
 
 def steady_flight(model: Model) -> SteadyFlight | None:

@@ -41,7 +41,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
-from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
+from heli_jax.identification.validation.feedback import Feedback, feedback_notes, feedback_of
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
@@ -147,7 +147,6 @@ def assemble(
     # The optimiser keeps only what it minimises; signals and Jacobian are those of its last point.
     e = evaluate(layout, data, noise, best.z)
     signals, absent = signals_of(e, problem.training), _absent_names(layout, optimum)
-    none = bool(layout.disturbance) and set(layout.disturbance) <= set(absent)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
@@ -158,13 +157,14 @@ def assemble(
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
     # A perfect model's simulation would leave what the disturbance makes; without one it would not.
-    against = None if none else layout.estimator.against_expected(layout, data, noise, e, best.z)
-    found = feedback_of(problem)
-    closed_loop = feedback_notes(problem, found, all(w.white for w in white.values()))
+    disturbed = not layout.disturbance or not set(layout.disturbance) <= set(absent)
+    against = (
+        layout.estimator.against_expected(layout, data, noise, e, best.z) if disturbed else None
+    )
+    found, closed_loop = _feedback(problem, white)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
-    # Where the model is inadequate its own sentences say more.
-    missing = _missing(problem, signals) if adequacy.adequate and not all_white else []
+    missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -198,8 +198,21 @@ def assemble(
     )
 
 
-def _missing(problem: Problem, signals: tuple[Signals, ...]) -> list[str]:
+def _feedback(
+    problem: Problem, white: dict[str, Whiteness]
+) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
+    """Whether inputs follow the outputs, and what is to be said of it."""
+    found = feedback_of(problem)
+    return found, tuple(feedback_notes(problem, found, all(w.white for w in white.values())))
+
+
+def _missing(
+    problem: Problem, signals: tuple[Signals, ...], adequacy: Adequacy
+) -> list[str] | tuple[()]:
     """What inputs still explain of the residuals (innovations)."""
+    # Where the model is inadequate its own sentences say more.
+    if not adequacy.adequate:
+        return ()
     return missing_dynamics(
         tuple(
             Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)

@@ -94,6 +94,15 @@ def check(problem: Problem) -> Check:
     return Check(verdict, sds, tuple(notes), guessed)
 
 
+def _starts(
+    guess: _FirstGuess, problem: Problem, starts: int | None, seed: int
+) -> Float[Array, "s q"]:
+    """Where the optimiser begins, as `fit` says of its argument."""
+    if starts is None:
+        return delay_starts(guess.layout, problem, guess.z, seed)
+    return starting.draw(guess.layout, problem, guess.z, starts, seed)
+
+
 def fit(
     problem: Problem,
     *,
@@ -128,10 +137,7 @@ def fit(
     # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
     before = verdict_of(problem, layout, guess.e)
     report(f"fitting {', '.join(layout.of_interest)}")
-    if starts is None:
-        points = delay_starts(layout, problem, guess.z, seed)
-    else:
-        points = starting.draw(layout, problem, guess.z, starts, seed)
+    points = _starts(guess, problem, starts, seed)
     disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.

@@ -44,7 +44,6 @@ def fit_json(
         supplementary: model selection and further intervals, where they were asked for.
     """
     # Keys are a public format: programs read them, and `load_fit`. Old ones stay.
-    whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
     return _plain(
         {
             "status": fit.status,
@@ -74,10 +73,7 @@ def fit_json(
             "bic": fit.bic,
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
-            "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
-            "feedback": [
-                {**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback
-            ],
+            **_residuals(fit),
             "baseline_rls": _baseline(baseline),
             "equation_error_start": _first_guess(problem),
             "starts": [row._asdict() for row in fit.starts],
@@ -90,6 +86,15 @@ def fit_json(
             "seed": fit.seed,
         }
     )
+
+
+def _residuals(fit: Fit) -> dict[str, Any]:
+    """Whether they are white, and whether inputs follow what they stand for."""
+    whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
+    return {
+        "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
+        "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
+    }
 
 
 def _first_guess(problem: Problem) -> dict[str, Any] | None:
