@@ -69,8 +69,9 @@ def generate(experiment: Experiment) -> Simulated:
     rng = np.random.default_rng(settings.seed)
     n = round(settings.duration * settings.rate)
     drawn = experiment.config.disturbance
-    if drawn is not None and (drawn.sigma_w is None or drawn.tau_w is None):
-        raise InputError(f"{experiment.path}: disturbance: simulate needs its sigma_w and tau_w")
+    if drawn is not None and None in drawn.parameters.values():
+        needed = " and ".join(drawn.parameters)
+        raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
     # What can be refused is refused before the run, which takes longest.
     _check_outputs(experiment, settings, where)
     driven = stick_inputs(experiment, settings, n, rng, where)
@@ -186,7 +187,7 @@ def _run(
             dt=1.0 / settings.rate,
             initial_state=x,
             substeps=substeps_for(1.0 / settings.rate),
-            key=jax.random.key(settings.seed) if experiment.config.disturbance else None,
+            key=jax.random.key(settings.seed) if model.noise_intensity else None,
             feedback=pilot,
             events=ends or None,
         )
@@ -287,8 +288,10 @@ def _stick_notes(experiment: Experiment, run: Trajectory, flown: np.ndarray) -> 
         return []
     notes = []
     for name, (low, high) in STICKS.items():
+        if not hasattr(run.inputs, name):
+            continue
         stick = np.asarray(getattr(run.inputs, name))[flown]
-        beyond = (stick < low) | (stick > high)
+        beyond = (stick < low - _MIDDLE) | (stick > high + _MIDDLE)
         if beyond.any():
             first = run.times[np.argmax(beyond)]
             notes.append(f"{name} is beyond its ends of {low:g} and {high:g}, first at {first:g} s")

@@ -36,8 +36,8 @@ __all__ = [
 # By the names that a configuration, fit.json and the report use; in Python the names are
 # attributes.
 _SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
-_HELICOPTERS: dict[str, Literal["paper", "consistent"]] = {
-    "helicopter": "consistent",
+_HELICOPTERS: dict[str, Literal["paper", "consistent", "full"]] = {
+    "helicopter": "full",
     "helicopter-consistent": "consistent",
     "helicopter-paper": "paper",
 }

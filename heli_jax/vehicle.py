@@ -30,9 +30,9 @@ def _scalar(value: Any) -> Any:
 
 
 # Any, since a field's default stands where the class says Scalar.
-def _field(default: float | None = None) -> Any:
+def _field(default: float | None = None, *, kw_only: bool = False) -> Any:
     if default is None:
-        return eqx.field(converter=_scalar)
+        return eqx.field(converter=_scalar, kw_only=kw_only)
     return eqx.field(converter=_scalar, default=default)
 
 
@@ -48,18 +48,23 @@ class Helicopter(eqx.Module):
     # What the reduced roll model reads has no default; what only the whole helicopter reads is NaN
     # until it is given, and `needed_but_missing` says so.
     Ixx: Annotated[Scalar, "kg m^2", "fuselage inertia about the roll axis"] = _field()
-    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field()
-    R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field()
-    c: Annotated[Scalar, "m", "main rotor blade chord"] = _field()
-    a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field()
-    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _field()
-    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _field()
-    L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
-    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
-    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
-    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field()
-    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _field()
-    Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field()
+    If: Annotated[Scalar, "kg m^2", "flybar inertia in flapping"] = _field(math.nan)
+    R: Annotated[Scalar, "m", "length of a main rotor blade"] = _field(kw_only=True)
+    c: Annotated[Scalar, "m", "main rotor blade chord"] = _field(kw_only=True)
+    a: Annotated[Scalar, "1/rad", "main rotor lift slope"] = _field(kw_only=True)
+    # What a machine without a flybar has not.
+    R1: Annotated[Scalar, "m", "rotor axis to the inner end of the flybar paddle"] = _field(
+        math.nan
+    )
+    R2: Annotated[Scalar, "m", "rotor axis to the outer end of the flybar paddle"] = _field(
+        math.nan
+    )
+    L1: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(kw_only=True)
+    L2: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
+    L3: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
+    L4: Annotated[Scalar, "m", "linkage length, eq. 11"] = _field(math.nan)
+    L5: Annotated[Scalar, "m", "linkage length, eq. 12"] = _field(math.nan)
+    Omega: Annotated[Scalar, "rad/s", "main rotor speed"] = _field(kw_only=True)
     rho: Annotated[Scalar, "kg/m^3", "air density"] = _field(1.2)
     g: Annotated[Scalar, "m/s^2", "gravitational acceleration"] = _field(9.80665)
     # Eq. 10's B = 0.97: lift ends at 97 % of the blade.
@@ -89,6 +94,17 @@ class Helicopter(eqx.Module):
     Sz: Annotated[Scalar, "m^2", "fuselage drag area from above, beyond the paper"] = _field(0.0)
     Ixx_added: Annotated[Scalar, "kg m^2", "known inertia added to Ixx"] = _field(0.0)
     Iyy_added: Annotated[Scalar, "kg m^2", "known inertia added to Iyy"] = _field(0.0)
+    I_beta: Annotated[Scalar, "kg m^2", "blade inertia in flapping"] = _field(math.nan)
+    k_beta: Annotated[Scalar, "N m/rad", "stiffness of the main rotor's hub"] = _field(math.nan)
+    # Blade-element theory has 1; measured machines tilt less.
+    K_mu: Annotated[Scalar, "1", "speed stability over blade-element theory's"] = _field(1.0)
+    h_T: Annotated[Scalar, "m", "tail rotor above the centre of gravity"] = _field(0.0)
+    K_P: Annotated[Scalar, "s/rad", "governor: throttle per error of rotor speed"] = _field(
+        math.nan
+    )
+    K_I: Annotated[Scalar, "1/rad", "governor: throttle rate per error of rotor speed"] = _field(
+        math.nan
+    )
     kappa: Annotated[Scalar, "1/s^2", "stand stiffness over own inertia"] = _field(0.0)
     zeta: Annotated[Scalar, "1/s", "stand damping over own inertia"] = _field(0.0)
     # Four times what blade-element theory gives for two blades over a turn: see
@@ -113,8 +129,11 @@ class Helicopter(eqx.Module):
 
 # A vehicle may leave out what the model at hand does not read; what it gives must be possible.
 # Gains have the sign of how a servo is mounted, and hr and lr that of where a rotor stands.
-_MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "a_T"}
-_MAY_BE_ZERO = {"Sx", "Sy", "Sz", "Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g"}
+_MAY_BE_NEGATIVE = {"K_theta0T", "K_theta0", "lr", "hr", "h_T", "a_T"}
+_MAY_BE_ZERO = {
+    "Sx", "Sy", "Sz", "Ixx_added", "Iyy_added", "kappa", "zeta", "Cd0", "g",
+    "k_beta", "K_mu", "K_I",
+}  # fmt: skip
 
 
 def of_helicopter(record: type) -> bool:

@@ -229,7 +229,7 @@ WRONG = {
         lambda c: (
             c["disturbance"].update(axis="pitch"), c["fit"].update(method="filter-error"),
         ),
-        ["disturbance", "no axis 'pitch'", "roll"],
+        ["disturbance", "no axis or state 'pitch'", "roll"],
     ),
     "negative disturbance": (
         lambda c: c["disturbance"].update(sigma_w=-1.0), ["disturbance.sigma_w", "-1"],

@@ -30,7 +30,7 @@ def load(tmp_path):
 @pytest.mark.parametrize(
     ("name", "model"),
     [
-        ("helicopter", "helicopter-consistent"),
+        ("helicopter", "helicopter-full"),
         ("helicopter-consistent", "helicopter-consistent"),
         ("helicopter-paper", "helicopter-paper"),
     ],
@@ -64,7 +64,7 @@ def test_a_slow_log_gets_more_steps_a_sample(load, tmp_path):
 def test_corrections_switch_on_and_off(load):
     some = load(model="helicopter-paper", corrections={"tail": True, "drag": False})
     assert some.model.name == "helicopter-paper+tail"
-    assert load("corrections.drag=false").model.name == "helicopter-consistent-drag"
+    assert load("corrections.drag=false").model.name == "helicopter-full-drag"
     again = load(model="helicopter-paper", corrections={"drag": False, "tail": True})
     assert again.model is some.model
     assert configuration.resolved(some)["corrections"] == {"tail": True, "drag": False}

@@ -77,7 +77,7 @@ class Mode(NamedTuple):
     eigenvalue: complex
     """[1/s]; of a pair the one with the positive imaginary part"""
     name: str
-    """what moves most, as 'roll with flybar roll'"""
+    """what moves most, as 'roll with flybar roll', or 'phugoid'"""
     frequency: float
     """undamped, |eigenvalue| [rad/s]"""
     damping: float
@@ -89,7 +89,7 @@ class Mode(NamedTuple):
 # Which motion a state that belongs to no axis is of; others stand for themselves.
 _MOTIONS = {
     "x": "surge", "dx": "surge", "y": "sway", "dy": "sway", "z": "heave", "dz": "heave",
-    "Omega": "rotor speed", "vi": "inflow",
+    "Omega": "rotor speed", "governor": "governor", "vi": "inflow",
 }  # fmt: skip
 _TAKES_PART = 0.2
 """share of a motion in a mode from which on the mode has its name too"""
@@ -138,6 +138,7 @@ def _motions(model: Model) -> dict[str, str]:
     for axis in axes_of(model):
         motions |= {n: axis.name for n in (axis.angle, axis.rate) if n is not None}
         motions |= dict.fromkeys(axis.flybar, f"flybar {axis.name}")
+        motions |= dict.fromkeys(axis.tilt, f"{axis.name} flapping")
     return motions
 
 
@@ -147,10 +148,28 @@ def _mode_name(shares: dict[str, float], motions: dict[str, str]) -> str:
         motion = motions.get(name, name)
         by_motion[motion] = by_motion.get(motion, 0.0) + share
     ordered = sorted(by_motion, key=lambda m: -by_motion[m])
-    part = [m for m in ordered if by_motion[m] >= _TAKES_PART]
+    part = [m for m in ordered if by_motion[m] >= _threshold(m)]
     # The body before what moves with it.
     part = sorted(part or ordered[:1], key=lambda m: m.startswith(("flybar", "rotor", "inflow")))
-    return " with ".join(part)
+    return " with ".join(_known(part))
+
+
+def _threshold(motion: str) -> float:
+    # The tilt is one state where a body has two, an angle and its rate.
+    return 0.75 * _TAKES_PART if motion.endswith("flapping") else _TAKES_PART
+
+
+def _known(part: list[str]) -> list[str]:
+    """The motions of a mode, those that have a name of their own together under it."""
+    # Attitude and speed in turn, each driving the other: the pitch's is the phugoid of books.
+    for axis, along, name in (("pitch", "surge", "phugoid"), ("roll", "sway", "lateral phugoid")):
+        if {axis, along} <= set(part):
+            part = [name, *(m for m in part if m not in (axis, along))]
+    # A body that swings against its rotor is one motion.
+    for axis in ("roll", "pitch"):
+        if {axis, f"{axis} flapping"} <= set(part):
+            part = [m for m in part if m != axis]
+    return part
 
 
 def transfer_function(

@@ -64,7 +64,7 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     """
     axes = axes_of(model)
     sticks = [axis.stick for axis in axes if axis.stick is not None]
-    of_attitude = {n for axis in axes for n in (axis.angle, axis.rate, *axis.flybar)}
+    of_attitude = {n for axis in axes for n in (axis.angle, axis.rate, *axis.flybar, *axis.tilt)}
     states = [n for n in naming.names(model.State) if n in of_attitude]
 
     def rates(x: Array, u: Array) -> Array:

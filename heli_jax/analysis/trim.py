@@ -12,11 +12,12 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
+from heli_jax.analysis.trim_guess import first_guess
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, SteadyFlight, needed_but_missing, zeros
 from heli_jax.vehicle import of_helicopter
 
-STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0)}
+STICKS = {"x_throttle": (0.0, 1.0), "x_yaw": (-1.0, 1.0), "x_collective": (-1.0, 1.0)}
 """Where the sticks end, unless `trim` is told otherwise; the cyclic ones are lengths, and open."""
 
 # Params, State and Inputs are classes of the user's, of numbers, arrays or tracers: `Any` below.
@@ -27,6 +28,9 @@ _POLISH = 3
 """steps of Newton's method, each doubling the digits"""
 _TRIES = 12
 """starts, the first from momentum theory and the others about it"""
+_ROUNDING = 1e-9
+_LOWEST = -0.3
+"""collective stick above which the machine is the right way up"""
 _UPRIGHT = 1.5
 """roll and pitch [rad] below which a machine is not on its back"""
 
@@ -111,25 +115,31 @@ def trim(
     condition: Condition = HOVER,
     *,
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    sticks: Mapping[str, tuple[float, float]] = STICKS,
+    sticks: Mapping[str, tuple[float, float]] | None = None,
+    power_off: bool = False,
 ) -> Trim:
     """The steady flight of a helicopter model: hover, climb, forward and sideward flight.
 
-    All sticks, the attitude, the flybar and the rotor's speed are found together. Concrete
-    parameters only: `equilibrium` is what can be differentiated and batched.
+    All sticks, the attitude, the tip-path plane, the flybar and the rotor's speed are found
+    together; with a collective stick beside the throttle the rotor turns at the vehicle's Omega.
+    Concrete parameters only: `equilibrium` is what can be differentiated and batched.
 
     Args:
         model: the full nonlinear model of a helicopter.
         params: its constants.
         condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
-        sticks: the ends of the sticks' travel by name.
+        sticks: the ends of the sticks' travel by name; those of `STICKS` unless given.
+        power_off: autorotation: the throttle is zero, and the climb, which is then negative, is
+            found in its place. For a model with a collective stick.
 
     Raises:
         ValueError: no such flight exists (the residual is named), it needs more than a stick
             gives, or it is outside the model's range.
     """
-    steady = _require(model)
+    steady = _require(model, power_off)
+    if sticks is None:
+        sticks = {n: ends for n, ends in STICKS.items() if n in naming.names(model.Inputs)}
     missing = needed_but_missing(model, params)
     if missing:
         raise ValueError(f"trim: {', '.join(missing)} missing, model {model.name} needs it")
@@ -142,7 +152,9 @@ def trim(
     rng = np.random.default_rng(0)
     offset = np.zeros(len(steady.unknowns))
     for _ in range(_TRIES):
-        result = jax.device_get(_equilibrium(model, params, condition, air, jnp.asarray(offset)))
+        result = jax.device_get(
+            _equilibrium(model, params, condition, air, jnp.asarray(offset), power_off)
+        )
         # The equations have more roots, such as inverted flight or blades that push downwards.
         sound = plausible(result) and np.isfinite(result.residual)
         if sound and (best is None or result.residual < best.residual):
@@ -153,6 +165,8 @@ def trim(
             return best
         offset = rng.standard_normal(offset.size)
     left = "" if best is None else f": the nearest leaves an acceleration of {best.residual:.3g}"
+    if "governor" in naming.names(model.State):
+        left += "; its governor has a throttle of 0 to 1 to hold Omega, and no brake"
     raise ValueError(f"no trim of {_words(condition)} exists for this vehicle{left}")
 
 
@@ -161,6 +175,7 @@ def equilibrium(
     params: Any,
     condition: Condition = HOVER,
     wind: tuple[Any, Any, Any] = (0.0, 0.0, 0.0),
+    power_off: bool = False,
 ) -> Trim:
     """As `trim`, from one start and without its errors: for jit, vmap and derivatives.
 
@@ -169,11 +184,12 @@ def equilibrium(
         params: its constants, concrete or traced.
         condition: the flight.
         wind: velocity of the air along x, y and z [m/s], for a model that has it.
+        power_off: as in `trim`.
 
     Look at `residual`: where it is not small (1e-10, say), there is no trim in the result.
     """
-    steady = _require(model)
-    return _equilibrium(model, params, condition, wind, jnp.zeros(len(steady.unknowns)))
+    steady = _require(model, power_off)
+    return _equilibrium(model, params, condition, wind, jnp.zeros(len(steady.unknowns)), power_off)
 
 
 @eqx.filter_jit
@@ -183,38 +199,46 @@ def _equilibrium(
     condition: Condition,
     wind: tuple[Any, Any, Any],
     offset: Float[Array, " k"],
+    power_off: bool,
 ) -> Trim:
     """From the guess and half of `offset`, in the unknowns' sizes."""
-    names, rates = _require(model)
+    names, rates = _require(model, power_off)
     dtype = offset.dtype
     # In units of their sizes: a rotor's speed is a thousand times a flapping angle.
-    guess, scale = _guess(params, condition)
+    guess, scale = first_guess(model, params, condition.climb, power_off)
     start = jnp.stack([jnp.asarray(guess.get(n, 0.0), dtype) for n in names])
     scales = jnp.stack([jnp.asarray(scale.get(n, 0.1), dtype) for n in names])
     cpsi, spsi = jnp.cos(jnp.asarray(condition.heading)), jnp.sin(jnp.asarray(condition.heading))
 
-    def point(z: Array) -> tuple[Any, Any]:
+    def point(z: Array, parameters: Any) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
         # Speeds are along the heading, the states along the axes of the ground.
         fixed = {
             "psi": condition.heading,
             "dx": condition.forward_speed * cpsi - condition.lateral_speed * spsi,
             "dy": condition.forward_speed * spsi + condition.lateral_speed * cpsi,
-            "dz": condition.climb,
+            "dz": values.get("climb", condition.climb),
+            # An unknown only where one stick has to do for collective and throttle.
+            "Omega": parameters.Omega,
         }
+        fixed = {n: v for n, v in fixed.items() if n in naming.names(model.State)}
+        values = {"Omega": parameters.Omega, "x_throttle": 0.0, **values}
         state = naming.replace(
             zeros(model.State, dtype),
-            **{n: jnp.asarray(v, dtype) for n, v in fixed.items()},
-            **{n: v for n, v in values.items() if n in naming.names(model.State)},
+            **{
+                n: jnp.asarray(v, dtype)
+                for n, v in {**fixed, **values}.items()
+                if n in naming.names(model.State)
+            },
         )
         air = {f"wind_{a}": jnp.asarray(w, dtype) for a, w in zip("xyz", wind, strict=True)}
         inputs = model.Inputs(
-            **{n: values[n] if n in values else air[n] for n in naming.names(model.Inputs)}
+            **{n: jnp.asarray({**air, **values}[n], dtype) for n in naming.names(model.Inputs)}
         )
         return state, inputs
 
     def fn(xi: Array, parameters: Any) -> Array:
-        state, inputs = point(scales * xi)
+        state, inputs = point(scales * xi, parameters)
         return naming.ravel(model.vector_field(parameters, state, inputs), only=rates)
 
     solution = optx.root_find(
@@ -233,7 +257,7 @@ def _equilibrium(
         return z - jnp.linalg.solve(jax.jacfwd(fn)(z, params), fn(z, params)), None
 
     xi, _ = jax.lax.scan(polish, xi, None, length=_POLISH)
-    state, inputs = point(scales * xi)
+    state, inputs = point(scales * xi, params)
     return Trim(state, inputs, jnp.max(jnp.abs(fn(xi, params))))
 
 
@@ -242,12 +266,14 @@ def steady_flight(model: Model) -> SteadyFlight | None:
     these are those of the helicopter models here; None where it cannot be trimmed."""
     if model.steady_flight is not None:
         return model.steady_flight
-    states = naming.names(model.State)
-    if not {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"} <= set(states):
+    states, inputs = naming.names(model.State), naming.names(model.Inputs)
+    if not {"phi", "theta", "psi", "dx", "dy", "dz", "Omega"} <= {*states, *inputs}:
         return None
-    unknowns = [n for n in states if n in ("phi", "theta", "Omega", "vi")]
+    found = ["phi", "theta", "vi", "a1", "b1", "governor"]
+    found += [] if "x_collective" in inputs else ["Omega"]
+    unknowns = [n for n in states if n in found]
     unknowns += [n for n in states if n.startswith("beta")]
-    unknowns += [n for n in naming.names(model.Inputs) if not n.startswith("wind")]
+    unknowns += [n for n in inputs if not n.startswith("wind") and n != "Omega"]
     # A state whose derivative is another state does not vanish by itself, it is that state.
     no_equation = {"x", "y", "z", "phi", "theta", "psi"}
     equations = [n for n in states if n not in no_equation and f"d{n}" not in states]
@@ -262,11 +288,12 @@ def is_full_nonlinear(model: Model) -> bool:
     return of_helicopter(model.Params) and steady_flight(model) is not None
 
 
-def _require(model: Model) -> SteadyFlight:
+def _require(model: Model, power_off: bool = False) -> SteadyFlight:
     """What trim solves for.
 
     Raises:
-        ValueError: the model is not the full nonlinear model of a helicopter.
+        ValueError: the model is not the full nonlinear model of a helicopter, or without power it
+            has no collective stick.
     """
     check_model(model)
     steady = steady_flight(model)
@@ -275,32 +302,27 @@ def _require(model: Model) -> SteadyFlight:
             "trim: expected the full nonlinear model, as models.helicopter(...) gives it, got "
             f"{model.name}"
         )
-    return steady
-
-
-def _guess(p: Any, condition: Condition) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Start and size of the unknowns: the rotor at its nominal speed, carrying the weight."""
-    # Momentum theory in hover, then blade-element theory solved for the collective pitch.
-    area = jnp.pi * p.R**2
-    vi = jnp.sqrt(p.m * p.g / (2.0 * p.rho * area))
-    tip = p.R * p.Omega
-    sigma = 2.0 * p.c / (jnp.pi * p.R)
-    loading = 2.0 * p.m * p.g / (p.rho * area * tip**2 * p.a * sigma)
-    inflow = (vi + condition.climb) / tip
-    theta0 = 3.0 / p.B**3 * (loading + 0.5 * p.B**2 * inflow)
-    throttle = theta0 / p.K_theta0
-    guess = {"Omega": p.Omega, "vi": vi, "x_throttle": throttle, "x_yaw": -0.5 * throttle}
-    scale = {
-        "Omega": p.Omega, "vi": vi, "x_throttle": throttle, "x_yaw": throttle,
-        "x_roll": 0.1 * p.L5, "x_pitch": 0.1 * p.L5,
-    }  # fmt: skip
-    return guess, scale
+    if not power_off:
+        return steady
+    if "x_throttle" not in steady.unknowns or "x_collective" not in steady.unknowns:
+        raise ValueError(
+            "trim: power_off: expected a model with x_collective and x_throttle, as "
+            f"models.helicopter() gives it, got {model.name}"
+        )
+    return steady._replace(
+        unknowns=tuple("climb" if n == "x_throttle" else n for n in steady.unknowns)
+    )
 
 
 def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
     """Whether the rotor turns, the blades push upwards, and the machine is not on its back."""
-    level = (abs(result.state.phi) < _UPRIGHT) & (abs(result.state.theta) < _UPRIGHT)
-    return level & (result.state.Omega > 0) & (result.inputs.x_throttle > 0)
+    state, inputs = result.state, result.inputs
+    level = (abs(state.phi) < _UPRIGHT) & (abs(state.theta) < _UPRIGHT)
+    Omega = state.Omega if hasattr(state, "Omega") else inputs.Omega
+    if hasattr(inputs, "x_collective"):
+        # Without power the blades may stand lower than flat.
+        return level & (Omega > 0) & (inputs.x_collective > _LOWEST)
+    return level & (Omega > 0) & (inputs.x_throttle > 0)
 
 
 def _check_sticks(
@@ -317,19 +339,29 @@ def _check_sticks(
                 f"{', '.join(naming.names(model.Inputs))}"
             )
         value = float(getattr(result.inputs, name))
-        if low <= value <= high:
+        # The governor's stick stands at its end, which rounding may pass.
+        if low - _ROUNDING <= value <= high + _ROUNDING:
             continue
-        why = ""
-        if name == "x_throttle" and value > high:
-            weight, speed = float(params.m * params.g), float(result.state.Omega)
-            why = (
-                f"; to carry its weight of {weight:.3g} N the rotor would have to turn at "
-                f"{speed:.4g} rad/s: too heavy, or too slow a rotor (K_throttle, K_theta0)"
-            )
+        why = _why_heavy(model, params, result, name) if value > high else ""
         raise ValueError(
             f"no trim of {_words(condition)}: expected {name} within {low:g} to {high:g}, got "
             f"{value:.3g}{why}"
         )
+
+
+def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
+    """Why a stick that carries the weight is past its end; empty for the others."""
+    if stick not in ("x_throttle", "x_collective"):
+        return ""
+    weight = float(params.m * params.g)
+    if "x_collective" in naming.names(model.Inputs):
+        gain = "K_throttle" if stick == "x_throttle" else "K_theta0, Omega"
+        return f"; its weight of {weight:.3g} N is too much for motor or rotor ({gain})"
+    return (
+        f"; to carry its weight of {weight:.3g} N the rotor would have to turn at "
+        f"{float(result.state.Omega):.4g} rad/s: too heavy, or too slow a rotor "
+        "(K_throttle, K_theta0)"
+    )
 
 
 def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:

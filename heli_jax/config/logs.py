@@ -59,7 +59,7 @@ def _read_flight(
             hold_out=f.hold_out,
             name=f.name or f"flight {i + 1}",
             moving_inputs=moving,
-            number=f.number,
+            number=f.flight,
         )
     except InputError:
         raise  # it names the log and the line already

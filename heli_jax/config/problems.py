@@ -41,13 +41,14 @@ def problem(experiment: Experiment) -> Problem:
     # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if config.fit.method == "filter-error":
-        if config.disturbance is None:
+        # A model with process noise of its own needs none beside it.
+        if config.disturbance is None and model.noise_intensity is None:
             raise InputError(
                 f"{path}: fit.method: filter-error needs a disturbance, expected "
                 "disturbance: {axis: roll, poles: 1}"
             )
         model, params = disturbed(experiment)
-        fixed = tuple(config.disturbance.fixed)
+        fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     try:
         return Problem(
             model,
@@ -110,16 +111,28 @@ def candidate_models(experiment: Experiment, fitted: Problem) -> "Alternatives":
         InputError: no axis of the model can be disturbed.
     """
     # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.disturbed_sets import disturbed_sets, undisturbed_too
     from heli_jax.identification.model_selection import alternatives
 
     model, disturbance = experiment.model, experiment.config.disturbance
     axes = disturbable(model)
-    if not axes:
+    if not axes and disturbance is None:
         raise InputError(
             f"{experiment.path}: fit.compare: model {model.name} has no axis to disturb, expected "
-            "one with roll, pitch or yaw"
+            "one with roll, pitch or yaw, or disturbance: {on: [STATE]}"
         )
-    axis = disturbance.axis if disturbance is not None else axes[0]
+    stated = disturbance.names if disturbance is not None else ()
+    # A list names some of what may be disturbed, and the other axes are in question as well; the
+    # one of `axis: roll` is settled, and its poles are.
+    asked = (
+        stated if disturbance is not None and disturbance.axis else undisturbed_too(model, stated)
+    )
+    if len(asked) > 1:
+        try:
+            return disturbed_sets(fitted, model, asked, stated)
+        except ValueError as e:
+            raise InputError(f"{experiment.path}: disturbance: {e}") from e
+    axis = next(iter(asked))
     # Whether there is a stand is in question only where its stiffness is.
     bare = model.without_stand if "kappa" in fitted.free else None
     return alternatives(fitted, model, axis, without_stand=bare)
@@ -130,19 +143,18 @@ def disturbed(experiment: Experiment) -> tuple[Model, Any]:
     """The model with the configuration's disturbance, and its parameters.
 
     Raises:
-        InputError: the model has no such axis.
+        InputError: the model has no such axis or state.
     """
     model, params = experiment.model, experiment.vehicle.params
     disturbance = experiment.config.disturbance
     if disturbance is None:
         return model, params
     try:
-        model = with_disturbance(model, disturbance.axis, disturbance.poles)
+        model = with_disturbance(model, disturbance.names, disturbance.poles)
     except ValueError as e:
         raise InputError(f"{experiment.path}: disturbance: {e}") from e
-    stated = {"sigma_w": disturbance.sigma_w, "tau_w": disturbance.tau_w}
     # Left out, sigma_w stays 0 and tau_w 1 s: filter error then makes an initial guess of its own.
-    extra = {n: jnp.asarray(v) for n, v in stated.items() if v is not None}
+    extra = {n: jnp.asarray(v) for n, v in disturbance.parameters.items() if v is not None}
     return model, model.Params(**{**naming.asdict(params), **extra})
 
 

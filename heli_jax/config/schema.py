@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
+from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.onboard import OnboardConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
@@ -74,8 +75,8 @@ class SignalsConfig(_Strict):
 class FlightConfig(_Strict):
     log: str
     signals: SignalsConfig
-    number: Annotated[int, Field(ge=1)] | None = None
-    """which flight of a log that holds several"""
+    flight: Annotated[int, Field(ge=1)] | None = None
+    """which flight of a log that holds several, from 1"""
     name: str | None = None
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.
@@ -184,34 +185,14 @@ class FitConfig(_Strict):
     seed: Annotated[int, Field(ge=0)] = 0
     max_steps: Annotated[int, Field(ge=1)] = 200
     compare: bool = False
-    """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand"""
+    """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
+    several axes may be disturbed, all of them and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
 
 
 class RLSConfig(_Strict):
     order: Annotated[int, Field(ge=1, le=20)] = 4
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
-
-
-class DisturbanceConfig(_Strict):
-    """A random acceleration on one axis: simulation draws it, filter error estimates it."""
-
-    axis: str
-    """one of the model's axes: roll, pitch, yaw, heave, ..."""
-    poles: Literal[1, 2] = 1
-    sigma_w: Positive | None = None
-    """standard deviation [rad/s^2]: needed to simulate, an initial guess for filter error"""
-    tau_w: Positive | None = None
-    """correlation time [s]: needed to simulate, an initial guess for filter error"""
-    fixed: list[Literal["sigma_w", "tau_w", "sigma_y"]] = []
-    """what filter error takes as it stands here; sigma_y: the noise that the outputs state (sd)"""
-
-    @model_validator(mode="after")
-    def _fixed_given(self) -> "DisturbanceConfig":
-        for name in ("sigma_w", "tau_w"):
-            if name in self.fixed and getattr(self, name) is None:
-                raise ValueError(f"{name}: missing, expected its value, since it is fixed")
-        return self
 
 
 class StickConfig(_Strict):

@@ -24,9 +24,6 @@ from heli_jax.sweeps.design import Design
 from heli_jax.sweeps.reducers import LINEAR, REDUCERS, Reduce, Streaming
 from heli_jax.sweeps.spec import Job, RunOptions, Trajectories, Trimmed, axis_unit, job
 
-_DRAWN = ("seed", "sigma_w", "tau_w")
-"""axes that are of the disturbance"""
-
 
 def simulates(experiment: Experiment) -> bool:
     """Whether the sweep's inputs are those that `simulate` makes.
@@ -109,15 +106,17 @@ def sweep_job(
 
 def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
     """The model, with the disturbance where an axis is one of its."""
-    plain = naming.names(experiment.model.Params)
+    plain, disturbance = naming.names(experiment.model.Params), experiment.config.disturbance
+    values = {} if disturbance is None else disturbance.parameters
     # A model of one's own may have a parameter called sigma_w, which is then no disturbance's.
-    drawn = [n for n in _axes(sweep) if n in _DRAWN and n not in plain]
-    if not drawn or experiment.config.disturbance is None:
+    drawn = [n for n in _axes(sweep) if n in ("seed", *values) and n not in plain]
+    if not drawn or disturbance is None:
         return experiment.model, experiment.vehicle.params
-    where, disturbance = f"{experiment.path}: disturbance", experiment.config.disturbance
-    for name in ("sigma_w", "tau_w"):
-        if getattr(disturbance, name) is None and name not in drawn:
-            raise InputError(f"{where}.{name}: missing, expected a number to draw it with")
+    for name, value in values.items():
+        if value is None and name not in drawn:
+            raise InputError(
+                f"{experiment.path}: disturbance.{name}: missing, expected a number to draw it with"
+            )
     if "seed" not in drawn:
         raise InputError(
             f"{experiment.path}: sweep.axes.{drawn[0]}: expected an axis seed too, as "

@@ -5,13 +5,15 @@ then divided by the rotor's speed, and a rotor at rest is an ordinary point.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
-
-import jax.numpy as jnp
 
 from heli_jax.dynamics.inflow import induced_velocity
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
+
+type Inflow = Callable[[Scalar, Scalar, Scalar, Scalar], Scalar]
+"""The induced velocity by V2, W, T0 and b, as `inflow.induced_velocity` has them."""
 
 
 class Flow(NamedTuple):
@@ -79,7 +81,12 @@ def hub_moment(p: Helicopter, Omega: Scalar, theta_cyc: Scalar, omega: Scalar) -
 
 
 def thrust(
-    p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, vi: Scalar | None = None
+    p: Helicopter,
+    Omega: Scalar,
+    theta0: Scalar,
+    flow: Flow,
+    vi: Scalar | None = None,
+    solve: Inflow = induced_velocity,
 ) -> RotorForce:
     r"""Thrust of the main rotor, eq. 13, with the inflow of momentum theory.
 
@@ -96,6 +103,7 @@ def thrust(
         theta0: collective pitch [rad], eq. 18.
         flow: the air that the rotor meets.
         vi: induced velocity [m/s]; solved for unless given, as by dynamic inflow.
+        solve: how it is solved for.
     """
     # Blade-element theory has B/2 mu^2 theta0 in the bracket beside these three; the paper drops
     # it, and the tests' quadrature agrees with eq. 13 up to that term alone.
@@ -106,7 +114,7 @@ def thrust(
     lifting = (half * p.B**3 / 3.0 * p.R**2) * Omega**2 * theta0 + b * flow.edgewise
     T0 = lifting - b * flow.W
     if vi is None:
-        vi = induced_velocity(flow.V2, flow.W, T0, b)
+        vi = solve(flow.V2, flow.W, T0, b)
     return RotorForce((p.rho * math.pi * p.R**2) * (T0 - b * vi), flow.W + vi, vi, T0)
 
 
@@ -148,7 +156,14 @@ def tail_moment(p: Helicopter, Omega: Scalar, theta0T: Scalar) -> Scalar:
     return (scale * p.L_T * p.K_Omega**2) * Omega**2 * theta0T
 
 
-def tail_thrust(p: Helicopter, Omega: Scalar, theta0T: Scalar, V2: Scalar, W: Scalar) -> RotorForce:
+def tail_thrust(
+    p: Helicopter,
+    Omega: Scalar,
+    theta0T: Scalar,
+    V2: Scalar,
+    W: Scalar,
+    solve: Inflow = induced_velocity,
+) -> RotorForce:
     r"""Thrust of the tail rotor with inflow, in place of eq. 16's.
 
     $$T_T = \tfrac12\rho\pi R_T^4\Omega_T^2 a_T\sigma_T
@@ -160,15 +175,37 @@ def tail_thrust(p: Helicopter, Omega: Scalar, theta0T: Scalar, V2: Scalar, W: Sc
         theta0T: pitch of the tail rotor's blades [rad], eq. 17.
         V2: square of the speed in the tail rotor's plane [m^2/s^2].
         W: speed against its thrust [m/s].
+        solve: how the induced velocity follows.
     """
     half = 0.5 * p.a_T * solidity(p.R_T, p.c_T)
     b = (half * 0.5 * p.B**2 * p.R_T * p.K_Omega) * Omega
     T0 = (half * p.B**3 / 3.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2 * theta0T - b * W
-    vi = induced_velocity(V2, W, T0, b)
+    vi = solve(V2, W, T0, b)
     return RotorForce((p.rho * math.pi * p.R_T**2) * (T0 - b * vi), W + vi, vi, T0)
 
 
-def inflow_rate(p: Helicopter, force: RotorForce, V2: Scalar) -> Scalar:
+def tail_torque(p: Helicopter, Omega: Scalar, theta0T: Scalar, inflow: Scalar) -> Scalar:
+    r"""Torque of the tail rotor on its own shaft [N m]: eq. 10's bracket without edgewise flow.
+
+    $$Q_T = \rho\pi R_T^5\Omega_T^2\left[\tfrac18\sigma_T C_{d0} + \tfrac12 a_T\sigma_T\lambda_T
+      \left(\tfrac{B^3}{3}\theta_{0T} - \tfrac{B^2}{2}\lambda_T\right)\right]$$
+
+    Its blades have the drag coefficient of the main ones.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0T: pitch of the tail rotor's blades [rad].
+        inflow: lambda_T R_T Omega_T [m/s].
+    """
+    sigma = solidity(p.R_T, p.c_T)
+    scale = p.rho * math.pi * p.R_T**3 * sigma
+    lifting = (p.B**3 / 3.0 * p.R_T * p.K_Omega) * Omega * theta0T - (0.5 * p.B**2) * inflow
+    drag = (scale * p.Cd0 / 8.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2
+    return drag + (scale * 0.5 * p.a_T) * inflow * lifting
+
+
+def inflow_rate(p: Helicopter, force: RotorForce, through: Scalar) -> Scalar:
     r"""Acceleration of the induced velocity [m/s^2] where the air has inertia.
 
     $$0.637\cdot\tfrac43\rho\pi R^3\,\dot v_i
@@ -179,11 +216,9 @@ def inflow_rate(p: Helicopter, force: RotorForce, V2: Scalar) -> Scalar:
     Args:
         p: vehicle, SI.
         force: thrust and inflow of the main rotor.
-        V2: square of the speed in its plane [m^2/s^2].
+        through: the flow sqrt(V^2 + (W + v_i)^2) through the rotor [m/s].
     """
     # 0.637 is theirs: the share of a sphere of air with the rotor's radius that takes part.
-    # A little flow is always there: the root has a derivative even where nothing moves.
-    through = jnp.sqrt(V2 + force.inflow**2 + 1e-16)
     area = math.pi * p.R**2
     excess = (1.0 / (p.rho * area)) * force.T - 2.0 * force.vi * through
     return (1.0 / (0.637 * 4.0 / 3.0 * p.R)) * excess

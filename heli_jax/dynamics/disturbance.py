@@ -1,11 +1,14 @@
-"""A disturbance as part of the model: a random acceleration with a memory."""
+"""Disturbances as part of the model: random pushes on derivatives, each with a memory."""
 
 import functools
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
+
+import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.model import Disturbance, Model, axes_of
 from heli_jax.naming import Record, Scalar
 
 
@@ -14,36 +17,69 @@ def disturbable(model: Model) -> list[str]:
     return [axis.name for axis in axes_of(model)]
 
 
-# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
 @functools.cache
-def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
-    r"""The model with an Ornstein-Uhlenbeck (Gauss-Markov) acceleration on one axis.
+def disturbable_states(model: Model) -> tuple[str, ...]:
+    """The states whose derivative may be pushed: all but those of pure kinematics.
+
+    Kinematics (phi' = p, positions) hold whatever the air does: their derivatives are made of
+    states alone, without a parameter or an input. The rate of an axis may always be pushed.
+    """
+    names = naming.names(model.State)
+    one, nan = np.float64(1.0), np.float64(np.nan)
+    ones = model.State(**dict.fromkeys(names, one))
+    params = model.Params(**dict.fromkeys(naming.names(model.Params), nan))
+    inputs = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), nan))
+    # NaN goes through every operation that uses it: what is still a number uses neither.
+    with np.errstate(all="ignore"):
+        pushed = naming.asdict(model.vector_field(params, ones, inputs))
+        known = {n: float(v) for n, v in pushed.items()}
+        # A state that nothing moves may be pushed: a random walk has no other derivative.
+        twos = model.State(**dict.fromkeys(names, 2.0 * one))
+        moved = naming.asdict(model.vector_field(params, twos, inputs))
+    rates = {axis.rate for axis in axes_of(model)}
+    return tuple(
+        n
+        for n in names
+        if n in rates or np.isnan(known[n]) or (known[n] == 0.0 and float(moved[n]) == 0.0)
+    )
+
+
+def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> Model:
+    r"""The model with an Ornstein-Uhlenbeck (Gauss-Markov) push on one or several derivatives.
 
     $\dot w = -w/\tau_w + \sigma_w\sqrt{2/\tau_w}\,n$ with white noise n of unit intensity, so that
-    w has the standard deviation sigma_w [rad/s^2] and correlation time tau_w [s]. With two poles
-    w follows a second lag of the same time constant, scaled to the same standard deviation. The
-    model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s). At the first sample
-    the disturbance is what it is at any other: all its states have the standard deviation sigma_w,
-    and the two of two poles the correlation 1/sqrt(2).
+    w, which adds to the derivative of a state, has the standard deviation sigma_w (in that state's
+    unit per second) and the correlation time tau_w [s]. With two poles w follows a second lag of
+    the same time constant, scaled to the same standard deviation. At the first sample w is what it
+    is at any other: all its states have the standard deviation sigma_w, and the two of two poles
+    the correlation 1/sqrt(2).
+
+    With one the model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s); with
+    several each has its own, named after what is disturbed: `sigma_w_p`, `tau_w_p`. A model's own
+    process noise stays as it is.
 
     Args:
-        model: without a disturbance on that axis.
-        axis: its name, one of `disturbable`.
+        model: without a disturbance on those states.
+        on: what is disturbed: axes (`disturbable`: the push is an acceleration) or states
+            (`disturbable_states`), by name.
         poles: 1 or 2, the order of the filter that colours the noise.
 
     Raises:
-        ValueError: the model has no such axis, or `poles` is neither 1 nor 2.
+        ValueError: the model has no such axis or state, it cannot be pushed or is named twice, or
+            `poles` is neither 1 nor 2.
     """
+    return _with_disturbances(model, (on,) if isinstance(on, str) else tuple(on), poles)
+
+
+# Cached: a model is static to jit, and a second one of the same kind would be compiled again.
+@functools.cache
+def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
     check_model(model)
-    rates = {known.name: known.rate for known in axes_of(model)}
-    if axis not in rates:
-        expected = f"one of {', '.join(rates)}" if rates else "a model that turns about an axis"
-        raise ValueError(f"model {model.name} has no axis {axis!r} to disturb, expected {expected}")
     if poles not in (1, 2):
         raise ValueError(f"poles must be 1 or 2, got {poles}")
-    lags = tuple(f"w{i + 1}_{axis}" for i in range(poles))
-    Params, State = _records(model, lags, _acceleration(model, rates[axis]))
-    disturbed = _Disturbed(model, rates[axis], lags, State)
+    added = _disturbances(model, on, poles)
+    Params, State = _records(model, added)
+    disturbed = _Disturbed(model, added, State)
     return Model(
         f"{model.name}-disturbed",
         disturbed.vector_field,
@@ -56,54 +92,109 @@ def with_disturbance(model: Model, axis: str, poles: int = 1) -> Model:
         start=disturbed.start,
         noise_intensity=disturbed.noise_intensity,
         initial_sd=disturbed.initial_sd,
-        correlation=None if poles == 1 else disturbed.correlation,
+        correlation=disturbed.correlation if poles == 2 or model.correlation else None,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
         delays=model.delays,
         delay_lines=model.delay_lines,
         positive=model.positive,
+        disturbances=(*model.disturbances, *added),
     )
 
 
-def _acceleration(model: Model, rate: str) -> str:
-    """The unit of a rate's derivative: heave is no rotation."""
-    unit = naming.unit(model.State, rate) or "rad/s"
+def disturbances_of(model: Model) -> tuple[Disturbance, ...]:
+    """The disturbances whose parameters filter error estimates by itself."""
+    if model.disturbances or model.noise_intensity is None:
+        return model.disturbances
+    # A model of one's own may have been given one by hand, under the names that it has here.
+    if {"sigma_w", "tau_w"} <= set(naming.names(model.Params)):
+        return (Disturbance("w", "", "sigma_w", "tau_w"),)
+    return ()
+
+
+def only_disturbed(model: Model) -> bool:
+    """Whether all process noise is that of disturbances: none is the model's own."""
+    if model.noise_intensity is None:
+        return True
+    # With every sigma at zero what is left is the model's own, at any value of its parameters.
+    params = dict.fromkeys(naming.names(model.Params), 1.0)
+    params |= {d.sigma: 0.0 for d in disturbances_of(model)}
+    own = naming.asdict(model.noise_intensity(model.Params(**params)))
+    return all(float(v) == 0.0 for v in own.values())
+
+
+def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Disturbance, ...]:
+    """What is added, by name; ValueError where it cannot be."""
+    if not on:
+        raise ValueError("a disturbance needs an axis or a state to act on, got none")
+    rates = {axis.name: axis.rate for axis in axes_of(model)}
+    added: list[Disturbance] = []
+    for name in on:
+        state = rates.get(name, name)
+        _check_pushed(model, name, state, rates)
+        for other in (*model.disturbances, *added):
+            if other.state == state:
+                same = "twice" if other.name == name else f"by {other.name!r} as well"
+                raise ValueError(f"{name!r} names state {state!r}, which is disturbed {same}")
+        ending = f"_{name}" if len(on) > 1 or model.disturbances else ""
+        lags = tuple(f"w{i + 1}_{name}" for i in range(poles))
+        added.append(Disturbance(name, state, f"sigma_w{ending}", f"tau_w{ending}", lags))
+    taken = {*naming.names(model.Params), *naming.names(model.State)}
+    for d in added:
+        for clash in sorted(taken & {d.sigma, d.tau, *d.lags}):
+            raise ValueError(
+                f"model {model.name} has {clash!r} already, the name that a disturbance on "
+                f"{d.name!r} gives to one of its own"
+            )
+    return tuple(added)
+
+
+def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) -> None:
+    """Refuse what is neither an axis nor a state that can be pushed."""
+    allowed = disturbable_states(model)
+    known = list(dict.fromkeys([*rates, *allowed]))
+    expected = f"expected one of {', '.join(known)}" if known else "which has none to disturb"
+    if state in allowed:
+        return
+    if state in naming.names(model.State):
+        raise ValueError(
+            f"model {model.name}: the derivative of {name!r} is kinematics, made of states "
+            f"alone, which nothing can push; {expected}"
+        )
+    raise ValueError(f"model {model.name} has no axis or state {name!r} to disturb, {expected}")
+
+
+def _pushed_unit(model: Model, state: str) -> str:
+    """The unit of a state's derivative: heave is no rotation."""
+    unit = naming.unit(model.State, state) or "rad/s"
     return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
-def _records(model: Model, lags: tuple[str, ...], unit: str) -> tuple[type, type]:
-    """The classes of parameters and states with those of the disturbance, whose unit is given."""
-    Params = naming.extended(
-        model.Params,
-        f"{model.Params.__name__}Disturbed",
-        {
-            # Zero by default: without a value for it the model flies as the undisturbed one does.
-            "sigma_w": (Annotated[Scalar, unit, "disturbance standard deviation"], 0.0),
-            "tau_w": (Annotated[Scalar, "s", "disturbance correlation time"], 1.0),
-        },
+def _records(model: Model, added: tuple[Disturbance, ...]) -> tuple[type, type]:
+    """The classes of parameters and states with those of the disturbances."""
+    parameters, states = {}, {}
+    for d in added:
+        unit, of = _pushed_unit(model, d.state), f" on {d.name}" if len(added) > 1 else ""
+        # Zero by default: without a value for it the model flies as the undisturbed one does.
+        parameters[d.sigma] = (
+            Annotated[Scalar, unit, f"disturbance standard deviation{of}"],
+            0.0,
+        )
+        parameters[d.tau] = (Annotated[Scalar, "s", f"disturbance correlation time{of}"], 1.0)
+        acceleration = Annotated[Scalar, unit, f"disturbance acceleration{of}"]
+        states |= dict.fromkeys(d.lags, (acceleration, None))
+    return (
+        naming.extended(model.Params, f"{model.Params.__name__}Disturbed", parameters),
+        naming.extended(model.State, f"{model.State.__name__}Disturbed", states),
     )
-    State = naming.extended(
-        model.State,
-        f"{model.State.__name__}Disturbed",
-        dict.fromkeys(lags, (Annotated[Scalar, unit, "disturbance acceleration"], None)),
-    )
-    return Params, State
 
 
 class _Disturbed(NamedTuple):
     """The functions of a disturbed model, around those of the model itself."""
 
     model: Model
-    rate: str
-    """the state whose derivative the disturbance adds to"""
-    lags: tuple[str, ...]
-    """the states of the filter, the one that is driven by white noise first"""
+    added: tuple[Disturbance, ...]
     State: type
-
-    @property
-    def gain(self) -> float:
-        # Two equal lags halve the variance of the first; the gain brings it back.
-        return 2.0**0.5 if len(self.lags) == 2 else 1.0
 
     def undisturbed(self, state: Record) -> Record:
         """The State of the model itself."""
@@ -111,17 +202,12 @@ class _Disturbed(NamedTuple):
         return self.model.State(**{n: getattr(state, n) for n in states})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        # It adds to the acceleration, as a gust's moment over the inertia would: a disturbance of
+        # It adds to the derivative, as a gust's moment over the inertia would: a disturbance of
         # the angle itself would jump, and one of the output would not act back through the flybar.
         rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
-        rates[self.rate] = rates[self.rate] + getattr(s, self.lags[-1])
-        before: Scalar | None = None
-        # The first lag is driven by white noise alone, which is not in the field: `noise_intensity`
-        # has it. Each further one follows the one before.
-        for name in self.lags:
-            w = getattr(s, name)
-            pull = -w if before is None else self.gain * before - w
-            rates[name], before = pull / p.tau_w, w
+        for d in self.added:
+            rates[d.state] = rates[d.state] + getattr(s, d.lags[-1])
+            rates |= _filtered(d, p, s)
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
@@ -132,22 +218,52 @@ class _Disturbed(NamedTuple):
         return self.model.limits(p, self.undisturbed(s), u)
 
     def noise_intensity(self, p: Record) -> Record:
+        own = self.model.noise_intensity
         # Zeros made of a parameter have its type and its batch axis.
-        zero = 0.0 * p.sigma_w
+        zero = 0.0 * getattr(p, self.added[0].sigma)
         intensity = dict.fromkeys(naming.names(self.State), zero)
-        # A first-order lag driven by q has the variance q^2 tau/2: q is chosen for sigma_w^2.
-        intensity[self.lags[0]] = p.sigma_w * (2.0 / p.tau_w) ** 0.5
+        intensity |= naming.asdict(own(p)) if own is not None else {}
+        for d in self.added:
+            # A first-order lag driven by q has the variance q^2 tau/2: q is chosen for sigma_w^2.
+            intensity[d.lags[0]] = getattr(p, d.sigma) * (2.0 / getattr(p, d.tau)) ** 0.5
         return self.State(**intensity)
 
     def start(self, p: Record) -> Record:
-        zero = 0.0 * p.sigma_w
         start = naming.asdict(self.model.initial_state(p))
-        return self.State(**{**start, **dict.fromkeys(self.lags, zero)})
+        for d in self.added:
+            start |= dict.fromkeys(d.lags, 0.0 * getattr(p, d.sigma))
+        return self.State(**start)
 
     def initial_sd(self, p: Record) -> dict[str, Any]:
-        return dict.fromkeys(self.lags, p.sigma_w)
+        own = self.model.initial_sd
+        sds = dict(own(p)) if own is not None else {}
+        for d in self.added:
+            sds |= dict.fromkeys(d.lags, getattr(p, d.sigma))
+        return sds
 
     def correlation(self, p: Record) -> dict[tuple[str, str], Any]:
+        own = self.model.correlation
+        pairs = dict(own(p)) if own is not None else {}
         # The Lyapunov equation of two equal lags: E[w1 w2] = gain/2 E[w1^2], whatever tau_w is.
-        first, second = self.lags
-        return {(first, second): 0.5 * self.gain + 0.0 * p.sigma_w}
+        for d in self.added:
+            if len(d.lags) == 2:
+                pairs[d.lags[0], d.lags[1]] = 0.5 * _gain(d) + 0.0 * getattr(p, d.sigma)
+        return pairs
+
+
+def _gain(d: Disturbance) -> float:
+    # Two equal lags halve the variance of the first; the gain brings it back.
+    return 2.0**0.5 if len(d.lags) == 2 else 1.0
+
+
+def _filtered(d: Disturbance, p: Record, s: Record) -> dict[str, Scalar]:
+    """The derivatives of a disturbance's own states."""
+    rates: dict[str, Scalar] = {}
+    before: Scalar | None = None
+    # The first lag is driven by white noise alone, which is not in the field: `noise_intensity` has
+    # it. Each further one follows the one before.
+    for name in d.lags:
+        w = getattr(s, name)
+        pull = -w if before is None else _gain(d) * before - w
+        rates[name], before = pull / getattr(p, d.tau), w
+    return rates

@@ -1,13 +1,16 @@
-r"""The whole helicopter: eqs 2-20 as printed, and with each correction that makes them physics.
+r"""The whole helicopter: eqs 2-20 as printed, with each correction that makes them physics, and
+with what a helicopter has beyond them.
 
 Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right:
 the ordinary yaw-pitch-roll angles of a body with axes forward, right and down. The states dphi,
 dtheta and dpsi are the angles' derivatives, in every variant. The rotor turns in -psi: counter-
 clockwise seen from above.
 
-`helicopter("paper")` is the paper to the letter; `helicopter("consistent")` has all corrections,
-and `helicopter("paper", tail=True)` one of them. `Corrections` says what each is. Drag is a
-disturbance in the paper, so the paper variant has none.
+`helicopter("paper")` is the paper to the letter; `helicopter("consistent")` has its equations with
+all corrections, and `helicopter()`, the variant "full", a rotor that flaps, a tail rotor with side
+force and power, a governor, and inflow in any descent as well. `helicopter("paper", tail=True)` has
+one of them. `Corrections` says what each is. Drag is a disturbance in the paper, so the paper
+variant has none.
 """
 
 import functools
@@ -18,45 +21,66 @@ import jax.numpy as jnp
 
 from heli_jax import naming
 from heli_jax.dynamics import aerodynamics as aero
-from heli_jax.dynamics import flybar
+from heli_jax.dynamics import descent_inflow, flybar
+from heli_jax.dynamics import inflow as momentum_theory
 from heli_jax.dynamics.helicopter_equations import (
     accelerations,
     angular_accelerations,
     flow,
+    inflow_of,
     main_rotor,
-    moments,
     motion,
     once,
-    rotor_acceleration,
 )
 from heli_jax.dynamics.helicopter_records import (
+    COLLECTIVE,
+    GOVERNOR,
+    INFLOW,
+    ROTOR_SPEED,
+    TILT,
     Corrections,
     HelicopterInputs,
     HelicopterOutputs,
     HelicopterState,
+    Moments,
     Motion,
 )
-from heli_jax.dynamics.inflow import vortex_ring
+from heli_jax.dynamics.loads import Rotors, drive, flapping, moments, rigid_hub_moments
 from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
+from heli_jax.dynamics.tail_rotor import tail_rotor
+from heli_jax.dynamics.tip_path_plane import Tilt, hub_loads
 from heli_jax.naming import Record, Scalar
 from heli_jax.vehicle import Helicopter
 
-# Dynamic inflow is an extension, not a correction: eqs 8-10 have inflow in equilibrium, and a state
-# more makes a record harder to fit.
-_ALL = Corrections(*[True] * len(Corrections._fields))._replace(dynamic_inflow=False)
-_VARIANTS = {"paper": Corrections(), "consistent": _ALL}
+_BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power", "windmill")
+_OWN_MOTOR = ("collective", "governor")
+# Dynamic inflow has a variant of its own: eqs 8-10 have inflow in equilibrium, and a state more
+# makes a record harder to fit. A bar and a measured rotor speed a machine has or has not.
+_CHOICES = ("dynamic_inflow", "measured_speed", "flybarless")
+_FULL = Corrections(*[True] * len(Corrections._fields))._replace(**dict.fromkeys(_CHOICES, False))
+_VARIANTS = {
+    "paper": Corrections(),
+    "consistent": _FULL._replace(**dict.fromkeys((*_BEYOND, *_OWN_MOTOR), False)),
+    "full": _FULL,
+}
 
 
 # Cached, since a model is static to jit: a second one of the same switches has other partials, and
 # would be compiled again.
 @functools.cache
 def helicopter(
-    variant: Literal["paper", "consistent"] = "consistent", *, wind: bool = False, **switches: bool
+    variant: Literal["paper", "consistent", "full"] = "full",
+    *,
+    wind: bool = False,
+    **switches: bool,
 ) -> Model:
-    """The nonlinear helicopter with flybar, rotor speed and tail rotor, eqs 2-20.
+    """The nonlinear helicopter with flybar, rotor speed and tail rotor, eqs 2-20 and beyond.
 
-    `switches` are those of `Corrections`. `wind` adds the inputs wind_x, wind_y, wind_z [m/s],
-    the velocity of the air over the ground.
+    Args:
+        variant: which switches are on: none, the corrections of the paper, or all.
+        wind: adds the inputs wind_x, wind_y, wind_z [m/s], the velocity of the air over the ground.
+        switches: those of `Corrections` by name, on or off in place of the variant's. A governor is
+            off where the rotor's speed is measured.
 
     Raises:
         ValueError: no such variant or switch.
@@ -69,13 +93,14 @@ def helicopter(
             f"corrections: expected some of {', '.join(Corrections._fields)}, got {unknown[0]!r}"
         )
     corrections = _VARIANTS[variant]._replace(**switches)
-    State = _state_class(corrections)
-    Inputs = HelicopterInputs
-    if wind:
-        air = {
-            f"wind_{axis}": (Annotated[Scalar, "m/s", f"wind along {axis}"], None) for axis in "xyz"
-        }
-        Inputs = naming.extended(HelicopterInputs, "HelicopterWindInputs", air)
+    if corrections.measured_speed:
+        if switches.get("governor"):
+            raise ValueError(
+                "corrections: expected governor or measured_speed, got both: a rotor speed that is "
+                "measured has no governor"
+            )
+        corrections = corrections._replace(governor=False)
+    State, Inputs = _state_class(corrections), _inputs_class(corrections, wind)
     # The name says what differs from its variant: fit.json and figures know a model by it.
     changed = [
         f"{'+' if on else '-'}{n}"
@@ -93,27 +118,60 @@ def helicopter(
         start=functools.partial(_start, State),
         limits=functools.partial(_limits, corrections),
         axes=_axes(corrections),
-        steady_flight=_steady_flight(corrections),
+        steady_flight=_steady_flight(corrections, Inputs),
     )
 
 
 def _axes(corrections: Corrections) -> tuple[Axis, ...]:
-    """A flybar averaged over a turn has no rate among the states."""
-    if not corrections.first_order_bar:
-        return (ROLL, PITCH, YAW)
-    return (ROLL._replace(flybar=("beta_roll",)), PITCH._replace(flybar=("beta_pitch",)), YAW)
+    """With the states of flybar and tip-path plane that there are."""
+
+    def with_rotor(axis: Axis) -> Axis:
+        bar = () if corrections.flybarless else axis.flybar
+        # A flybar averaged over a turn has no rate among the states.
+        bar = bar[:1] if corrections.first_order_bar else bar
+        return axis._replace(flybar=bar, tilt=axis.tilt if corrections.flapping else ())
+
+    return (with_rotor(ROLL), with_rotor(PITCH), YAW)
 
 
-def _steady_flight(corrections: Corrections) -> SteadyFlight:
-    """Attitude, rotor speed, inflow, flybar and sticks, of which none is chosen in a steady flight;
-    position, heading and velocity are given, and the angles do not turn."""
-    inflow = ("vi",) if corrections.dynamic_inflow else ()
-    bar = ("beta_roll", "beta_pitch")
-    turning = bar if corrections.first_order_bar else ("dbeta_roll", "dbeta_pitch")
+def _steady_flight(corrections: Corrections, Inputs: type) -> SteadyFlight:
+    """Attitude, rotor, inflow, flybar and sticks, of which none is chosen in a steady flight;
+    position, heading and velocity are given, and the angles do not turn.
+
+    A rotor that has a motor of its own turns at the vehicle's speed, which is given too.
+    """
+    bar = () if corrections.flybarless else ("beta_roll", "beta_pitch")
+    turning = bar if corrections.first_order_bar else tuple(f"d{n}" for n in bar)
+    further = [*(TILT if corrections.flapping else ())]
+    further += ["governor"] if corrections.governor else []
+    further += ["vi"] if corrections.dynamic_inflow else []
+    sticks = [n for n in naming.names(Inputs) if n.startswith("x_")]
+    # A stick more, for the throttle alone, or a speed that is no state.
+    given = corrections.collective or corrections.measured_speed
+    speed = () if given else ("Omega",)
+    rotor = () if corrections.measured_speed else ("Omega",)
     return SteadyFlight(
-        ("phi", "theta", "Omega", *inflow, *bar, *HelicopterInputs._fields),
-        ("dx", "dy", "dz", "dphi", "dtheta", "dpsi", *turning, "Omega", *inflow),
+        ("phi", "theta", *speed, *further, *bar, *sticks),
+        ("dx", "dy", "dz", "dphi", "dtheta", "dpsi", *turning, *rotor, *further),
     )
+
+
+def _inputs_class(corrections: Corrections, wind: bool) -> type:
+    sticks = naming.fields(HelicopterInputs)
+    if corrections.collective:
+        throttle = sticks.pop("x_throttle")
+        sticks |= {"x_collective": COLLECTIVE, "x_throttle": throttle}
+    if corrections.measured_speed:
+        # Nothing reads a throttle that is apart from the collective pitch.
+        if corrections.collective:
+            del sticks["x_throttle"]
+        sticks["Omega"] = ROTOR_SPEED
+    if wind:
+        for axis in "xyz":
+            sticks[f"wind_{axis}"] = Annotated[Scalar, "m/s", f"wind along {axis}"]
+    if tuple(sticks) == HelicopterInputs._fields:
+        return HelicopterInputs
+    return NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
 
 
 def _state_class(corrections: Corrections) -> type:
@@ -121,8 +179,16 @@ def _state_class(corrections: Corrections) -> type:
     hints = naming.fields(HelicopterState)
     if corrections.first_order_bar:
         hints = {n: h for n, h in hints.items() if not n.startswith("dbeta")}
+    if corrections.flybarless:
+        hints = {n: h for n, h in hints.items() if "beta_" not in n}
+    if corrections.measured_speed:
+        del hints["Omega"]
+    if corrections.flapping:
+        hints |= TILT
+    if corrections.governor:
+        hints["governor"] = GOVERNOR
     if corrections.dynamic_inflow:
-        hints["vi"] = Annotated[Scalar, "m/s", "induced velocity of the main rotor"]
+        hints["vi"] = INFLOW
     if tuple(hints) == HelicopterState._fields:
         return HelicopterState
     return NamedTuple("HelicopterState", list(hints.items()))  # type: ignore[misc]
@@ -132,7 +198,23 @@ def _start(State: type, p: Helicopter) -> Record:
     """At rest at the origin, the rotor at the speed of the vehicle file."""
     # Zeros made of a parameter have its type and its batch axis.
     zero = 0.0 * p.Omega
-    return State(**{**dict.fromkeys(naming.names(State), zero), "Omega": p.Omega})
+    state = State(**dict.fromkeys(naming.names(State), zero))
+    return naming.replace(state, Omega=p.Omega) if hasattr(state, "Omega") else state
+
+
+class _WithSpeed(NamedTuple):
+    """A state whose rotor speed is an input."""
+
+    state: Record
+    Omega: Scalar
+
+    def __getattr__(self, name: str) -> Scalar:
+        return getattr(self.state, name)
+
+
+def _turning(corrections: Corrections, s: Record, u: Record) -> Record:
+    """The state with the rotor's speed in it, wherever that comes from."""
+    return _WithSpeed(s, u.Omega) if corrections.measured_speed else s
 
 
 # A solver asks for the rates some twenty times: under jit they are traced once.
@@ -141,30 +223,54 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
     # In the order of what needs what: the motion gives the flow, the flow the thrust with its
     # inflow, and these the torque, the forces and the moments. The only loop among them, thrust and
     # inflow, is closed in `aero.thrust`.
+    s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
     air = once(flow(corrections, p, s, u, m))
-    force = main_rotor(p, s, u, air)
-    dOmega = rotor_acceleration(p, s, u, air, force)
-    ddx, ddy, ddz = accelerations(corrections, p, m, force.T)
-    M = moments(corrections, p, s, u, m, force.T, dOmega)
+    force = main_rotor(corrections, p, s, u, air)
+    tail = tail_rotor(corrections, p, u, m, s.Omega, inflow_of(corrections))
+    rotors = Rotors(force, tail)
+    shaft = drive(corrections, p, s, u, air, rotors)
+    hub, aside = _hub(corrections, p, s, u, m, rotors)
+    ddx, ddy, ddz = accelerations(corrections, p, m, force.T, aside)
+    M = moments(corrections, p, hub, rotors, shaft)
     ddphi, ddtheta, ddpsi = angular_accelerations(corrections, p, s, m, M)
     rates = {
         "x": s.dx, "y": s.dy, "z": s.dz,
         "phi": s.dphi, "theta": s.dtheta, "psi": s.dpsi,
         "dx": ddx, "dy": ddy, "dz": ddz,
         "dphi": ddphi, "dtheta": ddtheta, "dpsi": ddpsi,
-        "Omega": dOmega,
+        "Omega": shaft.dOmega,
+        "governor": shaft.dgovernor,
         **_bar(corrections, p, s, u, m),
     }  # fmt: skip
+    if corrections.flapping:
+        rates |= flapping(corrections, p, s, u, m, force)._asdict()
     if corrections.dynamic_inflow:
-        rates["vi"] = aero.inflow_rate(p, force, air.V2)
-    return State(**rates)
+        theory = descent_inflow if corrections.windmill else momentum_theory
+        rates["vi"] = aero.inflow_rate(p, force, theory.mass_flow(force.vi, air.V2, air.W))
+    return State(**{n: rates[n] for n in naming.names(State)})
+
+
+def _hub(
+    corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, rotors: Rotors
+) -> tuple[Moments, tuple[Scalar, Scalar] | None]:
+    """The moments of the main rotor, and the rotors' forces forward and to the right [N]; None
+    where there are none but the thrust along the mast."""
+    left = rotors.tail.T if corrections.tail_force else None
+    if corrections.flapping:
+        loads = hub_loads(p, rotors.main.T, Tilt(s.a1, s.b1))
+        right = loads.right if left is None else loads.right - left
+        return Moments(loads.roll, loads.pitch, loads.yaw), (loads.forward, right)
+    hub = rigid_hub_moments(corrections, p, s, u, m, rotors.main)
+    return hub, None if left is None else (0.0 * left, -left)
 
 
 def _bar(
     corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion
 ) -> dict[str, Scalar]:
     """The flybar's rates, eq. 12 or the first-order bar."""
+    if corrections.flybarless:
+        return {}
     # One bar for roll and one for pitch, each with the body's rate about its own axis.
     if corrections.first_order_bar:
         return {
@@ -183,6 +289,7 @@ def _bar(
 
 def _output(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> HelicopterOutputs:
     """Angles, body rates (as gyros measure them), position and velocity, rotor speed."""
+    s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
     rates, place = (m.p, m.q, m.r), (s.x, s.y, s.z, s.dx, s.dy, s.dz)
     return HelicopterOutputs(s.phi, s.theta, s.psi, *rates, *place, s.Omega)
@@ -198,10 +305,13 @@ _UPRIGHT = 0.1
 
 def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> dict[str, Any]:
     """Where the model's range ends, by name; True where it has been left."""
+    s = _turning(corrections, s, u)
     air = flow(corrections, p, s, u, motion(corrections, s, u))
-    force = main_rotor(p, s, u, air)
+    force = main_rotor(corrections, p, s, u, air)
+    ring = momentum_theory.vortex_ring(air.V2, air.W, force.T0, force.vi)
     outside = {
-        "vortex ring": vortex_ring(air.V2, air.W, force.T0, force.vi),
+        # Momentum theory alone ends there.
+        **({} if corrections.windmill else {"vortex ring": ring}),
         "slow rotor": s.Omega < _SLOWEST * p.Omega,
         "fast flight": (_FASTEST * p.R * s.Omega) ** 2 < air.V2,
     }

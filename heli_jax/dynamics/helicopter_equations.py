@@ -1,4 +1,7 @@
-r"""The equations of the whole helicopter, one after another: eqs 2-10 and 14-19 with corrections.
+r"""The equations of the whole helicopter, one after another: eqs 2-9, 11 and 18 with corrections.
+
+What the rotors and the motor do to the body is in `loads`, and what goes beyond the paper has files
+of its own: `tip_path_plane`, `tail_rotor`, `governor`, `descent_inflow`.
 
 Frames: x forward, y right, z up; phi is positive right side down, theta nose up, psi nose right.
 Body axes are forward, right and down. `helicopter` puts the equations together.
@@ -10,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from heli_jax.dynamics import aerodynamics as aero
-from heli_jax.dynamics import flybar
-from heli_jax.dynamics.helicopter_records import Attitude, Corrections, Motion
+from heli_jax.dynamics import descent_inflow, flybar, inflow
+from heli_jax.dynamics.helicopter_records import Attitude, Corrections, Moments, Motion
 from heli_jax.naming import Record, Scalar
 from heli_jax.numerics.sincos import sincos
 from heli_jax.vehicle import Helicopter
@@ -91,10 +94,33 @@ def cyclic(p: Helicopter, s: Record, u: Record) -> Cyclic:
         s: state, with the names of HelicopterState.
         u: inputs, with the names of HelicopterInputs.
     """
+    if not hasattr(s, "beta_roll"):
+        # Without a bar all of the stick is Bell's path: eq. 11 with L2 = 0.
+        return Cyclic((1.0 / p.L1) * u.x_roll, (1.0 / p.L1) * u.x_pitch)
     return Cyclic(
         flybar.cyclic_pitch(p, u.x_roll, s.beta_roll),
         flybar.cyclic_pitch(p, u.x_pitch, s.beta_pitch),
     )
+
+
+def collective(p: Helicopter, u: Record) -> Scalar:
+    """theta0 [rad], eq. 18: of the collective stick where there is one, else of the throttle.
+
+    Args:
+        p: vehicle, SI.
+        u: inputs, with the names of HelicopterInputs.
+    """
+    return p.K_theta0 * (u.x_collective if hasattr(u, "x_collective") else u.x_throttle)
+
+
+def hub_speed(p: Helicopter, m: Motion) -> tuple[Scalar, Scalar]:
+    """The hub's speed through the air, forward and to the right [m/s].
+
+    Args:
+        p: vehicle, SI.
+        m: the `motion` of the body.
+    """
+    return m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
 
 
 def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion) -> aero.Flow:
@@ -137,7 +163,12 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
     if corrections.cyclic:
         tilt = cyclic(p, s, u)
     if corrections.edgewise:
-        forward_speed, lateral_speed = m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
+        forward_speed, lateral_speed = hub_speed(p, m)
+        if corrections.flapping:
+            # Seen from the tilted plane: less air comes through it, and the blades' pitch to it is
+            # less by the same angle, so that thrust stays and power is that of the tilted thrust.
+            W = W - forward_speed * s.a1 + lateral_speed * s.b1
+            tilt = Cyclic(tilt.roll - s.b1, tilt.pitch - s.a1)
         return aero.Flow(
             forward_speed**2 + lateral_speed**2,
             W,
@@ -149,128 +180,34 @@ def flow(corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motio
     return aero.Flow(speed**2, W, speed * (tilt.roll + tilt.pitch))
 
 
-def main_rotor(p: Helicopter, s: Record, u: Record, air: aero.Flow) -> aero.RotorForce:
+def main_rotor(
+    corrections: Corrections, p: Helicopter, s: Record, u: Record, air: aero.Flow
+) -> aero.RotorForce:
     """Thrust and inflow of the main rotor, eqs 13 and 18; with dynamic inflow vi is a state.
 
     Args:
+        corrections: the switches of the variant.
         p: vehicle, SI.
         s: state, with the names of HelicopterState.
         u: inputs, with the names of HelicopterInputs.
         air: the `flow` at the hub.
     """
     vi = getattr(s, "vi", None)
-    return once(aero.thrust(p, s.Omega, p.K_theta0 * u.x_throttle, air, vi))
+    solve = inflow_of(corrections)
+    return once(aero.thrust(p, s.Omega, collective(p, u), air, vi, solve))
 
 
-def tail_rotor(p: Helicopter, s: Record, u: Record, m: Motion) -> aero.RotorForce:
-    """Thrust and inflow of the tail rotor; a positive thrust turns the nose to the right.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
-    """
-    # Its place is (-L_T, 0, 0) and its thrust points to the left: V2 is in its plane, forward and
-    # down. W grows with the yaw rate that the thrust makes, which is where yaw damping comes from;
-    # eq. 16, without inflow, has none.
-    V2 = m.u**2 + (m.w + p.L_T * m.q) ** 2
-    W = p.L_T * m.r - m.v
-    return once(aero.tail_thrust(p, s.Omega, p.K_theta0T * u.x_yaw, V2, W))
-
-
-def motor_torque(corrections: Corrections, p: Helicopter, u: Record) -> Scalar:
-    """T_m [N m], eq. 19, or as eq. 10 has the motor.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        u: inputs, with the names of HelicopterInputs.
-    """
-    # Eq. 10 accelerates the rotor by K_throttle x_throttle, a torque Ir K_throttle on the fuselage.
-    # K_Tm says the same thing once more: only where the two agree is the motor's torque one number.
-    gain = p.Ir * p.K_throttle if corrections.tied_torque else p.K_Tm
-    return gain * u.x_throttle
-
-
-def rotor_acceleration(
-    p: Helicopter, s: Record, u: Record, air: aero.Flow, force: aero.RotorForce
-) -> Scalar:
-    """dOmega/dt [rad/s^2], eq. 10.
-
-    Args:
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        air: the `flow` at the hub.
-        force: of the main rotor.
-    """
-    # K_throttle x_throttle stands alone: its unit is rad/s^2 per unit of stick, not the one that
-    # the paper's nomenclature says.
-    Q = aero.torque(p, s.Omega, p.K_theta0 * u.x_throttle, air, force.inflow)
-    return p.K_throttle * u.x_throttle - (1.0 / p.Ir) * Q
-
-
-class Moments(NamedTuple):
-    """About the centre of gravity [N m]: roll right, nose up, nose right."""
-
-    roll: Scalar
-    pitch: Scalar
-    yaw: Scalar
-
-
-def moments(
-    corrections: Corrections,
-    p: Helicopter,
-    s: Record,
-    u: Record,
-    m: Motion,
-    T: Scalar,
-    dOmega: Scalar,
-) -> Moments:
-    """The moments of eqs 5-7 and 14-17.
-
-    Args:
-        corrections: the switches of the variant.
-        p: vehicle, SI.
-        s: state, with the names of HelicopterState.
-        u: inputs, with the names of HelicopterInputs.
-        m: the `motion` of that state.
-        T: thrust of the main rotor [N].
-        dOmega: acceleration of the rotor [rad/s^2], eq. 10.
-    """
-    tilt = cyclic(p, s, u)
-    if corrections.rotor_moment:
-        roll = aero.hub_moment(p, s.Omega, tilt.roll, m.p)
-        pitch = aero.hub_moment(p, s.Omega, tilt.pitch, m.q)
-    else:
-        roll = aero.cyclic_moment(p, s.Omega, tilt.roll)
-        pitch = aero.cyclic_moment(p, s.Omega, tilt.pitch)
-    yaw = _yaw_moment(corrections, p, s, u, m, dOmega)
-    # Eq. 6's -T lr: the rotor axis stands behind the centre of gravity, and lifts the tail.
-    return once(Moments(roll, pitch - T * p.lr, yaw))
-
-
-def _yaw_moment(
-    corrections: Corrections, p: Helicopter, s: Record, u: Record, m: Motion, dOmega: Scalar
-) -> Scalar:
-    """M_psi and what the motor does, eqs 7, 16 and 19 [N m]."""
-    # Trim needs M_psi = -T_m: x_yaw K_theta0T is negative in hover.
-    if corrections.tail:
-        yaw = p.L_T * tail_rotor(p, s, u, m).T
-    else:
-        yaw = aero.tail_moment(p, s.Omega, p.K_theta0T * u.x_yaw)
-    yaw = yaw + motor_torque(corrections, p, u)
-    # The fuselage feels the motor's torque T_m alone. Eq. 7 has -Ir dOmega beside it, the motor a
-    # second time: by eq. 10 that takes T_m off again and leaves the rotor's drag torque, which
-    # follows a throttle step only as the rotor speeds up. Trim, where dOmega = 0, stays the same.
-    if not corrections.reaction:
-        yaw = yaw - p.Ir * dOmega
-    return yaw
+def inflow_of(corrections: Corrections) -> aero.Inflow:
+    """How the induced velocity follows: momentum theory, or with the windmill branch."""
+    return descent_inflow.induced_velocity if corrections.windmill else inflow.induced_velocity
 
 
 def accelerations(
-    corrections: Corrections, p: Helicopter, m: Motion, T: Scalar
+    corrections: Corrections,
+    p: Helicopter,
+    m: Motion,
+    T: Scalar,
+    aside: tuple[Scalar, Scalar] | None = None,
 ) -> tuple[Scalar, Scalar, Scalar]:
     r"""Accelerations along x, y and z [m/s^2], eqs 2-4.
 
@@ -287,6 +224,7 @@ def accelerations(
         p: vehicle, SI.
         m: the `motion` of that state.
         T: thrust of the main rotor [N].
+        aside: forces of the rotors forward and to the right, beside T [N].
     """
     at, pull = m.at, (1.0 / p.m) * T
     if corrections.direction:
@@ -296,19 +234,22 @@ def accelerations(
         # cos(psi) in both: at psi = 90 degrees nothing accelerates horizontally. As printed.
         ddx, ddy = -pull * at.sth * at.cpsi, pull * at.sphi * at.cpsi
     ddz = pull * at.cphi * at.cth - p.g
-    if not corrections.drag:
+    if not corrections.drag and aside is None:
         return ddx, ddy, ddz
-    slowed = _drag(p, m)
+    slowed = _drag(p, m) if corrections.drag else (0.0 * pull, 0.0 * pull, 0.0 * pull)
+    if aside is not None:
+        slowed = (slowed[0] - (1.0 / p.m) * aside[0], slowed[1] - (1.0 / p.m) * aside[1], slowed[2])
+    slowed = _to_earth(at, *slowed)
     return ddx - slowed[0], ddy - slowed[1], ddz - slowed[2]
 
 
 def _drag(p: Helicopter, m: Motion) -> tuple[Scalar, ...]:
-    """What drag takes off the accelerations along x, y and z [m/s^2]."""
+    """What drag takes off the accelerations forward, right and down [m/s^2]."""
     square = m.u**2 + m.v**2 + m.w**2
     # The root of a speed of zero has no derivative; this one has, and gives zero drag there.
     speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
     factor = once((0.5 * p.rho / p.m) * speed)
-    return _to_earth(m.at, factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w)
+    return factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w
 
 
 def angular_accelerations(

@@ -32,6 +32,21 @@ class HelicopterInputs(NamedTuple):
     x_throttle: Annotated[Scalar, "1", "throttle stick"]
 
 
+COLLECTIVE = Annotated[Scalar, "1", "collective stick"]
+"""an input of its own where collective and throttle are apart"""
+ROTOR_SPEED = Annotated[Scalar, "rad/s", "rotor speed, measured"]
+"""an input where the rotor's speed is measured and no motor is modelled"""
+TILT = {
+    "a1": Annotated[Scalar, "rad", "tip-path plane, back"],
+    "b1": Annotated[Scalar, "rad", "tip-path plane, right"],
+}
+"""the states of flapping"""
+GOVERNOR = Annotated[Scalar, "1", "governor: integral part of the throttle"]
+"""the state of the governor"""
+INFLOW = Annotated[Scalar, "m/s", "induced velocity of the main rotor"]
+"""the state of dynamic inflow"""
+
+
 class HelicopterOutputs(NamedTuple):
     roll: Annotated[Scalar, "rad", "roll angle"]
     pitch: Annotated[Scalar, "rad", "pitch angle"]
@@ -49,7 +64,7 @@ class HelicopterOutputs(NamedTuple):
 
 
 class Corrections(NamedTuple):
-    """What of the paper is corrected; each for itself."""
+    """What of the paper is corrected or added; each for itself."""
 
     direction: bool = False
     """eqs 2-3: thrust along the mast at any heading (printed, they hold near psi = 0)"""
@@ -75,6 +90,26 @@ class Corrections(NamedTuple):
     """eqs 2-4: drag of the fuselage by its equivalent areas Sx, Sy, Sz"""
     dynamic_inflow: bool = False
     """momentum theory with the inertia of the air (Carpenter and Fridovich, 1953): a state vi"""
+    flapping: bool = False
+    """eqs 14-15: the rotor tilts first (states a1, b1); its stiffness and in-plane forces act"""
+    speed_stability: bool = False
+    """the first harmonic of the lift in a speed: the rotor tilts back from where it flies to"""
+    tip_loss: bool = False
+    """eqs 14-15: the lift ends at B R, as in eqs 10 and 13"""
+    tail_force: bool = False
+    """eqs 2-3, 5: the tail rotor's thrust is a force at its place, not a moment alone"""
+    tail_power: bool = False
+    """eqs 7, 10: the tail rotor takes its power from the main rotor's shaft"""
+    windmill: bool = False
+    """descents through the rotor's own wake by the measured curve, and the windmill beyond"""
+    collective: bool = False
+    """eqs 18-19: an input x_collective for the pitch; x_throttle is left with the motor"""
+    governor: bool = False
+    """eq. 10: the throttle is a governor's, which holds the speed that x_throttle asks for"""
+    measured_speed: bool = False
+    """in place of eq. 10: the rotor's speed is an input Omega, and no motor is modelled"""
+    flybarless: bool = False
+    """eqs 11-12: no flybar; all of the cyclic stick goes to the blades"""
 
 
 class Attitude(NamedTuple):
@@ -104,3 +139,11 @@ class Motion(NamedTuple):
     """rates of roll, pitch and yaw [rad/s]"""
     q: Scalar
     r: Scalar
+
+
+class Moments(NamedTuple):
+    """About the centre of gravity [N m]: roll right, nose up, nose right."""
+
+    roll: Scalar
+    pitch: Scalar
+    yaw: Scalar

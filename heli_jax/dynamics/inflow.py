@@ -76,6 +76,17 @@ def _induced_velocity_jvp(
     return v, (dT0 - v * db - (v / s) * dV2 - (2.0 * v * w / s) * dW) / slope
 
 
+def mass_flow(v: Scalar, V2: Scalar, W: Scalar) -> Scalar:
+    """The flow sqrt(V^2 + (W + v)^2) through the rotor [m/s].
+
+    Args:
+        v: induced velocity [m/s].
+        V2: square of the airspeed in the plane of the rotor [m^2/s^2].
+        W: airspeed through the rotor against the thrust [m/s].
+    """
+    return jnp.sqrt(V2 + (W + v) ** 2 + _REST**2)
+
+
 def vortex_ring(V2: Scalar, W: Scalar, T0: Scalar, v: Scalar) -> Bool[Array, ""]:
     """Whether momentum theory has left its range: in a descent through the rotor's own wake.
 

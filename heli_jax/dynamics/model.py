@@ -33,6 +33,23 @@ class Axis(NamedTuple):
     """the input that turns the machine about this axis"""
     flybar: tuple[str, ...] = ()
     """the states of the flybar that belong to it"""
+    tilt: tuple[str, ...] = ()
+    """the states of the main rotor's tip-path plane that belong to it"""
+
+
+class Disturbance(NamedTuple):
+    """A random push on the derivative of one state, by the names of what a model has of it."""
+
+    name: str
+    """as it was asked for: an axis or a state"""
+    state: str
+    """whose derivative it adds to"""
+    sigma: str
+    """the parameter that is its standard deviation"""
+    tau: str
+    """the parameter that is its correlation time [s]"""
+    lags: tuple[str, ...] = ()
+    """its own states, the one that is driven by white noise first"""
 
 
 class SteadyFlight(NamedTuple):
@@ -96,6 +113,8 @@ class Model(eqx.Module):
     parameter that is its delay [s]"""
     positive: tuple[str, ...] = eqx.field(static=True, default=())
     """the parameters that are above zero whatever else may change its sign"""
+    disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
+    """what `with_disturbance` added; filter error estimates its parameters by itself"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
@@ -141,9 +160,18 @@ def zeros(record: type, dtype: DTypeLike | None = None) -> Record:
     return record(**{name: jnp.zeros((), dtype) for name in naming.names(record)})
 
 
-ROLL = Axis("roll", "dphi", "phi", "Ixx", "Ixx_added", "x_roll", ("beta_roll", "dbeta_roll"))
+ROLL = Axis(
+    "roll", "dphi", "phi", "Ixx", "Ixx_added", "x_roll", ("beta_roll", "dbeta_roll"), ("b1",)
+)
 PITCH = Axis(
-    "pitch", "dtheta", "theta", "Iyy", "Iyy_added", "x_pitch", ("beta_pitch", "dbeta_pitch")
+    "pitch",
+    "dtheta",
+    "theta",
+    "Iyy",
+    "Iyy_added",
+    "x_pitch",
+    ("beta_pitch", "dbeta_pitch"),
+    ("a1",),
 )
 YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
 """The axes under the names that they have in the models here."""
@@ -161,6 +189,7 @@ def axes_of(model: Model) -> tuple[Axis, ...]:
         axis._replace(
             angle=axis.angle if axis.angle in states else None,
             flybar=tuple(n for n in axis.flybar if n in states),
+            tilt=tuple(n for n in axis.tilt if n in states),
         )
         for axis in (ROLL, PITCH, YAW)
         if axis.rate in states

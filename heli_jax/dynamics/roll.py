@@ -133,7 +133,7 @@ roll = Model(
     RollInputs,
     RollOutputs,
     linear=True,
-    axes=(ROLL,),
+    axes=(ROLL._replace(tilt=()),),
 )
 """Free roll at constant rotor speed: eqs 21-22."""
 
@@ -146,7 +146,7 @@ pitch = Model(
     PitchInputs,
     PitchOutputs,
     linear=True,
-    axes=(PITCH,),
+    axes=(PITCH._replace(tilt=()),),
 )
 """Free pitch at constant rotor speed: eqs 21-22 with Iyy."""
 

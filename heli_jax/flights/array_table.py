@@ -179,7 +179,7 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         def visit(name: str, item: Any) -> None:
             nonlocal cells
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim <= 2:
-                cells += item.size
+                cells += int(item.size or 0)  # an empty dataset has none
                 _require_few_cells(path, cells)
                 dotted = name.replace("/", ".") if kind == "mat 7.3" else name
                 for part, values in _vectors(dotted, np.asarray(item)):

@@ -194,7 +194,8 @@ def _topic(
         if values.dtype.kind == "S":
             continue
         if factor is not None and not scaled:
-            values = values * factor
+            # 718 / 100 is the number nearest to 7.18, 718 * 0.01 is not.
+            values = values / round(1.0 / factor) if factor < 1.0 else values * factor
         parts = {f"[{i}]": values[:, i] for i in range(values.shape[1])} if values.ndim > 1 else {}
         for end, part in (parts or {"": values}).items():
             columns[f"{name}.{column}{end}"] = part

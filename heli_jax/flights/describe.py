@@ -18,7 +18,7 @@ from heli_jax.flights.grid import (
     rounding_of,
     uniform_grid,
 )
-from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
@@ -191,7 +191,7 @@ def _describe_channels(log: ChannelLog) -> LogInfo:
 
 def _describe_topic(topic: Topic) -> TopicInfo:
     columns = tuple(
-        _describe_column(Survey(name, np.asarray(x, np.float64), x.size), topic.units.get(name, ""))
+        _describe_column(Survey(name, as_floats(x), x.size), topic.units.get(name, ""))
         for name, x in topic.columns.items()
     )
     time = _describe_stamps(topic.clock, "s", topic.times) if topic.clock else None

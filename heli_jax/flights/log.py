@@ -107,7 +107,14 @@ class ChannelLog:
         if not topic.clock:
             problem = "its rows have an order and no times, so nothing can be fitted to them"
             raise wrong(self.path, problem, f"channel {shown(name)}")
-        return Channel(topic.times, np.asarray(topic.columns[name], np.float64))
+        return Channel(topic.times, as_floats(topic.columns[name]))
+
+
+def as_floats(values: np.ndarray) -> np.ndarray:
+    """Samples (N,) of any type as float64."""
+    # Damage can make a NaN of a kind that a conversion warns of; it stays NaN.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(values, np.float64)
 
 
 def require_samples(path: str, topics: Sequence[Topic]) -> None:

@@ -52,12 +52,13 @@ def open_log(path: str | Path, flight: int | None = None) -> Table | ChannelLog:
     logs = chosen_flights(path, open_flights(path), flight)
     if not isinstance(logs, tuple):
         return logs
-    if len(logs) > 1:
-        numbers = [str(log.flight[0]) for log in logs]
+    log, *others = logs
+    if others:
+        numbers = [str(one.flight[0]) for one in logs]
         known = ", ".join(numbers[:20]) + (", ..." if len(numbers) > 20 else "")
         problem = f"holds {len(logs)} flights, expected the number of one: {known}"
         raise wrong(str(path), problem)
-    return logs[0]
+    return log
 
 
 def chosen_flights(

@@ -20,6 +20,9 @@ _FEWEST = 8
 _MOST_UPSAMPLING = 100
 """times the fastest topic's rate: more is a slip, and fills the memory with straight lines"""
 
+_MOST_GAPS = 20
+"""times the samples that there are"""
+
 _Key = tuple[str, str]
 """a model's name, and `input` or `output`"""
 
@@ -240,5 +243,10 @@ def common_times(path: str, clocks: list[TopicClock], rate: float) -> np.ndarray
     if not (rate * fastest <= _MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for topics of at most {1 / fastest:.4g} Hz"
         raise wrong(path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")
+    # One wrong stamp at the end of a damaged log would otherwise fill the memory.
+    most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
+    if count > most:
+        problem = f"the times go over {end - start:.6g} s, of which samples cover less than 5 %"
+        raise wrong(path, f"{problem}, expected a window without such gaps")
     # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     return start + np.arange(int(count + 1e-6) + 1) / rate

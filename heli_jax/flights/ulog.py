@@ -250,9 +250,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
         several = sum(other == name for other, _ in merged) > 1
         shown = f"{name}[{instance}]" if several or instance else name
         clock = _clock(rows)
-        columns = {
-            f"{shown}.{n}": rows[n] for n in rows.dtype.names or () if not n.startswith("_padding")
-        }
+        columns = {f"{shown}.{n}": rows[n] for n in rows.dtype.names or () if "_padding" not in n}
         units = {f"{shown}.{n}": "us" for n in ("timestamp", "timestamp_sample")}
         units = {n: unit for n, unit in units.items() if n in columns}
         topics.append(Topic(shown, rows[clock] * 1e-6, columns, units, clock))

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.agreement import (
     correlated_residuals,
     free_runs,
@@ -21,6 +22,7 @@ from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
@@ -112,16 +114,19 @@ class _Numbers(NamedTuple):
 
 
 def _numbers(
-    problem: Problem, at: Solution, e: Evaluation, errors: StandardErrors, *, none: bool
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    errors: StandardErrors,
+    absent: tuple[str, ...],
 ) -> _Numbers:
-    """The estimates; `none`: a disturbance was looked for and does not show."""
+    """The estimates; `absent`: the parameters of disturbances that do not show."""
     layout = at.layout
     verdict, wider, quantiles, _ = errors
     of_interest = estimates_of(problem, layout, e, verdict, quantiles, wider)
     nuisance = {k: v for k, v in of_interest.items() if k not in layout.free}
     nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
-    if none:
-        nuisance |= {name: _absent(name, nuisance[name]) for name in layout.disturbance}
+    nuisance |= {n: _absent(nuisance[n], gone=n in layout.sigmas) for n in absent}
     sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
     return _Numbers(of_interest, nuisance, sds, ill)
@@ -141,13 +146,14 @@ def assemble(
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
     # The optimiser keeps only what it minimises; signals and Jacobian are those of its last point.
     e = evaluate(layout, data, noise, best.z)
-    signals, none = signals_of(e, problem.training), _no_disturbance(optimum)
+    signals, absent = signals_of(e, problem.training), _absent_names(layout, optimum)
+    none = bool(layout.disturbance) and set(layout.disturbance) <= set(absent)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
     solution = Solution(layout, data, noise, best.z)
     errors = standard_errors(problem, solution, e, run.before, white=all_white)
-    numbers = _numbers(problem, solution, e, errors, none=none)
+    numbers = _numbers(problem, solution, e, errors, absent)
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
@@ -171,7 +177,7 @@ def assemble(
         verdict=errors.verdict,
         noise=numbers.noise,
         log_likelihood=layout.estimator.log_likelihood(layout, data, noise, e),
-        unknowns=_unknowns(layout, none=none),
+        unknowns=_unknowns(layout, len(absent)),
         signals=(*signals, *held.signals),
         metrics=pooled_metrics(signals),
         validation=pooled_metrics(held.signals),
@@ -213,11 +219,17 @@ def _params(problem: Problem, estimates: dict[str, Estimate]) -> Any:
     return naming.replace(problem.vehicle, **values)
 
 
-def _unknowns(layout: Layout, *, none: bool) -> int:
-    """All that was estimated; a disturbance that does not show is not among it."""
+def _absent_names(layout: Layout, optimum: RelaxedOptimum) -> tuple[str, ...]:
+    """The parameters of all disturbances that do not show."""
+    return layout.disturbance if _no_disturbance(optimum) else optimum.absent
+
+
+def _unknowns(layout: Layout, absent: int) -> int:
+    """All that was estimated; disturbances that do not show, of so many parameters, are not among
+    it."""
     # AIC and BIC count them: with sigma_w = 0 the correlation time has no meaning either.
     estimated = layout.determined + layout.estimator.noise_unknowns(layout)
-    return estimated - (len(layout.disturbance) if none else 0)
+    return estimated - absent
 
 
 def _notes(
@@ -237,13 +249,15 @@ def _notes(
     layout, data, best = search.layout, search.data, optimum.best
     # Whether the sample time is short enough is a question to the estimated machine.
     values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
-    none = _no_disturbance(optimum)
+    none, absent = _no_disturbance(optimum), _absent_names(layout, optimum)
     # An optimiser that has not arrived comes first: it makes all else doubtful.
     return [
         *_stopped_notes(layout, best, optimum),
         *excitation.sampling(problem, values),
         *_disturbance_notes(optimum.ratio if none else None),
-        *([] if none else extreme_noise_notes(layout, data, best.z)),
+        *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
+        *_absent_notes(layout, optimum.absent),
+        *of_disturbances(layout, e, absent),
         *optimum.notes,
         *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
         *stated_noise_notes(problem, numbers.noise),
@@ -263,10 +277,9 @@ def _status(best: Optimum, e: Evaluation, numbers: _Numbers, verdict: Verdict) -
     return "converged" if verdict.identifiable else "not-identifiable"
 
 
-def _absent(name: str, estimate: Estimate) -> Estimate:
-    """The estimate of a disturbance parameter where no disturbance shows."""
+def _absent(estimate: Estimate, *, gone: bool) -> Estimate:
+    """The estimate of a disturbance parameter where no disturbance shows; `gone`: it is a size."""
     # Its size is then zero, at its bound; its correlation time means nothing.
-    gone = name == "sigma_w"
     value = 0.0 if gone else estimate.value
     return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
 
@@ -316,6 +329,17 @@ def _disturbance_notes(ratio: float | None) -> list[str]:
     return [
         "No disturbance shows in the record (twice the log-likelihood gained by one is "
         f"{ratio:.2g}): output error suffices, and these are its numbers."
+    ]
+
+
+def _absent_notes(layout: Layout, absent: tuple[str, ...]) -> list[str]:
+    """Which of several disturbances do not show."""
+    names = [d.name for d in disturbances_of(layout.model) if d.sigma in absent]
+    if not names:
+        return []
+    return [
+        f"No disturbance shows on {', '.join(names)} (twice the log-likelihood gained by each is "
+        f"below {NO_DISTURBANCE:g}): the fit goes without."
     ]
 
 

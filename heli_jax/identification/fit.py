@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float
 
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
@@ -19,6 +20,8 @@ from heli_jax.identification.estimation.noise_covariance import (
     relax_noise_covariance,
 )
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
+from heli_jax.identification.estimation.which_disturbances import those_that_show
+from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
@@ -79,6 +82,7 @@ def check(problem: Problem) -> Check:
     notes += feedback_notes(problem, feedback_of(problem))
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
+    notes += tuple(of_disturbances(guess.layout, guess.e))
     notes += other_hold(problem, Solution(*guess[:4]), guess.e, skip=not_identifiable)
     guessed = tuple(
         f"{label}/{name}"
@@ -128,7 +132,7 @@ def fit(
         points = delay_starts(layout, problem, guess.z, seed)
     else:
         points = starting.draw(layout, problem, guess.z, starts, seed)
-    disturbed = "sigma_w" in layout.disturbance
+    disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
     search = starting.Search(
@@ -146,6 +150,8 @@ def fit(
     optimum = better_of_two_guesses(search, points, optimum, problem.training)
     search.max_steps = max_steps
     if disturbed:
-        optimum = disturbance_or_none(search, optimum)
+        several = len(disturbances_of(problem.model)) > 1
+        which = those_that_show if several else disturbance_or_none
+        optimum = which(search, optimum)
     timing = {"fit": time.perf_counter() - began}
     return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))

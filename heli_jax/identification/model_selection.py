@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import scipy.special
 
 from heli_jax import naming
-from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import fit
 from heli_jax.identification.problem import Free, Problem
@@ -155,7 +155,10 @@ def choose(
     compared = [_test(candidates[a], candidates[b]) for a, b in pairs]
     tests = [t for t in compared if t.degrees > 0]
     # A fit that has not arrived has a likelihood too, of no optimum: it comes last, whatever it is.
-    ranked = tuple(sorted(candidates.values(), key=lambda c: (c.status == "not-converged", c.aic)))
+    # Rounded, since a disturbance that does not show leaves the same model: the one named first.
+    ranked = tuple(
+        sorted(candidates.values(), key=lambda c: (c.status == "not-converged", round(c.aic, 1)))
+    )
     sentences += _sentences(ranked, tests)
     sentences += [
         f"{t.small} within {t.large}: the larger one has no unknown more, so there is no test."
@@ -222,14 +225,19 @@ def _none_below_its_part(
 
 
 def _alike(problems: Mapping[str, Problem]) -> list[tuple[str, str]]:
-    """Pairs of models with the same parameters, each with a disturbance of its own."""
+    """Pairs of models with the same parameters and disturbances on the same states, which differ
+    in their kind."""
     with_noise = [name for name, problem in problems.items() if problem.noise]
+
+    def disturbed(name: str) -> set[str]:
+        return {d.state for d in disturbances_of(problems[name].model)}
+
     # Neither is nested in the other, but a disturbance seldom moves parameters far.
     return [
         (a, b)
         for a in with_noise
         for b in with_noise
-        if a != b and problems[a].free == problems[b].free
+        if a != b and problems[a].free == problems[b].free and disturbed(a) == disturbed(b)
     ]
 
 
@@ -257,11 +265,19 @@ def begun_from(problem: Problem, nested: Problem, optimum: Fit) -> Problem:
         free[name] = parameter._replace(start=_inside(parameter, value))
     # A disturbance that did not show ended at zero: this one then begins where it always does.
     noise = {
-        n: jnp.asarray(optimum.nuisance[n].value)
-        for n in problem.noise
-        if n in optimum.nuisance and optimum.nuisance[n].value > 0
+        n: jnp.asarray(optimum.nuisance[m].value)
+        for n, m in same_parameters(problem.model, nested.model).items()
+        if n in problem.noise and m in optimum.nuisance and optimum.nuisance[m].value > 0
     }
     return replace(problem, free=free, vehicle=naming.replace(problem.vehicle, **noise))
+
+
+def same_parameters(model: Model, other: Model) -> dict[str, str]:
+    """By the name of a disturbance's parameter that of the same one in another model, where one
+    disturbance alone is called sigma_w and one of several sigma_w_p."""
+    by_state = {d.state: d for d in disturbances_of(other)}
+    pairs = [(d, by_state[d.state]) for d in disturbances_of(model) if d.state in by_state]
+    return {n: m for d, o in pairs for n, m in ((d.sigma, o.sigma), (d.tau, o.tau))}
 
 
 def _inside(free: Free, value: float) -> float:

@@ -1,5 +1,6 @@
 """Problem: what is fitted to what."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,12 +11,14 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.push_scale import push_scales
 from heli_jax.vehicle import Helicopter, impossible, of_helicopter
 
 
@@ -41,7 +44,6 @@ class Nuisance(NamedTuple):
 # `Any` stands for Params, a class of the user's, here and below.
 __all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
 
-_FIXABLE = ("sigma_w", "tau_w", "sigma_y")
 _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
 _PER_PARAMETER = 3
@@ -78,8 +80,9 @@ class Problem:
     """output-error compares with a simulation; filter-error with one-step predictions of a
     Kalman filter, for models with a disturbance (`with_disturbance`)"""
     fixed_noise: tuple[str, ...] = ()
-    """what filter error takes as given instead of estimating it: `sigma_w` and `tau_w` from
-    `vehicle`, `sigma_y` (the measurement noise) from the flights' `sd`"""
+    """what filter error takes as given instead of estimating it: `sigma_w` and `tau_w` (of several
+    disturbances `sigma_w_p`, ...) from `vehicle`, `sigma_y` (the measurement noise) from the
+    flights' `sd`"""
     window: float | None = None
     """multiple shooting: flights are simulated in windows of this length [s], each from an initial
     state of its own, because the error of an initial state grows in unstable flight"""
@@ -121,21 +124,46 @@ class Problem:
 
     @property
     def noise(self) -> dict[str, Free]:
-        """The parameters of the disturbance that filter error estimates, with their starts."""
+        """The parameters of the disturbances that filter error estimates, with their starts."""
         if not estimator_of(self.method).process_noise:
             return {}
         # Of the size of the motion, and a second: a coarse search takes it from there.
-        free = {"sigma_w": Free(self.motion), "tau_w": Free(1.0)}
+        sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
+        free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 free[name] = Free(value)
-        return {n: f for n, f in free.items() if n not in self.fixed_noise}
+        return free
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """The parameters of the disturbances that filter error estimates."""
+        if not estimator_of(self.method).process_noise:
+            return ()
+        names = [n for d in disturbances_of(self.model) for n in (d.sigma, d.tau)]
+        return tuple(n for n in names if n not in self.fixed_noise)
 
     @property
     def noise_is_fixed(self) -> bool:
         """Whether the measurement noise is taken as stated."""
         return estimator_of(self.method).process_noise and "sigma_y" in self.fixed_noise
+
+    @functools.cached_property
+    def push_scales(self) -> dict[str, float]:
+        """By the name of its sigma how large each of several disturbances may be, SI; of a single
+        one it is the motion."""
+        disturbances = disturbances_of(self.model)
+        if len(disturbances) < 2:
+            return {}
+        flight = self.training[0]
+        sds = {
+            n: max(float(np.nanstd(f.outputs[n])) for f in self.training if n in f.outputs)
+            for n in sorted({n for f in self.training for n in f.outputs})
+        }
+        params = naming.replace(self.start_params(), **flight.known)
+        first = {n: float(flight.inputs[n][0]) for n in naming.names(self.model.Inputs)}
+        return push_scales(self.model, params, first, sds, disturbances)
 
     @property
     def motion(self) -> float:
@@ -169,17 +197,19 @@ def _check_method(problem: Problem) -> None:
     model = problem.model
     if not estimator_of(problem.method).process_noise:
         return
-    have = naming.names(model.Params)
-    if model.noise_intensity is None or "sigma_w" not in have or "tau_w" not in have:
+    if model.noise_intensity is None:
         raise ValueError(
             f"method {problem.method}: model {model.name} has no disturbance, expected a model "
-            "made with with_disturbance (in a configuration: a `disturbance`)"
+            "made with with_disturbance (in a configuration: a `disturbance`) or with a "
+            "noise_intensity of its own"
         )
-    if not all(n in _FIXABLE for n in problem.fixed_noise):
+    estimated = [n for d in disturbances_of(model) for n in (d.sigma, d.tau)]
+    if not all(n in (*estimated, "sigma_y") for n in problem.fixed_noise):
         raise ValueError(
-            f"fixed_noise: expected some of {', '.join(_FIXABLE)}, got {problem.fixed_noise}"
+            f"fixed_noise: expected some of {', '.join((*estimated, 'sigma_y'))}, got "
+            f"{', '.join(problem.fixed_noise)}"
         )
-    for name in ("sigma_w", "tau_w"):
+    for name in estimated:
         if name in problem.free:
             raise ValueError(f"free.{name}: {problem.method} estimates it by itself, leave it out")
         value = float(getattr(problem.vehicle, name))
@@ -280,7 +310,7 @@ def _check_known(flight: Flight, problem: Problem, where: str) -> None:
                 f"{where}, known.{name}: model {model.name} has no such parameter"
                 f"{nearest(name, naming.names(model.Params))}"
             )
-        if name in problem.free or name in problem.noise:
+        if name in problem.free or name in problem.noise_names:
             raise ValueError(f"{where}, known.{name}: expected known or free, got both")
         if not math.isfinite(value):
             raise ValueError(f"{where}, known.{name}: expected a finite number, got {value}")

@@ -18,7 +18,7 @@ STICKS = ("x_roll", "x_pitch", "x_yaw")
 @pytest.fixture(scope="module")
 def hover(vehicles_folder):
     vehicle = load_vehicle(vehicles_folder / "x-cell-60.yaml")
-    model = models.by_name("helicopter")
+    model = models.by_name("helicopter-consistent")
     found = trim(model, vehicle)
     return model, vehicle, found, piloting.attitude_hold(model, vehicle, found)
 

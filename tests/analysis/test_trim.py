@@ -11,6 +11,7 @@ from heli_jax.analysis.linear import eigenmodes, modes
 from heli_jax.analysis.trim import Condition, equilibrium
 from heli_jax.config.schema import StartConfig
 from heli_jax.dynamics import helicopter as whole
+from tests.dynamics import full_helicopter as second
 from tests.dynamics import whole_helicopter as oracle
 
 # As listed in the paper's reading; it has 0.006 for the slowest pair of `consistent`, which comes
@@ -47,7 +48,7 @@ def test_hover_has_the_numbers_of_the_reading(hovers, xcell):
     s, u = hovers["consistent"].state, hovers["consistent"].inputs
     how = whole.Corrections(*[True] * 11)
     air = whole.flow(how, xcell, s, u, whole.motion(how, s, u))
-    force = whole.main_rotor(xcell, s, u, air)
+    force = whole.main_rotor(how, xcell, s, u, air)
     theta0 = xcell.K_theta0 * u.x_throttle
     Q = whole.aero.torque(xcell, s.Omega, theta0, air, force.inflow)
     assert np.degrees(float(theta0)) == pytest.approx(8.65, rel=5e-3)
@@ -69,7 +70,7 @@ def test_eigenvalues_are_those_of_the_reading(variant, hovers, xcell):
 
 
 def test_modes_have_names(hovers, xcell):
-    model, found = models.helicopter(), hovers["consistent"]
+    model, found = models.helicopter("consistent"), hovers["consistent"]
     named = eigenmodes(model, xcell, found.state, found.inputs)
     by_name = {m.name: m for m in named}
     assert by_name["roll with flybar roll"].frequency == pytest.approx(18.5, rel=0.01)
@@ -82,7 +83,7 @@ def test_modes_have_names(hovers, xcell):
 
 def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
     found = hovers["consistent"]
-    lin = linearize(models.helicopter(), xcell, found.state, found.inputs)
+    lin = linearize(models.helicopter("consistent"), xcell, found.state, found.inputs)
     system = lin.to_control()
     assert isinstance(system, control.StateSpace)
     assert system.state_labels == list(lin.states)
@@ -110,7 +111,7 @@ def test_linearisation_has_names_and_becomes_a_control_system(hovers, xcell):
 )
 def test_steady_flights_are_steady(condition, xcell):
     """With drag, by the second program's derivatives."""
-    model = models.helicopter()
+    model = models.helicopter("consistent")
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
     found = trim(model, p, condition)
     s = {n: float(v) for n, v in naming.asdict(found.state).items()}
@@ -143,14 +144,14 @@ def test_the_old_names_of_the_speeds_are_accepted_with_a_warning():
 
 def test_hover_in_a_wind_is_flight_the_other_way(xcell):
     p = naming.replace(xcell, Sx=jnp.asarray(0.1), Sy=jnp.asarray(0.22), Sz=jnp.asarray(0.15))
-    still = trim(models.helicopter(), p, Condition(forward_speed=6.0))
-    blown = trim(models.helicopter(wind=True), p, wind=(-6.0, 0.0, 0.0))
+    still = trim(models.helicopter("consistent"), p, Condition(forward_speed=6.0))
+    blown = trim(models.helicopter("consistent", wind=True), p, wind=(-6.0, 0.0, 0.0))
     assert float(blown.state.theta) == pytest.approx(float(still.state.theta), abs=1e-12)
     assert float(blown.inputs.x_throttle) == pytest.approx(float(still.inputs.x_throttle))
 
 
 def test_trim_has_the_derivative_of_a_root(xcell):
-    model = models.helicopter()
+    model = models.helicopter("consistent")
 
     def throttle(m):
         return equilibrium(model, naming.replace(xcell, m=m)).inputs.x_throttle
@@ -172,17 +173,146 @@ def test_trim_has_the_derivative_of_a_root(xcell):
 def test_a_vehicle_that_cannot_hover_is_refused_with_the_reason(xcell, changes, words):
     changed = naming.replace(xcell, **{n: jnp.asarray(v) for n, v in changes.items()})
     with pytest.raises(ValueError, match=f"no trim of hover: expected {words}"):
-        trim(models.helicopter(), changed)
+        trim(models.helicopter("consistent"), changed)
 
 
 def test_flights_that_do_not_exist_are_refused(xcell, bench30):
     with pytest.raises(ValueError, match=r"within the model's range: vortex ring"):
-        trim(models.helicopter(), xcell, Condition(climb=-4.0))
+        trim(models.helicopter("consistent"), xcell, Condition(climb=-4.0))
     with pytest.raises(ValueError, match="exists for this vehicle: the nearest leaves"):
-        trim(models.helicopter(), naming.replace(xcell, m=jnp.asarray(400.0)))
+        trim(models.helicopter("consistent"), naming.replace(xcell, m=jnp.asarray(400.0)))
     with pytest.raises(ValueError, match=r"expected the full nonlinear model, .* got roll"):
         trim(models.roll, bench30)
     with pytest.raises(ValueError, match="has no stick 'x_rudder'"):
-        trim(models.helicopter(), xcell, sticks={"x_rudder": (-1.0, 1.0)})
+        trim(models.helicopter("consistent"), xcell, sticks={"x_rudder": (-1.0, 1.0)})
     with pytest.raises(ValueError, match=r"Iyy, .* missing"):
-        trim(models.helicopter(), bench30)
+        trim(models.helicopter("consistent"), bench30)
+
+
+# The variant `full`.
+
+
+@pytest.fixture(scope="module")
+def full(xcell):
+    model = models.helicopter()
+    return model, trim(model, xcell)
+
+
+def test_hover_banks_so_that_the_side_forces_balance(full, xcell):
+    """Weight along the body's y axis, the tilted thrust and the tail rotor's thrust add to zero."""
+    model, found = full
+    assert found.residual < 1e-10
+    s = {n: float(v) for n, v in naming.asdict(found.state).items()}
+    u = {n: float(v) for n, v in naming.asdict(found.inputs).items()}
+    rates = second.rates(second.FULL, s, u)
+    assert max(abs(rates[n]) for n in model.steady_flight.equations) < 1e-9
+    # The tail rotor pulls to the right (it turns the nose to the left), so the machine banks left.
+    weight = second.FULL["m"] * second.FULL["g"]
+    tail = weight * np.sin(-s["phi"]) * np.cos(s["theta"]) - weight * s["b1"]
+    assert tail == pytest.approx(3.52, rel=0.05)  # as models.md has it
+    assert np.degrees(-s["phi"]) == pytest.approx(2.3, abs=0.3)
+    assert s["Omega"] == pytest.approx(157.1)
+    assert u["x_throttle"] == pytest.approx(1.0)
+
+
+def test_hover_has_the_modes_of_a_helicopter(full, xcell):
+    """Between the R-50 and what models.md has of the X-Cell, and named."""
+    model, found = full
+    by_name = {m.name: m for m in eigenmodes(model, xcell, found.state, found.inputs)}
+    phugoid = by_name["phugoid"]
+    # -0.03 +- 0.69j with speed stability added by hand, 0.3 +- 0.1j of the R-50.
+    assert -0.03 < phugoid.eigenvalue.real < 0.4
+    assert 0.1 < phugoid.eigenvalue.imag < 0.7
+    roll = next(m for n, m in by_name.items() if n.startswith("roll flapping"))
+    pitch = next(m for n, m in by_name.items() if n.startswith("pitch flapping"))
+    # The R-50's are at 11.9 and 8.4 rad/s, the X-Cell's roll at about 20.
+    assert 11.9 < roll.frequency < 23.0
+    assert 8.4 < pitch.frequency < roll.frequency
+    assert 0.2 < roll.damping < 0.7
+    assert {"yaw", "heave", "lateral phugoid"} <= set(by_name)
+    assert any("flybar" in name for name in by_name)
+
+
+def test_the_roll_mode_of_the_published_machine(full, xcell):
+    """The shipped file has a simulator's inertias; with those that go with k_beta (Gavrilets, 2003)
+    the roll mode is the published one of about 20 rad/s."""
+    model, found = full
+    published = {"Ixx": 0.18, "Iyy": 0.34, "hr": 0.235}
+    p = naming.replace(xcell, **{n: jnp.asarray(x) for n, x in published.items()})
+    named = eigenmodes(model, p, found.state, found.inputs)
+    roll = next(m for m in named if m.name.startswith("roll flapping"))
+    assert roll.frequency == pytest.approx(20.0, rel=0.1)
+
+
+def johnson_descent(inflow):
+    """The descent, over the induced velocity of hover, at which W + v is `inflow` over the same:
+    the measured curve of axial flight (W. Johnson, NASA TP-2005-213477)."""
+    c = np.linspace(-2.0, -1.0, 100001)
+    return -c[np.argmin(np.abs(c * (0.373 * c**2 - 0.991) - inflow))]
+
+
+def test_autorotation_sinks_as_measured(full, xcell):
+    """Straight down the rotor's power is nil where thrust times inflow makes up for the drag of
+    main blades and tail; the measured curve says how fast it sinks for that."""
+    model, _ = full
+    found = trim(model, xcell, power_off=True)
+    assert found.residual < 1e-10
+    assert float(found.inputs.x_throttle) == 0.0
+    assert float(found.state.Omega) == pytest.approx(157.1)
+    v = second.FULL
+    s = {n: float(x) for n, x in naming.asdict(found.state).items()}
+    u = {n: float(x) for n, x in naming.asdict(found.inputs).items()}
+    rates = second.rates(v, s, u)
+    assert max(abs(rates[n]) for n in model.steady_flight.equations) < 1e-9
+    drag = v["rho"] / 2 * v["Sz"] * s["dz"] ** 2
+    T = v["m"] * v["g"] - drag
+    hover = np.sqrt(T / (2 * v["rho"] * np.pi * v["R"] ** 2))
+    profile = v["rho"] * v["c"] * v["R"] ** 4 * v["Omega"] ** 3 * v["Cd0"] / 4
+    tail = v["K_Omega"] ** 3 * v["rho"] * v["c_T"] * v["R_T"] ** 4 * v["Omega"] ** 3 * v["Cd0"] / 4
+    wanted = johnson_descent(-(profile + tail) / T / hover) * hover
+    assert -s["dz"] == pytest.approx(wanted, rel=0.1)
+
+
+def test_autorotation_in_forward_flight_is_that_of_momentum_theory(full, xcell):
+    """Past the wake's ring the measured curve is momentum theory: the power balance with it."""
+    model, _ = full
+    found = trim(model, xcell, Condition(forward_speed=10.0), power_off=True)
+    v, s = second.FULL, {n: float(x) for n, x in naming.asdict(found.state).items()}
+    V, sink = 10.0, -s["dz"]
+    T = v["m"] * v["g"]
+    hover2 = T / (2 * v["rho"] * np.pi * v["R"] ** 2)
+    tail = v["K_Omega"] ** 3 * v["c_T"] * v["R_T"] ** 4 + v["c"] * v["R"] ** 4
+    profile = tail * v["rho"] * v["Omega"] ** 3 * v["Cd0"] / 4
+    fuselage = v["rho"] / 2 * np.hypot(V, sink) * (v["Sx"] * V**2 + v["Sz"] * sink**2)
+    induced = hover2 / V  # the flow through the rotor is little beside V
+    assert sink * T == pytest.approx(profile + fuselage + T * induced, rel=0.1)
+    assert not any(bool(x) for x in model.limits(xcell, found.state, found.inputs).values())
+
+
+@pytest.mark.parametrize("climb", [-4.0, -6.0, -8.0])
+def test_steep_descents_are_inside_the_range(climb, full, xcell):
+    model, hover = full
+    found = trim(model, xcell, Condition(climb=climb))
+    assert found.residual < 1e-10
+    assert float(found.inputs.x_throttle) == pytest.approx(1.0)
+    assert 0 < float(found.state.governor) < float(hover.state.governor)
+
+
+def test_a_descent_that_drives_the_rotor_is_refused_with_the_reason(full, xcell):
+    with pytest.raises(ValueError, match="throttle of 0 to 1"):
+        trim(full[0], xcell, Condition(climb=-12.0))
+
+
+def test_power_off_needs_a_collective_stick(xcell):
+    with pytest.raises(ValueError, match="power_off: expected a model with x_collective"):
+        trim(models.helicopter("consistent"), xcell, power_off=True)
+
+
+def test_a_flybarless_machine_hovers(vehicles_folder):
+    trex = load_vehicle(vehicles_folder / "t-rex-550.yaml")
+    model = models.helicopter(flybarless=True)
+    found = trim(model, trex)
+    assert 0.2 < float(found.state.governor) < 0.8
+    assert 0.2 < float(found.inputs.x_collective) < 0.9
+    with pytest.raises(ValueError, match=r"If, R1.* missing"):
+        trim(models.helicopter(), trex)

@@ -131,9 +131,9 @@ def test_pitch_has_its_own_axis(bench30):
 @pytest.mark.parametrize(
     ("axis", "poles", "said"),
     [
-        ("yaw", 1, "no axis 'yaw' to disturb, expected one of roll"),
-        ("heave", 1, "no axis 'heave'"),
-        ("pitch", 1, "no axis 'pitch'"),
+        ("yaw", 1, "no axis or state 'yaw' to disturb, expected one of roll"),
+        ("heave", 1, "no axis or state 'heave'"),
+        ("pitch", 1, "no axis or state 'pitch'"),
         ("roll", 0, "poles must be 1 or 2, got 0"),
         ("roll", 3, "poles must be 1 or 2, got 3"),
     ],

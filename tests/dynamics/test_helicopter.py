@@ -14,6 +14,8 @@ from heli_jax.dynamics.model import zeros as model_zeros
 from tests.dynamics import blade_element, rotating_bar
 from tests.dynamics import whole_helicopter as oracle
 
+CORRECTIONS = Corrections._fields[: Corrections._fields.index("dynamic_inflow") + 1]
+"""Those of the paper's equations; `test_full_helicopter` has what is beyond them."""
 SCALES = {
     "phi": 0.4, "theta": 0.4, "psi": 2.0, "beta_roll": 0.2, "beta_pitch": 0.2,
     "dx": 6.0, "dy": 4.0, "dz": 2.0,
@@ -75,7 +77,7 @@ def test_each_correction_can_be_turned_on_alone():
         "first_order_bar": {"beta_roll", "beta_pitch"},
         "rotor_moment": {"dphi", "dtheta"},
     }
-    for name in Corrections._fields:
+    for name in CORRECTIONS:
         model = helicopter("paper", **{name: True})
         assert model.name == f"helicopter-paper+{name}"
         found = naming.asdict(rates(model, v, s, u))
@@ -83,13 +85,13 @@ def test_each_correction_can_be_turned_on_alone():
         moved = {n for n in plain if n in found and float(found[n]) != float(plain[n])}
         assert moved
         assert moved == changes.get(name, moved)
-    both = helicopter("paper", **dict.fromkeys(Corrections._fields[:-1], True))
+    both = helicopter("paper", **dict.fromkeys(CORRECTIONS[:-1], True))
     for name, value in naming.asdict(rates(both, v, s, u)).items():
         assert float(value) == pytest.approx(all_on[name], rel=1e-9, abs=1e-9)
 
 
 def test_unknown_variants_and_switches_are_refused():
-    with pytest.raises(ValueError, match="expected one of paper, consistent"):
+    with pytest.raises(ValueError, match="expected one of paper, consistent, full"):
         helicopter("physics")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"corrections: expected some of .*, got 'tails'"):
         helicopter("paper", tails=True)

@@ -200,8 +200,10 @@ def test_a_model_that_states_its_axes_is_disturbed_and_put_on_a_stand():
     assert [mode.name for mode in shares] == ["bank"]
 
 
-@pytest.mark.parametrize("variant", ["paper", "consistent"])
-@pytest.mark.parametrize("more", [{}, {"dynamic_inflow": True}, {"first_order_bar": True}])
+@pytest.mark.parametrize("variant", ["paper", "consistent", "full"])
+@pytest.mark.parametrize(
+    "more", [{}, {"dynamic_inflow": True}, {"first_order_bar": True}, {"flybarless": True}]
+)
 def test_what_the_helicopter_states_is_what_its_names_say(variant, more):
     model = models.helicopter(variant, wind=True, **more)
     silent = dataclasses.replace(model, axes=None, steady_flight=None)

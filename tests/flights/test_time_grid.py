@@ -120,11 +120,12 @@ def test_rate_of_a_rounded_log_keeps_its_samples(tmp_path, rate):
 
 @pytest.mark.parametrize("part", [2, 3, 5])
 def test_a_slower_clock_takes_whole_samples(tmp_path, part):
-    x = np.random.default_rng(1).normal(size=300)
+    # Slow enough that the low-pass filter of outputs leaves it alone.
+    x = np.sin(2 * np.pi * 0.3 * np.arange(300) / 30)
     stamps = [f"{i / 30:.3f}" for i in range(300)]
     flight = read(tmp_path / "log.csv", stamps, x, rate=30.0 / part)
     assert np.array_equal(flight.inputs["u"], x[::part])
-    assert np.allclose(flight.outputs["y"], x[::part], atol=1e-9)
+    assert np.allclose(flight.outputs["y"][3:-3], x[::part][3:-3], atol=2e-3)
 
 
 def test_held_inputs_do_not_slip_on_rounded_stamps(tmp_path):
@@ -139,7 +140,7 @@ def test_held_inputs_do_not_slip_on_rounded_stamps(tmp_path):
 def test_notes_of_resampling(tmp_path, rate, word):
     flight = read(tmp_path / "log.csv", [f"{0.01 * i:.2f}" for i in range(100)], rate=rate)
     assert word in notes(flight)
-    assert ("filtered" in notes(flight)) == (rate == 20.0)
+    assert ("filtered" in notes(flight)) == (rate < 100.0)
     assert ("white" in notes(flight)) == (rate == 250.0)
     assert flight.dt == 1 / rate
     assert flight.duration == pytest.approx(0.99, abs=flight.dt)

@@ -71,7 +71,7 @@ def gates(flown, **changed):
 
 def test_a_noise_free_flight_of_the_exact_model_fails_no_gate(flown):
     found = gates(flown)
-    assert len(found) == 20
+    assert len(found) == 25
     assert card.failed(tuple(found.values())) == ()
     # And it is asked of those that fly the axis.
     asked = {of for of, gate in found.items() if gate.passed is not None}

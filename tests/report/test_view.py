@@ -17,7 +17,7 @@ from heli_jax.vehicle import load_vehicle
 from tests.report.conftest import SCRIPT
 from tests.report.test_html import Links, words
 
-HELICOPTER = models.by_name("helicopter")
+HELICOPTER = models.by_name("helicopter-consistent")
 
 
 def flown(n=300, dt=0.02, **states):

@@ -26,7 +26,7 @@ def xcell(vehicles_folder):
 
 @pytest.fixture(scope="module")
 def hover(xcell):
-    return trim(models.helicopter(), xcell)
+    return trim(models.helicopter("consistent"), xcell)
 
 
 def sticks(found, n, *, roll=2e-4, pitch=-2e-4, yaw=0.05, throttle=0.01, seed=0):
@@ -49,7 +49,7 @@ def bare(xcell):
 
 def test_free_fall_is_a_parabola(xcell):
     """Without a rotor that the air could turn, and without drag."""
-    model, p = models.helicopter(), bare(xcell)
+    model, p = models.helicopter("consistent"), bare(xcell)
     s = naming.replace(model.initial_state(p), Omega=0.0, dx=3.0, dy=-1.0, dz=5.0, phi=0.3, psi=1.0)
     zero = jnp.zeros(60)
     run = jax.jit(lambda s: simulate(model, p, model.Inputs(zero, zero, zero, zero), dt=DT,
@@ -63,7 +63,7 @@ def test_free_fall_is_a_parabola(xcell):
 
 
 def test_turning_the_problem_turns_the_trajectory(xcell, hover):
-    model, angle, n = models.helicopter(), 2.2, 150
+    model, angle, n = models.helicopter("consistent"), 2.2, 150
     u = sticks(hover, n)
 
     @jax.jit
@@ -83,7 +83,7 @@ def test_turning_the_problem_turns_the_trajectory(xcell, hover):
 
 def energetic(p):
     """The consistent helicopter with the work done on it as one more state, and its energy."""
-    base = models.helicopter()
+    base = models.helicopter("consistent")
     how = whole.Corrections(*[True] * 11)
     State = naming.extended(base.State, "Working", {"work": (float, None)})
 
@@ -93,10 +93,12 @@ def energetic(p):
     def field(p, s, u):
         m = whole.motion(how, s, u)
         air = whole.flow(how, p, s, u, m)
-        force = whole.main_rotor(p, s, u, air)
-        dOmega = whole.rotor_acceleration(p, s, u, air, force)
+        force = whole.main_rotor(how, p, s, u, air)
+        tail = whole.tail_rotor(how, p, u, m, s.Omega, whole.inflow_of(how))
+        rotors = whole.Rotors(force, tail)
         a = whole.accelerations(how, p, m, force.T)
-        M = whole.moments(how, p, s, u, m, force.T, dOmega)
+        hub = whole.rigid_hub_moments(how, p, s, u, m, force)
+        M = whole.moments(how, p, hub, rotors, whole.drive(how, p, s, u, air, rotors))
         power = p.m * (a[0] * s.dx + a[1] * s.dy + (a[2] + p.g) * s.dz)
         power = power + M.roll * m.p + M.pitch * m.q + M.yaw * m.r
         return State(**naming.asdict(base.vector_field(p, inner(s), u)), work=power)
@@ -152,7 +154,7 @@ def test_rk4_is_dopri8(variant, substeps, xcell):
 
 def test_two_seconds_are_scipys(xcell, hover):
     """One flight against solve_ivp with the second program's derivatives."""
-    model, n = models.helicopter(), 50
+    model, n = models.helicopter("consistent"), 50
     u = sticks(hover, n)
     names = oracle.STATES["consistent"]
     v = {**oracle.XCELL}
@@ -184,7 +186,7 @@ def pilot(hover, gain=1.0):
 
 
 def test_feedback_is_applied_once_a_sample(xcell, hover):
-    model, n = models.helicopter(), 30
+    model, n = models.helicopter("consistent"), 30
     u = sticks(hover, n, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)
     start = naming.replace(hover.state, phi=0.2, dtheta=0.1)
     law = pilot(hover)
@@ -256,7 +258,7 @@ def test_the_ground_ends_a_run_at_its_moment():
 
 
 def test_the_rotor_s_limits_end_a_run(xcell, hover):
-    model = models.helicopter()
+    model = models.helicopter("consistent")
     u = sticks(hover, 60, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)
     u = u._replace(x_throttle=0.8 * u.x_throttle)
 
@@ -275,7 +277,7 @@ def test_the_rotor_s_limits_end_a_run(xcell, hover):
 
 
 def test_one_bad_element_leaves_the_others_alone(xcell, hover):
-    model, n = models.helicopter(), 50
+    model, n = models.helicopter("consistent"), 50
     u = sticks(hover, n)
 
     @jax.jit

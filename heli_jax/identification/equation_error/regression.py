@@ -7,7 +7,7 @@ Levenberg-Marquardt steps, else one step is the regression.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -121,7 +121,8 @@ def _projected(
     """What of the columns of x the columns of `away` cannot give."""
     size = np.linalg.norm(away, axis=0)
     away = away[:, size > 0] / size[size > 0]
-    basis, triangle, _ = scipy.linalg.qr(away, mode="economic", pivoting=True)
+    factors: Any = scipy.linalg.qr(away, mode="economic", pivoting=True)
+    basis, triangle = factors[:2]
     basis = basis[:, np.abs(np.diag(triangle)) > 1e-9]
     return x - basis @ (basis.T @ x)
 

@@ -147,7 +147,8 @@ def _regression(setup: _Setup, names: Sequence[str]) -> Regression:
     if not made:
         raise ValueError(
             "start: equation-error: no stretch without missing samples is as long as the "
-            f"smoothing needs ({records.shortest(setup.half)} samples): expected a start of each free parameter"
+            f"smoothing needs ({records.shortest(setup.half)} samples): expected a start of each "
+            "free parameter"
         )
     return Regression(setup.model, setup.base, tuple(names), tuple(made))
 

@@ -41,6 +41,7 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
         flights=tuple(_flight_data(problem, f, dtype) for f in flights),
+        push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},
     )
     # Once, instead of with every call of a compiled program.
     numbers = jax.device_put(numbers)

@@ -4,14 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.model import Disturbance
 from heli_jax.identification.estimation.estimator import Evaluation, measured_count
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain, noise_guess_at
+from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     log_likelihood_of,
     relaxed_from,
 )
+from heli_jax.identification.estimation.noise_search import noise_guess_at
 from heli_jax.identification.unknowns.layout import Layout, disturbance_limits, unpack
 
 NO_DISTURBANCE = 2.71
@@ -33,7 +36,8 @@ def disturbance_or_none(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
     layout, data = search.layout, search.data
     e = evaluate(layout, data, optimum.noise, optimum.best.z)
     # First what costs one evaluation: the search without a disturbance takes as long as a fit.
-    if _sure(layout, optimum, e) and _far_better(search, optimum, e):
+    [d] = disturbances_of(layout.model)
+    if is_sure(layout, optimum, e, d) and _far_better(search, optimum, e):
         return optimum
     without = without_disturbance(search, optimum)
     alone = evaluate(layout, data, without.noise, without.best.z)
@@ -57,11 +61,12 @@ def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     a search begun anew with the disturbance at its start: white noise is a local optimum of short
     records."""
     layout, data = search.layout, search.data
-    if "tau_w" not in layout.disturbance:
+    [d] = disturbances_of(layout.model)
+    if d.tau not in layout.disturbance:
         return optimum
     # At the limits `unpack` clips, so that the likelihood is flat and no optimiser comes back.
-    low, high = (float(v) for v in disturbance_limits(data)["tau_w"])
-    if low < float(optimum.best.z[layout.disturbance_at("tau_w")]) < high:
+    low, high = (float(v) for v in disturbance_limits(layout, data)[d.tau])
+    if low < float(optimum.best.z[layout.disturbance_at(d.tau)]) < high:
         return optimum
     z = with_noise_guess(search, optimum)
     at_guess = evaluate(layout, data, optimum.noise, z)
@@ -71,15 +76,20 @@ def _off_the_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     return again.after(optimum) if bool(again.best.converged) and gained else optimum
 
 
-def _sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation) -> bool:
-    """Whether a disturbance was found and all of it is determined."""
+def is_sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation, d: Disturbance) -> bool:
+    """Whether a disturbance was found and all of it is determined.
+
+    Args:
+        layout: what the unknowns are.
+        optimum: where the search ended.
+        e: at that optimum.
+        d: the disturbance, its sigma among the unknowns.
+    """
     if not (bool(optimum.best.converged) and np.all(np.isfinite(e.J))):
         return False
-    # In z the disturbance follows the named unknowns.
-    at = len(layout.of_interest)
     sds = deviations(e.J)
-    known = np.isfinite(sds[at : at + len(layout.disturbance)]).all()
-    return bool(known and sds[layout.disturbance_at("sigma_w")] < _SURE)
+    its = [layout.disturbance_at(n) for n in (d.sigma, d.tau) if n in layout.disturbance]
+    return bool(np.isfinite(sds[its]).all() and sds[layout.disturbance_at(d.sigma)] < _SURE)
 
 
 def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
@@ -93,7 +103,7 @@ def _far_better(search: Search, optimum: RelaxedOptimum, e: Evaluation) -> bool:
         e: at that optimum.
     """
     layout, data, noise = search.layout, search.data, optimum.noise
-    alone = evaluate(layout, data, noise, _silenced(search, optimum))
+    alone = evaluate(layout, data, noise, silenced(search, optimum, layout.sigmas))
     gained = gauss_newton_gain(alone.r, alone.J)
     if not np.isfinite(gained):
         return False
@@ -179,12 +189,17 @@ def _corrects(search: Search, without: RelaxedOptimum, e: Evaluation) -> bool:
 
 def without_disturbance(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
     """The optimum with a sigma_w that is all but zero."""
-    return relaxed_from(search, optimum.noise, _silenced(search, optimum))
+    z = silenced(search, optimum, search.layout.sigmas)
+    return relaxed_from(search, optimum.noise, z)
 
 
-def _silenced(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
-    """z of an optimum with a sigma_w that is all but zero."""
+def silenced(
+    search: Search, optimum: RelaxedOptimum, sigmas: tuple[str, ...]
+) -> Float[Array, " q"]:
+    """z of an optimum with the named standard deviations of disturbances all but zero."""
     # Far below the smallest noise rather than zero, whose logarithm no z holds.
-    at = search.layout.disturbance_at("sigma_w")
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
-    return optimum.best.z.at[at].set(np.log(smallest) - _NONE)
+    z = optimum.best.z
+    for name in sigmas:
+        z = z.at[search.layout.disturbance_at(name)].set(np.log(smallest) - _NONE)
+    return z

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import correlation_of, initial_sd_of
 from heli_jax.identification.estimation.estimator import (
     Estimator,
@@ -76,12 +77,15 @@ class FilterError(Estimator):
         return False
 
     def scaled_outputs(self, problem: Problem) -> tuple[tuple[str, ...], bool]:
-        """With sigma_w and sigma_y unknown their common factor is concentrated out, and every
-        output but the first has a factor of its own; with sigma_w given all outputs have one."""
+        """With every sigma_w and sigma_y unknown their common factor is concentrated out, and every
+        output but the first has a factor of its own; with one given, or process noise of the
+        model's own, all outputs have one."""
         if "sigma_y" in problem.fixed_noise:
             return (), False
         # Only with all of them unknown: a factor common to noises of which one is given is none.
-        concentrated = "sigma_w" not in problem.fixed_noise
+        sigmas = [d.sigma for d in disturbances_of(problem.model)]
+        unknown = bool(sigmas) and not any(n in problem.fixed_noise for n in sigmas)
+        concentrated = unknown and only_disturbed(problem.model)
         outputs = tuple(sorted({n for f in problem.training for n in f.outputs}))
         return outputs[concentrated:], concentrated
 
@@ -105,10 +109,10 @@ class FilterError(Estimator):
             return z, noise._replace(log_variance_ratio=level)
         # The scale of the greatest likelihood, and what the unknowns took from the squares.
         factor = np.sqrt(squares / n * freedom)
-        if "sigma_w" in layout.disturbance:
+        for name in layout.sigmas:
             # The filter knows only ratios of noises: with all of them times one factor its gains,
             # and with them the optimum, stay.
-            at = layout.disturbance_at("sigma_w")
+            at = layout.disturbance_at(name)
             z = z.at[at].add(jnp.asarray(np.log(factor), z.dtype))
         sd = tuple(
             {name: np.asarray(s * factor, s.dtype) for name, s in by_output.items()}
@@ -259,7 +263,7 @@ def filtered_flights(
     small = len(naming.names(layout.model.State)) <= SMALL
     for group in layout.one_covariance:
         # One record of a small model: written out in rows the exact filter takes as long, and two
-        # seconds less to compile .
+        # seconds less to compile.
         if not (small and len(group) == 1):
             found = innovations_together(layout, data, noise, u, group)
             together |= dict(zip(group, found, strict=True))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.estimation.estimator import measured_count
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
-from heli_jax.identification.estimation.trust_region import LevenbergMarquardt
+from heli_jax.identification.estimation.trust_region import LevenbergMarquardt, within_reach
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
 
@@ -41,6 +41,8 @@ _TIKHONOV_SDS_LINEAR = 1e6
 """the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
 that the data would give it at the start if all else were known"""
 
+_REACH = 3.0
+"""of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
 _MANY_STEPS = 60
 """steps after which a run among many, which began near its optimum, is given up"""
 
@@ -73,6 +75,8 @@ class _Constants(NamedTuple):
     """one over the sd of the tie to the start, 0 without"""
     convergence_mask: Bool[Array, " q"]
     """the unknowns whose steps say whether the optimiser has arrived"""
+    reach: Float[Array, " q"]
+    """how far one step may go, by unknown"""
 
 
 class _Rows(NamedTuple):
@@ -147,6 +151,7 @@ def _advance(constants: _Constants, state: _State, R: Float[Array, "k k"]) -> _S
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
     rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
+    new = within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     fine = result == optx.RESULTS.successful
     stepped = _State(xi, new, done | ~fine, done & fine)
@@ -387,4 +392,9 @@ def _constants(layout: Layout, z0: Array, scaling: _Scaling) -> _Constants:
         norms = _COLUMN * scaling.residual_norm / jnp.where(usable, scaling.unit, 1.0)
         ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
         tikhonov = jnp.where(linear, ties, tikhonov)
-    return _Constants(z0, scaling, tikhonov, jnp.asarray(mask))
+    # Of several disturbances one may vanish, where its logarithm runs off: each by itself.
+    noises = (at >= len(layout.of_interest)) & (
+        at < len(layout.of_interest) + len(layout.disturbance)
+    )
+    reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
+    return _Constants(z0, scaling, tikhonov, jnp.asarray(mask), jnp.asarray(reach, z0.dtype))

@@ -15,7 +15,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.estimation.noise_search import noise_guess_at
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
@@ -40,6 +40,10 @@ _SHIFTS = 41
 """time shifts tried first, 20 ms apart"""
 _NEAR = 0.1
 """standard deviations from the optimum at which it counts as reached"""
+_AGAIN = 3
+"""times that an optimiser which stopped short of the optimum is sent on"""
+_FAINT = 0.3
+"""one over the sd of the logarithm of a disturbance's parameter below which it is none"""
 
 
 def first_guess(
@@ -72,37 +76,6 @@ def first_guess(
     if layout.shift:
         z0 = z0.at[q + len(layout.gains)].set(coordinate[best])
     return z0
-
-
-def noise_guess_at(
-    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
-) -> Float[Array, " q"]:
-    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements.
-        z0: where the grid has its middle.
-    """
-    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
-    at = len(layout.of_interest)
-    steps = {
-        "sigma_w": np.log(10.0) * np.arange(-3.0, 2.5),
-        "tau_w": np.log(10.0) * np.arange(-1, 2),
-    }
-    grid = np.stack(np.meshgrid(*(steps[n] for n in layout.disturbance), indexing="ij"), axis=-1)
-    grid = grid.reshape(-1, len(layout.disturbance))
-    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
-    points[:, at : at + len(layout.disturbance)] += grid
-    costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
-    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    return jnp.asarray(points[best], z0.dtype)
-
-
-@eqx.filter_jit
-def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
-    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
 
 
 @eqx.filter_jit
@@ -242,10 +215,35 @@ class Search:
             if not bool(run.converged) and layout.estimator.least_squares:
                 near = np.isfinite(run.cost) and self._is_near(layout, noise, run.z)
                 run = run._replace(converged=np.asarray(near))
+            run = self._arrived(layout, noise, run)
             runs.append(run)
             if progress is not None and points.shape[0] > 1:
                 progress(f"{i + 1} of {points.shape[0]} starts done")
         return runs
+
+    def _arrived(self, layout: Layout, noise: Noise, run: Optimum) -> Optimum:
+        """A run with several disturbances, gone on with until no step would gain anything.
+
+        The optimiser stops where its last step moved no parameter; next to variances that vanish
+        that step may have been short for another reason.
+        """
+        if len(layout.sigmas) < 2:
+            return run
+        for _ in range(_AGAIN):
+            at = residual_and_jacobian(layout, self.data, noise, run.z)
+            J, faint = np.asarray(at.J), np.zeros(run.z.shape[0], bool)
+            noises = slice(
+                len(layout.of_interest), len(layout.of_interest) + len(layout.disturbance)
+            )
+            # Of a variance that vanishes the slope says less than its bounds do.
+            faint[noises] = ~(np.linalg.norm(J[:, noises], axis=0) > _FAINT)
+            gain = gauss_newton_gain(at.r, J[:, ~faint])
+            if not (bool(run.converged) and gain > _NEAR**2):
+                break
+            again = optimise(layout, self.data, noise, run.z, self.max_steps)
+            steps = run.steps + again.steps
+            run = jax.device_get(again)._replace(z=again.z, steps=np.asarray(steps))
+        return run
 
     def _is_near(self, layout: Layout, noise: Noise, z: Array) -> bool:
         """Whether the optimum is within a tenth of a standard deviation of every unknown.

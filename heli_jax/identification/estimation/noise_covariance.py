@@ -36,6 +36,8 @@ class RelaxedOptimum(NamedTuple):
     """twice the log-likelihood that a disturbance gained, where that was asked"""
     notes: tuple[str, ...] = ()
     """what a reader should know of how the optimum was reached"""
+    absent: tuple[str, ...] = ()
+    """the parameters of those of several disturbances that do not show"""
 
     def after(self, earlier: "RelaxedOptimum", *notes: str) -> "RelaxedOptimum":
         """The same with the rounds and notes of an earlier one before its own."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
@@ -80,6 +81,24 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
             high_cutoff=0.75, low_cutoff=0.1, high_constant=100.0, low_constant=0.1
         )
         self.verbose = lambda **_: None
+
+
+def within_reach(
+    state: Any, y: Float[Array, " q"], reach: Float[Array, " q"], unit: Float[Array, " q"]
+) -> Any:
+    """The solver's state, its next point no further from y than `reach` in each unknown by itself.
+
+    A bound on the whole step would let one unknown that runs away stop all others.
+
+    Args:
+        state: after a step.
+        y: the unknowns at the last point that was accepted.
+        reach: by unknown, inf where there is no bound.
+        unit: of the unknowns y, in which reach is not given; 0 where one stays put.
+    """
+    reach = reach / jnp.where(unit > 0, unit, 1.0)
+    nearer = jnp.clip(state.y_eval, y - reach, y + reach)
+    return eqx.tree_at(lambda s: s.y_eval, state, nearer)
 
 
 def _norm(convergence_mask: Bool[Array, " q"]) -> Callable[[Array], Array]:

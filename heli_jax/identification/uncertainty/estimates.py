@@ -176,27 +176,30 @@ def prior_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     return notes
 
 
-def extreme_noise_notes(layout: Layout, data: Data, z: Float[Array, " q"]) -> list[str]:
+def extreme_noise_notes(
+    layout: Layout, data: Data, z: Float[Array, " q"], absent: tuple[str, ...] = ()
+) -> list[str]:
     """Where a parameter of the disturbance ran to the end of what a record can show.
 
     Args:
         layout: of the unknowns.
         data: whose length and sample time say what can be shown.
         z: the optimum (q,), with logarithms of the disturbance's parameters.
+        absent: parameters of disturbances that do not show, of which nothing is said here.
     """
     notes = []
-    limits = disturbance_limits(data)
+    limits = disturbance_limits(layout, data)
     for i, name in enumerate(layout.disturbance):
         at = float(z[len(layout.of_interest) + i])
         low, high = (float(v) for v in limits[name])
-        if low < at < high:
+        if low < at < high or name in absent:
             continue
         value = np.exp(min(max(at, low), high))
         meaning = {
             # Shorter than a sample, or longer than the record.
-            ("tau_w", True): "to this record the disturbance is white noise",
-            ("tau_w", False): "to this record the disturbance is a random walk",
-        }.get((name, at <= low), "the record bounds it to one side at most")
+            (False, True): "to this record the disturbance is white noise",
+            (False, False): "to this record the disturbance is a random walk",
+        }.get((name in layout.sigmas, at <= low), "the record bounds it to one side at most")
         unit = naming.unit(layout.model.Params, name) or ""
         notes.append(f"{name} is not determined: it ran to {value:.3g} {unit}; {meaning}.")
     return notes

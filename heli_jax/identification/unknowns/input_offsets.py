@@ -32,9 +32,9 @@ def offset_inputs(problem: Problem) -> tuple[str, ...]:
     """The inputs whose offset is estimated, in the order of the model.
 
     As `nuisance.input_offset` says; where it leaves that open, the sticks of a machine in free
-    flight: those whose constant offset no initial state and no bias can take the place of. The
-    throttle is no stick that has a centre, and where a free parameter is a constant term of the
-    equations that parameter stands for the offsets already.
+    flight: those whose constant offset no initial state and no bias can take the place of. Throttle
+    and collective have no centre, and where a free parameter is a constant term of the equations
+    that parameter stands for the offsets already.
     """
     inputs = naming.names(problem.model.Inputs)
     requested = problem.nuisance.input_offset
@@ -47,7 +47,8 @@ def offset_inputs(problem: Problem) -> tuple[str, ...]:
 
 def _in_free_flight(problem: Problem) -> tuple[str, ...]:
     model, params = problem.model, problem.start_params()
-    sticks = [n for n in naming.names(model.Inputs) if n != "x_throttle"]
+    centreless = ("x_throttle", "x_collective", "Omega")
+    sticks = [n for n in naming.names(model.Inputs) if n not in centreless]
     # Our model that is not linear is the whole helicopter, which flies free. Its matrices at the
     # mean inputs and the model's own initial state, no trim, would say nothing.
     if of_helicopter(model.Params) and not model.linear:

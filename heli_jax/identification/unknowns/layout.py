@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
@@ -67,6 +68,8 @@ class Data(NamedTuple):
     prior_sd: Any
     """inf where a parameter has no prior"""
     flights: tuple[FlightData, ...]
+    push_scales: dict[str, Any]
+    """see `Problem.push_scales`"""
 
 
 class Layout(eqx.Module):
@@ -126,6 +129,11 @@ class Layout(eqx.Module):
         """Where in z the nuisance parameters of the flights begin: initial states, biases and
         input offsets, which have weak priors and are projected out of the verdict."""
         return len(self.of_interest) + len(self.disturbance) + len(self.scaled)
+
+    @property
+    def sigmas(self) -> tuple[str, ...]:
+        """The disturbances' standard deviations among the unknowns."""
+        return tuple(d.sigma for d in disturbances_of(self.model) if d.sigma in self.disturbance)
 
     def disturbance_at(self, name: str) -> int:
         """Where in z a parameter of the disturbance stands."""
@@ -289,13 +297,17 @@ def value_of(layout: Layout, data: Data, i: int, z: Real) -> Any:
     return transforms.to_value(layout.kinds[i], z, data.sign[i], data.low[i], data.high[i])
 
 
-def disturbance_limits(data: Data) -> dict[str, tuple[Any, Any]]:
-    """Lowest and highest logarithm of each parameter of the disturbance.
+def disturbance_limits(layout: Layout, data: Data) -> dict[str, tuple[Any, Any]]:
+    """Lowest and highest logarithm of each parameter of the disturbances, each by itself.
 
     A correlation time below a hundredth of a sample is white noise to any record, one above a
     thousand records is a random walk; beyond these a likelihood without a maximum would take the
     numbers as far as the computer has any. sigma_w has the size of the measured motion to go by,
-    with room for a disturbance that is none.
+    of several disturbances each its own, with room for a disturbance that is none.
+
+    Args:
+        layout: which parameters there are.
+        data: sample times, lengths and sizes of the records.
     """
     dt = functools.reduce(jnp.minimum, [flight.dt for flight in data.flights])
     longest = functools.reduce(
@@ -308,11 +320,13 @@ def disturbance_limits(data: Data) -> dict[str, tuple[Any, Any]]:
     )
     # sigma_w is an acceleration: over one sample it moves an angle by sigma_w dt^2, hence the
     # -2 log(dt) at the upper end.
-    size = jnp.log(motion)
-    return {
-        "sigma_w": (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST),
-        "tau_w": (jnp.log(_SHORTEST * dt), jnp.log(_LONGEST * longest)),
-    }
+    limits = dict.fromkeys(
+        layout.disturbance, (jnp.log(_SHORTEST * dt), jnp.log(_LONGEST * longest))
+    )
+    for name in layout.sigmas:
+        size = jnp.log(data.push_scales.get(name, motion))
+        limits[name] = (size - _FAINTEST, size - 2.0 * jnp.log(dt) + _STRONGEST)
+    return limits
 
 
 def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
@@ -332,7 +346,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         # Bounded smoothly: a clip would leave a shift at the bound without a derivative.
         shift = MAX_TIME_SHIFT * jnp.tanh(z[at])
         at += 1
-    limits = disturbance_limits(data)
+    limits = disturbance_limits(layout, data)
     # Clipped, not transformed: inside the limits the likelihood keeps its shape in the logarithm,
     # and outside its derivative is zero, which tells that the parameter means nothing there.
     noise = {

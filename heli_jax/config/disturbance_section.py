@@ -1,0 +1,89 @@
+"""What may stand in a configuration's section `disturbance`."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
+
+from heli_jax.errors import nearest
+
+
+def _size_choice(value: Any) -> Any:
+    """One number above zero, or one for each of several disturbances by name."""
+    given = value.values() if isinstance(value, dict) else [value]
+    for number in given:
+        real = isinstance(number, int | float) and not isinstance(number, bool)
+        if not (real and 0 < number < float("inf")):
+            raise ValueError(
+                "expected a number above zero, or of several disturbances one for each by name, "
+                f"got {number!r:.60}"
+            )
+    return {str(k): float(v) for k, v in value.items()} if isinstance(value, dict) else float(value)
+
+
+def _on_choice(value: Any) -> Any:
+    names = [value] if isinstance(value, str) else value
+    if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
+        raise ValueError(f"expected a state, or a list of them such as [p, q], got {value!r:.60}")
+    return tuple(names)
+
+
+class DisturbanceConfig(BaseModel):
+    """Random pushes on derivatives of states: simulation draws them, filter error estimates them.
+
+    `axis: roll` and `on: [roll]` mean the same.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    axis: str | None = None
+    """one of the model's axes: roll, pitch, yaw, heave, ..."""
+    # Any, since the validators before it have said what it may be, here and below.
+    on: Annotated[Any, BeforeValidator(_on_choice)] = None
+    """states or axes, each with a disturbance of its own"""
+    poles: Literal[1, 2] = 1
+    sigma_w: Annotated[Any, BeforeValidator(_size_choice)] = None
+    """standard deviation, in the state's unit per second (SI), of several by name: needed to
+    simulate, an initial guess for filter error"""
+    tau_w: Annotated[Any, BeforeValidator(_size_choice)] = None
+    """correlation time [s], of several by name or one number for all: as sigma_w"""
+    fixed: list[str] = []
+    """what filter error takes as it stands here: sigma_w, tau_w (of several disturbances sigma_w_p,
+    ...), sigma_y: the noise that the outputs state (sd)"""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is disturbed, as it stands in the file."""
+        return self.on if self.axis is None else (self.axis,)
+
+    @property
+    def parameters(self) -> dict[str, float | None]:
+        """By the name of each parameter its value, None where none is given."""
+        several, values = len(self.names) > 1, {}
+        for name in self.names:
+            for key in ("sigma_w", "tau_w"):
+                given = getattr(self, key)
+                of_it = given.get(name) if isinstance(given, dict) else given
+                values[f"{key}_{name}" if several else key] = of_it
+        return values
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "DisturbanceConfig":
+        if (self.axis is None) == (self.on is None):
+            got = "neither" if self.on is None else "both"
+            raise ValueError(f"expected axis (one) or on (a list of states), got {got}")
+        for key in ("sigma_w", "tau_w"):
+            given = getattr(self, key)
+            for name in given if isinstance(given, dict) else ():
+                if name not in self.names:
+                    raise ValueError(f"{key}: {name!r} is not disturbed{nearest(name, self.names)}")
+        if len(self.names) > 1 and isinstance(self.sigma_w, float):
+            # Of states in different units one number would mean a different thing on each.
+            example = ", ".join(f"{n}: {self.sigma_w:g}" for n in self.names)
+            raise ValueError(f"sigma_w: expected a value for each, as {{{example}}}, got one")
+        for name in self.fixed:
+            if name not in (*self.parameters, "sigma_y"):
+                known = ", ".join((*self.parameters, "sigma_y"))
+                raise ValueError(f"fixed: expected some of {known}, got {name!r}")
+            if name != "sigma_y" and self.parameters[name] is None:
+                raise ValueError(f"{name}: missing, expected its value, since it is fixed")
+        return self

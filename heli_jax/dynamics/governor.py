@@ -1,0 +1,42 @@
+r"""The motor's throttle: the stick's, or that of a governor that holds the rotor's speed.
+
+$$x_g = K_P(\Omega_{ref} - \Omega) + i_g,\qquad
+  \dot i_g = K_I\left[(\Omega_{ref} - \Omega) + (\mathrm{sat}\,x_g - x_g)/K_P\right]$$
+
+with $x_g$ held within 0 and 1, and the integral led back while it is (Astrom and Hagglund, PID
+Controllers, 1995: back-calculation). Its form and the X-Cell's gains are those of Gavrilets (MIT
+thesis, 2003).
+"""
+
+import jax.numpy as jnp
+
+from heli_jax.naming import Scalar
+from heli_jax.vehicle import Helicopter
+
+
+def set_point(p: Helicopter, x_throttle: Scalar | None) -> Scalar:
+    """The rotor speed to be held [rad/s]: on a transmitter the throttle stick asks for a share of
+    the nominal speed, and at zero for none.
+
+    Args:
+        p: vehicle, SI.
+        x_throttle: the stick [1]; None where it moves the collective pitch.
+    """
+    return p.Omega if x_throttle is None else p.Omega * x_throttle
+
+
+def throttle(
+    p: Helicopter, asked: Scalar, Omega: Scalar, integral: Scalar
+) -> tuple[Scalar, Scalar]:
+    """The throttle, 0 to 1, and the derivative of the integral part [1/s].
+
+    Args:
+        p: vehicle, SI.
+        asked: the rotor speed to be held [rad/s].
+        Omega: main rotor speed [rad/s].
+        integral: the state i_g [1].
+    """
+    error = asked - Omega
+    free = p.K_P * error + integral
+    held = jnp.clip(free, 0.0, 1.0)
+    return held, p.K_I * (error + (1.0 / p.K_P) * (held - free))

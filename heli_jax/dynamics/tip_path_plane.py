@@ -1,0 +1,140 @@
+r"""The main rotor as a tip-path plane that tilts back by a1 and to the right by b1.
+
+$$\tau_f\dot a_1 = -a_1 - \tau_f q + \theta_{pitch} + \frac{\partial a_1}{\partial\mu}\mu_x
+    + \tau_f\omega_k b_1, \qquad
+  \tau_f\dot b_1 = -b_1 - \tau_f p + \theta_{roll} - \frac{\partial a_1}{\partial\mu}\mu_y
+    - \tau_f\omega_k a_1$$
+
+with the cyclic pitch of eq. 11, $\tau_f = 16/(\gamma\Omega)$ and the Lock number
+$\gamma = \rho a c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets,
+MIT thesis, 2003; Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is
+what a stiff hub turns: it raises the blade's frequency above $\Omega$, and a free tilt then moves
+around against the rotor's sense. Left out is what is $\gamma/16$ of it or less: the blade's own
+second derivative.
+"""
+
+from typing import NamedTuple
+
+from heli_jax.naming import Record, Scalar
+from heli_jax.vehicle import Helicopter
+
+_STOPPED = 1e-8
+"""[rad^2/s^2] beside Omega^2: a rotor at rest has no flapping, but is an ordinary point"""
+
+
+class Tilt(NamedTuple):
+    """Angles of the tip-path plane to the hub [rad]."""
+
+    a1: Scalar
+    """back"""
+    b1: Scalar
+    """right"""
+
+
+def lock_number(p: Helicopter) -> Scalar:
+    r"""$\gamma = \rho a c R^4/I_\beta$ [1]: the air's forces over the blade's inertia."""
+    return p.rho * p.a * p.c * p.R**4 / p.I_beta
+
+
+def flapping_rate_constant(p: Helicopter, Omega: Scalar, B: Scalar) -> Scalar:
+    r"""$1/\tau_f = \gamma B^4\Omega/16$ [1/s].
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        B: tip loss factor, 1 for lift up to the tip.
+    """
+    return (lock_number(p) / 16.0 * B**4) * Omega
+
+
+def speed_lift(p: Helicopter, Omega: Scalar, theta0: Scalar, inflow: Scalar, B: Scalar) -> Scalar:
+    r"""$\tfrac23 B^3\theta_0\Omega R - \tfrac12 B^2\lambda\Omega R$ [m/s].
+
+    The lift that the advancing blade has more of in a speed V, integrated along the blade, is
+    $\tfrac12\rho a c R^2 V$ times this.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        theta0: collective pitch [rad].
+        inflow: lambda R Omega [m/s].
+        B: tip loss factor, 1 for lift up to the tip.
+    """
+    return (2.0 / 3.0 * B**3 * p.R) * Omega * theta0 - (0.5 * B**2) * inflow
+
+
+def flap_back(p: Helicopter, Omega: Scalar, lift: Scalar, B: Scalar) -> Scalar:
+    r"""How far the plane tilts away from a speed of 1 m/s [rad s/m].
+
+    $$\frac{1}{R\Omega}\frac{\partial a_1}{\partial\mu}
+      = \frac{2 K_\mu}{R\Omega}\,\frac{1}{B^4}
+      \left(\tfrac43 B^3\theta_0 - B^2\lambda\right)$$
+
+    Args:
+        p: vehicle, SI; K_mu is 1 in blade-element theory.
+        Omega: main rotor speed [rad/s].
+        lift: `speed_lift`.
+        B: tip loss factor, 1 for lift up to the tip.
+    """
+    return (4.0 * p.K_mu / (p.R**2 * B**4)) * lift / (Omega * Omega + _STOPPED)
+
+
+def first_harmonic_moment(p: Helicopter, lift: Scalar) -> Scalar:
+    r"""Moment on a hub without hinges in a speed of 1 m/s [N s].
+
+    $\tfrac12\rho a c V\Omega R^3(\tfrac23\theta_0 - \tfrac12\lambda)$, which eqs 14-15 leave out;
+    like the cyclic pitch it acts with the lag of a quarter of a turn.
+
+    Args:
+        p: vehicle, SI.
+        lift: `speed_lift`.
+    """
+    return (0.5 * p.K_mu * p.rho * p.a * p.c * p.R**2) * lift
+
+
+def flapping_rates(
+    p: Helicopter, Omega: Scalar, tilt: Tilt, driven: Tilt, m: Record, B: Scalar
+) -> Tilt:
+    """da1/dt and db1/dt [rad/s], the equations of the module's text.
+
+    Args:
+        p: vehicle, SI.
+        Omega: main rotor speed [rad/s].
+        tilt: of the tip-path plane.
+        driven: where cyclic pitch and speed would hold it.
+        m: the `Motion` of the body, of which p and q [rad/s] count.
+        B: tip loss factor, 1 for lift up to the tip.
+    """
+    k = flapping_rate_constant(p, Omega, B)
+    turn = (0.5 * p.k_beta / p.I_beta) * Omega / (Omega * Omega + _STOPPED)
+    return Tilt(
+        k * (driven.a1 - tilt.a1) + turn * tilt.b1 - m.q,
+        k * (driven.b1 - tilt.b1) - turn * tilt.a1 - m.p,
+    )
+
+
+class HubLoads(NamedTuple):
+    """What a tilted rotor does to the body, beside its thrust along the mast."""
+
+    forward: Scalar
+    """force [N]"""
+    right: Scalar
+    roll: Scalar
+    """moment about the centre of gravity [N m]"""
+    pitch: Scalar
+    yaw: Scalar
+
+
+def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
+    r"""In-plane forces $-T a_1$ and $T b_1$ at the hub, and $(k_\beta + T h_r)$ times the tilt.
+
+    Args:
+        p: vehicle, SI; k_beta is the stiffness of the whole hub.
+        T: thrust of the main rotor [N].
+        tilt: of the tip-path plane.
+    """
+    stiffness = p.k_beta + T * p.hr
+    right = T * tilt.b1
+    # The mast stands lr behind the centre of gravity: a force to the right there turns the nose
+    # left.
+    return HubLoads(-T * tilt.a1, right, stiffness * tilt.b1, stiffness * tilt.a1, -p.lr * right)

@@ -1,0 +1,70 @@
+"""A first guess of the disturbances: the greatest likelihood on a coarse grid."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.identification.estimation.residual import rows_of
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+
+
+def noise_guess_at(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"]
+) -> Float[Array, " q"]:
+    """z0 with sigma_w and tau_w of the greatest likelihood on a coarse grid about it; of several
+    disturbances first all together, then each by itself.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+    """
+    z = one_noise_guess(layout, data, noise, z0, layout.disturbance)
+    # A grid over all at once would have 18 to the power of their number.
+    several = [d for d in disturbances_of(layout.model) if d.sigma in layout.disturbance]
+    for d in several if len(several) > 1 else []:
+        z = one_noise_guess(layout, data, noise, z, (d.sigma, d.tau))
+    return z
+
+
+def one_noise_guess(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    z0: Float[Array, " q"],
+    names: tuple[str, ...],
+) -> Float[Array, " q"]:
+    """z0 with the named parameters of disturbances moved together, by the same factors of every
+    sigma and of every tau, to the greatest likelihood on a coarse grid about it.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid has its middle.
+        names: of the parameters; those that are no unknowns stay.
+    """
+    # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
+    steps = {
+        "sigma": np.log(10.0) * np.arange(-3.0, 2.5),
+        "tau": np.log(10.0) * np.arange(-1, 2),
+    }
+    kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
+    used = [k for k in steps if k in kinds.values()]
+    grid = np.stack(np.meshgrid(*(steps[k] for k in used), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, len(used))
+    points = np.tile(np.asarray(z0), (grid.shape[0], 1))
+    for name, kind in kinds.items():
+        points[:, layout.disturbance_at(name)] += grid[:, used.index(kind)]
+    costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    return jnp.asarray(points[best], z0.dtype)
+
+
+@eqx.filter_jit
+def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
+    return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)
