@@ -156,11 +156,7 @@ def assemble(
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
-    # A perfect model's simulation would leave what the disturbance makes; without one it would not.
-    disturbed = not layout.disturbance or not set(layout.disturbance) <= set(absent)
-    against = (
-        layout.estimator.against_expected(layout, data, noise, e, best.z) if disturbed else None
-    )
+    against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
@@ -196,6 +192,17 @@ def assemble(
         seed=run.seed,
         timing=run.timing,
     )
+
+
+def _against_expected(
+    search: Search, optimum: RelaxedOptimum, e: Evaluation, absent: tuple[str, ...]
+) -> dict[str, float] | None:
+    """What a perfect model's simulation would leave, None without any disturbance."""
+    layout = search.layout
+    if layout.disturbance and set(layout.disturbance) <= set(absent):
+        return None
+    at = (layout, search.data, optimum.noise, e, optimum.best.z)
+    return layout.estimator.against_expected(*at)
 
 
 def _feedback(
