@@ -42,6 +42,8 @@ _RIDGE = 1e-12
 _JUMP, _ROUNDS = 5.0, 3
 """times the median size of what is unforeseen of an input, above which it is a jump; how often what
 is left is looked at again"""
+_MOVES = 0.05
+"""part of the samples at which an input that may follow something moves, at least"""
 _SEEN = 0.8
 """part of the samples of an output that is used"""
 
@@ -78,6 +80,10 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
     n = next(iter(outputs.values())).size if outputs else 0
     if not inputs or n < _LEAST:
         return ()
+    unforeseen = {name: _unforeseen(values) for name, values in inputs.items()}
+    free = {name: values for name, values in unforeseen.items() if values is not None}
+    if not free:
+        return ()
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
     innovations = _innovations(y, np.concatenate([y, u], axis=1))
@@ -87,12 +93,9 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
     # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
     tests = together * len(inputs) * len(outputs) * len(blocks)
     found = []
-    for name, values in inputs.items():
-        unforeseen = _unforeseen(values)
-        if unforeseen is None:
-            continue
+    for name, values in free.items():
         p, correlation, output, (first, last) = min(
-            (*_correlation(unforeseen, innovations[:, k], block), output, block)
+            (*_correlation(values, innovations[:, k], block), output, block)
             for k, output in enumerate(outputs)
             for block in blocks
         )
@@ -154,6 +157,9 @@ def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
     A pilot's test steps are larger than what he does about a gust, and would drown it. What is left
     out is chosen by the input alone, so that the test stays one.
     """
+    # A commanded input that stays for twenty samples and jumps follows nothing in between.
+    if np.mean(np.diff(u) != 0.0) < _MOVES:
+        return None
     left = _innovations(u[:, None], u[:, None])
     for _ in range(_ROUNDS):
         if left is None:
@@ -218,7 +224,7 @@ def _innovations(
     ]
     k = sizes[int(np.argmin(criteria))]
     left = np.full(y.shape, np.nan)
-    coefficients = scipy.linalg.solve_triangular(factor[:k, :k], along[:k], lower=True, trans="T")
+    coefficients = scipy.linalg.solve_triangular(factor[:k, :k], along[:k], lower=True, trans=1)
     left[longest:][rows] = at - x[:, :k] @ coefficients
     return left
 
