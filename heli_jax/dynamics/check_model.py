@@ -111,6 +111,7 @@ def _check(model: _Parts, traceable: bool) -> None:
     def of(role: str, *arguments: str) -> _Function:
         return _Function(model, role, arguments, traceable)
 
+    # The two that every model has come first: what they say is the cause where the others fail too.
     of("vector_field", "params", "state", "inputs").returns("State")
     of("output", "params", "state", "inputs").returns("Outputs")
     if model.start is not None:
@@ -223,6 +224,7 @@ class _Function:
         if not (
             jnp.issubdtype(array.dtype, jnp.floating)
             or jnp.issubdtype(array.dtype, jnp.integer)
+            # Limits are answers of yes or no.
             or self.role == "limits"
         ):
             self.refuse(f"expected a real number for {name!r}, got one of type {array.dtype}")

@@ -171,6 +171,8 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
     if wind:
         for axis in "xyz":
             sticks[f"wind_{axis}"] = Annotated[Scalar, "m/s", f"wind along {axis}"]
+    # The class itself where nothing differs: a model's classes are static to jit, and equal fields
+    # in another class would be another program.
     if tuple(sticks) == HelicopterInputs._fields:
         return HelicopterInputs
     return NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
@@ -260,6 +262,8 @@ def _hub(
     where there are none but the thrust along the mast."""
     left = rotors.tail.T if corrections.tail_force else None
     if corrections.flapping:
+        # A rotor that flaps acts on the body by its tilt alone: eqs 14-15, which let the cyclic
+        # pitch turn the body at once, are replaced and not added to.
         loads = hub_loads(p, rotors.main.T, Tilt(s.a1, s.b1))
         right = loads.right if left is None else loads.right - left
         return Moments(loads.roll, loads.pitch, loads.yaw), (loads.forward, right)
@@ -315,6 +319,7 @@ def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> di
         # Momentum theory alone ends there.
         **({} if corrections.windmill else {"vortex ring": ring}),
         "slow rotor": s.Omega < _SLOWEST * p.Omega,
+        # The advance ratio without the division: at rest a rotor has none, and V2 needs no root.
         "fast flight": (_FASTEST * p.R * s.Omega) ** 2 < air.V2,
     }
     # Without `rigid_body` nothing is divided by cos theta.

@@ -137,6 +137,8 @@ class Model(eqx.Module):
     @property
     def delay_parameters(self) -> tuple[str, ...]:
         """The parameters that are delays of inputs or outputs."""
+        # Several inputs may share a delay, as all sticks share the radio: it is one unknown, named
+        # once.
         return tuple(dict.fromkeys(name for _, name in (*self.delays, *self.delay_lines)))
 
     @property
@@ -173,6 +175,7 @@ PITCH = Axis(
     ("beta_pitch", "dbeta_pitch"),
     ("a1",),
 )
+# Yaw has no added inertia: the stand has springs and weights about roll and pitch alone.
 YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
 """The axes under the names that they have in the models here."""
 
@@ -299,6 +302,8 @@ def needed_but_missing(model: Model, params: Record) -> list[str]:
     # may be left out (c_paddle) has another in its place by jnp.where, and does not show.
     params = plain(params)
     missing = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    # The delay of an input is in no equation, since it acts on the record: no NaN comes through,
+    # and it is known to be read by its name.
     late = dict(model.delays).values()
     return [n for n in missing if n in late or np.isnan(_at_one(model, params, n, np.nan)).any()]
 

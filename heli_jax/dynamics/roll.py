@@ -170,6 +170,13 @@ def on_stand(model: Model) -> Model:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
     def vector_field(p: Record, s: Record, u: Record) -> Record:
+        """The model's derivatives, slowed by the stand.
+
+        Args:
+            p: the model's Params, SI.
+            s: the model's State.
+            u: the model's Inputs.
+        """
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)

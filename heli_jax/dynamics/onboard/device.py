@@ -59,15 +59,34 @@ class Device(abc.ABC):
         self.Outputs = with_more(model.Outputs, parts.outputs)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that reach the model; those from outside unless the device drives it."""
+        """The inputs that reach the model; those from outside unless the device drives it.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return u
 
     @abc.abstractmethod
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the device's own states, per second."""
+        """The derivatives of the device's own states, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, from those of the model."""
+        """The outputs, from those of the model.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+            y: the outputs of the model itself.
+        """
         return y
 
     def first(self, p: Record) -> dict[str, Any]:
@@ -81,16 +100,36 @@ class Device(abc.ABC):
         return self.model.State(**{n: getattr(s, n) for n in naming.names(self.model.State)})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """Of the model behind its device."""
+        """Of the model behind its device.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         of_model = self.model.vector_field(p, self.inner(s), self.inputs(p, s, u))
+        # The device's states stand behind the model's: matrices of the model keep their rows and
+        # columns.
         return self.State(**naming.asdict(of_model), **self.rates(p, s, u))
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """What the log has."""
+        """What the log has.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return self.shown(p, s, u, self.measured(p, s, u))
 
     def measured(self, p: Record, s: Record, u: Record) -> Record:
-        """The outputs of the model itself."""
+        """The outputs of the model itself.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return self.model.output(p, self.inner(s), self.inputs(p, s, u))
 
     def start(self, p: Record) -> Record:
@@ -105,7 +144,13 @@ class Device(abc.ABC):
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """Those of the model, with the inputs that reach it."""
+        """Those of the model, with the inputs that reach it.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         assert self.model.limits is not None
         return self.model.limits(p, self.inner(s), self.inputs(p, s, u))
 
@@ -139,6 +184,8 @@ class Device(abc.ABC):
             "without_stand": None if bare is None else again(bare),
             "positive": (*model.positive, *positive),
         }
+        # What is not named here stays as it is. `initial_sd` and `correlation` go by names of
+        # states, so they hold for a State that has grown; axes and delays name what is still there.
         return dataclasses.replace(model, **{**fields, **changes})
 
 
@@ -193,6 +240,8 @@ def quotient(above: str | None, below: str | None) -> str | None:
         return None
     try:
         exponents = units.base_of(above), units.base_of(below)
+        # Params are kept in SI. A unit that would need a factor is not that of a stored number, and
+        # no unit is better than one that is wrong by it.
         si = all(
             units.factor(u, units.as_text(e)) == 1.0
             for u, e in zip((above, below), exponents, strict=True)

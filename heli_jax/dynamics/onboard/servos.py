@@ -75,6 +75,8 @@ class _Servos(Device):
             f"zeta_{name}": Quantity("1", "servo's damping ratio", math.nan, True),
         }
         if rate_limit:
+            # Equal servos share their parameters, the limit too: one number for inputs of different
+            # units would be two limits under one name.
             unit = quotient(_one_unit(model, on), "s")
             params[f"rate_{name}"] = Quantity(unit, "servo's greatest speed", math.nan, True)
         states = {}
@@ -86,9 +88,23 @@ class _Servos(Device):
         self.on, self.rate_limit, self.name = on, rate_limit, name
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        """The inputs that are moved by servos, where these stand; the others as they are.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of positions and speeds, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         omega, zeta = (getattr(p, f"{k}_{self.name}") for k in ("omega", "zeta"))
         rates = {}
         for n in self.on:

@@ -96,6 +96,8 @@ def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vec
     def of(record: Record, name: str) -> Any:
         return getattr(record, name, 0.0)
 
+    # omega x v and omega x (omega x r) are products of two small numbers, of which a linear model
+    # knows nothing: kept here, they would make the output nonlinear.
     turning = _cross((of(rates, "p"), of(rates, "q"), of(rates, "r")), _at(p))
     return (
         of(rates, "u") + _g(p) * of(s, "theta") + turning[0],
@@ -106,6 +108,8 @@ def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vec
 
 def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
     omega, velocity = (s.p, s.q, s.r), (s.u, s.v, s.w)
+    # u, v and w are components along axes that turn: their derivatives lack omega x v, without
+    # which a steady turn would show no acceleration.
     along = _sum((rates.u, rates.v, rates.w), _cross(omega, velocity))
     cos_theta = jnp.cos(s.theta)
     weight = (

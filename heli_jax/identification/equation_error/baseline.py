@@ -93,6 +93,8 @@ def baseline(
     theta = history[-1]
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
     poles = np.roots(den)
+    # A simulation beside the one-step errors: these look good for any model of a fast sampled
+    # record, where the last output is nearly the next one.
     simulated = _simulate(num, den, u, y)
     continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
@@ -264,6 +266,8 @@ def _combinations(
     # The vehicle may state a stand that this model does not stand on.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
+    # Told even where they are impossible: that the paper's way gives them on this record is what a
+    # reader compares with the fit.
     values = {n: float(v) for n, v in ratios.values.items()}
     doubts = []
     wrong = [f"{n} = {v:.4g}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]
