@@ -111,7 +111,6 @@ def _check(model: _Parts, traceable: bool) -> None:
     def of(role: str, *arguments: str) -> _Function:
         return _Function(model, role, arguments, traceable)
 
-    # The two that every model has come first: what they say is the cause where the others fail too.
     of("vector_field", "params", "state", "inputs").returns("State")
     of("output", "params", "state", "inputs").returns("Outputs")
     if model.start is not None:

@@ -137,8 +137,8 @@ def rigid_hub_moments(
         per_speed = tip_path_plane.first_harmonic_moment(p, lift)
         forward, right = hub_speed(p, m)
         # The advancing side lifts more, and a quarter of a turn later the rotor leans away from
-        # where it flies to: nose up ahead, to the left in a slip to the right. It is the speed
-        # stability that makes hover's phugoid, and is felt most where the rotor is stiff.
+        # where it flies to: nose up ahead, to the left in a slip to the right. This speed
+        # stability is what hover's slow oscillation comes from.
         roll, pitch = roll - per_speed * right, pitch + per_speed * forward
     return Moments(roll, pitch, 0.0 * roll)
 

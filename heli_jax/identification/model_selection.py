@@ -294,6 +294,7 @@ def _inside(free: Free, value: float) -> float:
 
 def _test(small: Candidate, large: Candidate) -> Nested:
     """Without a further unknown there is nothing to test: degrees of 0, and no p-value."""
+    # Both at their own optimum over the same samples, or the ratio has no known distribution.
     ratio = 2.0 * (large.log_likelihood - small.log_likelihood)
     degrees = large.unknowns - small.unknowns
     # Wilks: chi-squared with as many degrees of freedom as there are unknowns more.

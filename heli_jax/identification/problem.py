@@ -131,6 +131,8 @@ class Problem:
         sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
+            # What somebody stated goes before the guess. Zero is the default of a sigma and no
+            # statement: it has no logarithm to begin with.
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 free[name] = Free(value)

@@ -125,6 +125,7 @@ def per_sample(
             "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
             f"{options.solver!r}"
         )
+    # Of the parameters at hand, which may be traced: a delay is estimated like any other parameter.
     delays = delays_of(model, params, options.delay, options.dt)
 
     term = field_term(model, model.vector_field)

@@ -93,8 +93,6 @@ def baseline(
     theta = history[-1]
     num, den = (np.asarray(v) for v in transfer_function(jnp.asarray(theta)))
     poles = np.roots(den)
-    # A simulation beside the one-step errors: these look good for any model of a fast sampled
-    # record, where the last output is nearly the next one.
     simulated = _simulate(num, den, u, y)
     continuous_num, continuous_den, exact, note = _continuous(num, den, flight.dt)
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
@@ -195,6 +193,8 @@ def _simulate(
 ) -> Float[np.ndarray, " N"]:
     """Hd driven by the whole input, started from the first measured outputs."""
     n = den.size - 1
+    # The whole record and not one step ahead: where sampling is fast any model predicts the next
+    # output well, since the last one is nearly the same.
     forced = np.convolve(u, num / den[0])[n : u.size]
     band = np.tile(np.asarray(den / den[0])[:, None], u.size - n)
     past = np.convolve(np.concatenate([y[:n], np.zeros(n)]), den / den[0])[n : 2 * n]

@@ -297,8 +297,8 @@ def _inside(free: Free, value: float) -> float:
     """The value, or where it lies outside the bounds the nearest one a little inside."""
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
-    # Never on a bound itself: the search has a bounded parameter in coordinates that put its bounds
-    # at infinity.
+    # Strictly inside: in the coordinates of a bounded parameter its bounds are at infinity, and so
+    # is zero in those of a logarithm.
     if low < value < high:
         return value
     span = high - low if math.isfinite(high - low) else max(abs(low if value <= low else high), 1.0)

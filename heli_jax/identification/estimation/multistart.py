@@ -96,6 +96,8 @@ def _scan(
             for n, y in flight.outputs.items():
                 m = run.outputs[names.index(n)]
                 seen = jnp.isfinite(y)
+                # Over the noise, as in the fit itself: otherwise the output with the largest
+                # numbers would choose the time shift.
                 ys.append(_centred(y, seen) / s[n])
                 ms.append(_centred(m, seen) / s[n])
         y, m = jnp.concatenate(ys), jnp.concatenate(ms)
@@ -191,6 +193,8 @@ class Search:
             progress: called with a sentence after each of several starts.
         """
         runs = self._run(self.layout, noise, points, progress)
+        # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
+        # good a place is.
         runs = [self._better_than_nothing(run, noise) for run in runs]
         if self.bounded.kinds == self.layout.kinds:
             return runs

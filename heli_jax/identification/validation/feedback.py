@@ -77,6 +77,8 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
         return ()
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
+    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # answer to an input, and would pass for feedback.
     innovations = _innovations(y, np.concatenate([y, u], axis=1))
     if innovations is None:
         return ()
@@ -173,6 +175,8 @@ def _decimated(
     every = max(1, int(np.ceil(1.0 / (flight.dt * _RATE) - 1e-9)))
 
     def thinned(x: np.ndarray) -> np.ndarray:
+        # Means of blocks and not every n-th sample: what is faster than the lower rate would come
+        # back as something slow.
         whole = x[: x.size // every * every].reshape(-1, every)
         return whole.mean(axis=1)  # NaN where one of them is missing
 
@@ -195,6 +199,8 @@ def _innovations(
     the record is too short."""
     scale = np.nanstd(past, axis=0)
     past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
+    # By BIC, which is consistent: over thousands of samples AIC would take coefficients that fit
+    # the record's noise.
     best, least = None, np.inf
     longest = _ORDERS[-1]
     for order in _ORDERS:
