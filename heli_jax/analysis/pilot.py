@@ -101,5 +101,7 @@ def _least_energy(
     schur: Any = scipy.linalg.schur(shifted.T, sort="rhp")  # three with `sort`, which stubs ignore
     T, Z, k = schur
     W, slow = Z[:, :k].T, T[:k, :k].T
+    # Linear in place of a Riccati equation: without a weight on the states the inverse of its
+    # solution obeys Lyapunov's equation.
     X = scipy.linalg.solve_continuous_lyapunov(slow, W @ B @ B.T @ W.T)
     return B.T @ W.T @ np.linalg.solve(X, W)

@@ -158,6 +158,8 @@ class Problem:
         disturbances = disturbances_of(self.model)
         if len(disturbances) < 2:
             return {}
+        # One flight for the matrices: a size to begin a search with needs no more, and the
+        # deviations are the largest of all flights.
         flight = self.training[0]
         sds = {
             n: max(float(np.nanstd(f.outputs[n])) for f in self.training if n in f.outputs)
