@@ -143,6 +143,7 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
         ending = f"_{name}" if len(on) > 1 or model.disturbances else ""
         lags = tuple(f"w{i + 1}_{name}" for i in range(poles))
         added.append(Disturbance(name, state, f"sigma_w{ending}", f"tau_w{ending}", lags))
+    # A clash would hide the model's own field: its equations would read the disturbance.
     taken = {*naming.names(model.Params), *naming.names(model.State)}
     for d in added:
         for clash in sorted(taken & {d.sigma, d.tau, *d.lags}):
@@ -293,5 +294,7 @@ def _filtered(d: Disturbance, p: Record, s: Record) -> dict[str, Scalar]:
     for name in d.lags:
         w = getattr(s, name)
         pull = -w if before is None else _gain(d) * before - w
+        # The same time constant for both lags: with one more of its own, a fit could not tell which
+        # is which.
         rates[name], before = pull / getattr(p, d.tau), w
     return rates

@@ -229,6 +229,8 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
     # inflow, is closed in `aero.thrust`.
     s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
+    # The flow is that of the body's motion alone, without the rotor's own induced velocity: this
+    # comes with the thrust, which depends on it.
     air = once(flow(corrections, p, s, u, m))
     force = main_rotor(corrections, p, s, u, air)
     tail = tail_rotor(corrections, p, u, m, s.Omega, inflow_of(corrections))
@@ -318,6 +320,8 @@ def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> di
     outside = {
         # Momentum theory alone ends there.
         **({} if corrections.windmill else {"vortex ring": ring}),
+        # Limits are told and not enforced: a solver that steps across one goes on smoothly, and the
+        # run is marked from there.
         "slow rotor": s.Omega < _SLOWEST * p.Omega,
         # The advance ratio without the division: at rest a rotor has none, and V2 needs no root.
         "fast flight": (_FASTEST * p.R * s.Omega) ** 2 < air.V2,

@@ -43,6 +43,8 @@ def with_delays(
     check_model(model)
     if not (isinstance(order, int) and 1 <= order <= _HIGHEST):
         raise ValueError(f"order: expected 1 to {_HIGHEST} states, got {order!r:.20}")
+    # Two ways, and not one for both: an input is a record, which can be read at any other time,
+    # exactly. An output is computed, and its past is there only if states carry it.
     late_in, late_out = _by_name(inputs), _by_name(outputs)
     if not late_in and not late_out:
         raise ValueError("expected an input or an output to delay, got none")
@@ -128,6 +130,8 @@ def _with_output_delays(model: Model, late: tuple[tuple[str, str], ...], order: 
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
+    # What the models know of their delays is kept by name in `delay_lines` as well: a fit begins
+    # from several starts where one of these is free.
     device = _LateOutputs(model, dict(late), order)
     return device.made(
         "late-outputs",
@@ -193,6 +197,8 @@ class _LateOutputs(Device):
 
     def first(self, p: Record) -> dict[str, Any]:
         # As if the machine had always been where it starts: the first coefficient is the mean.
+        # At rest at zero instead, the line would show a step from zero to the first output, one
+        # delay long, which no flight has.
         at_first = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         return first | {line_states(n, 1)[0]: getattr(at_first, n) for n in self.late}
@@ -209,6 +215,8 @@ def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
         order: states of the line.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
+    # The delay of this input is no longer one of the record: left in both places it would act
+    # twice.
     rest = tuple((n, parameter) for n, parameter in model.delays if n != name)
     return device.made(
         "line",
@@ -273,6 +281,8 @@ def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
     """
     rates = []
     for i in range(len(past)):
+        # The signal enters at the near end of the delay, where Legendre's polynomials are 1 and -1
+        # in turn.
         change = value if i % 2 == 0 else -value
         for j, m in enumerate(past):
             change = change - m if j > i or (i - j) % 2 == 0 else change + m

@@ -45,6 +45,8 @@ class Device(abc.ABC):
 
     def __init__(self, model: Model, parts: Parts) -> None:
         self.model = model
+        # Before anything is made: a name that is taken would silently replace the model's own
+        # field.
         _check_new(model, parts)
         title = type(self).__name__.strip("_")
 
@@ -139,6 +141,8 @@ class Device(abc.ABC):
     def noise_intensity(self, p: Record) -> Record:
         """The model's own; no device adds noise to the state."""
         assert self.model.noise_intensity is not None
+        # A device computes or filters: noise of a sensor is measurement noise, which the fit has by
+        # itself.
         own = naming.asdict(self.model.noise_intensity(p))
         zero = 0.0 * next(iter(own.values()))
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
@@ -168,6 +172,8 @@ class Device(abc.ABC):
             # The device rests too: a state more to solve for, and its derivative to vanish.
             steady = SteadyFlight((*states, *steady.unknowns), (*states, *steady.equations))
         bare = model.without_stand
+        # Time constants, frequencies and damping of a device are above zero whatever the model
+        # around which it stands: a fit then searches their logarithm.
         positive = tuple(n for n, q in self.parts.params.items() if q.positive)
         fields = {
             "name": f"{model.name}+{suffix}",
@@ -239,6 +245,8 @@ def quotient(above: str | None, below: str | None) -> str | None:
     if above is None or below is None:
         return None
     try:
+        # By exponents of the base units and not as text: rad/s over 1 has to come out as rad/s, and
+        # what cancels has to vanish.
         exponents = units.base_of(above), units.base_of(below)
         # Params are kept in SI. A unit that would need a factor is not that of a stored number, and
         # no unit is better than one that is wrong by it.

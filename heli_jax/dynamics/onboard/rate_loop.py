@@ -90,6 +90,7 @@ def with_gyro(
 
 def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
     """Sticks with the states that are their rates."""
+    # The model's axes say which rate a stick turns: most loops need no table of their own.
     known = {a.stick: a.rate for a in axes_of(model) if a.stick is not None}
     if on is None:
         own = [a for a in axes_of(model) if a.name in axes and a.stick in known]
@@ -137,10 +138,14 @@ class _RateLoop(Device):
         params: dict[str, Quantity] = {}
         states: dict[str, Quantity] = {}
         for stick, rate in loops:
+            # The stick of the loop takes the place and the unit of the input that it drives, so
+            # that a log of sticks fits the model with its loop and without.
             unit = naming.unit(model.Inputs, stick), naming.unit(model.State, rate)
             params |= _gains(stick, *unit, law)
             if law.integral:
                 angle = quotient(unit[1], "1/s")
+                # The integral is an angle and a state: it remembers, which makes a heading hold of
+                # a rate loop.
                 states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
             if law.lag:
                 states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as the gyro has it")
@@ -167,6 +172,8 @@ class _RateLoop(Device):
         """
         driven = {}
         for stick, rate in self.loops:
+            # From the state and not from an output: an output may be delayed or filtered by the
+            # sensors of the log, which are not those of the loop.
             measured, gain = self.seen(s, stick, rate), getattr(p, f"Kp_{stick}")
             if not self.law.command:
                 # A damper has no Kc: a gain before the pedal would be exchangeable with the pedal's

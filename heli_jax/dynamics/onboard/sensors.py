@@ -102,6 +102,8 @@ class _LowPass(Device):
     def first(self, p: Record) -> dict[str, Any]:
         # As if the machine had always been where it starts.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
+        # Zero in its place would show as a start-up transient of the filter, which a logger that
+        # runs before the record begins has long behind it.
         return {f"{n}_lowpass": getattr(y, n) for n in self.on}
 
 
@@ -125,6 +127,8 @@ class _Imu(Device):
             n: Quantity("m/s^2", f"specific force {words[n]} at the IMU")
             for n in self.motion.outputs
         }
+        # Its place has zero as default, the centre of gravity, where the levers vanish: the one
+        # position that needs no measurement. Nothing else here has a default.
         super().__init__(model, Parts(params, {}, outputs))
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:

@@ -62,6 +62,8 @@ def _with_servos(
     def again(bare: Model) -> Model:
         return _with_servos(bare, on, rate_limit, delay, name)
 
+    # The delay goes outside the servo: the two commute, and an input that is late by its record is
+    # exact and costs no states.
     made = device.made(f"{name}s", again)
     return with_input_delays(made, dict.fromkeys(on, f"delay_{name}")) if delay else made
 
@@ -95,6 +97,8 @@ class _Servos(Device):
             s: its State, with the states added here.
             u: its Inputs, as they come from outside.
         """
+        # The position alone reaches the model: blades follow where the servo stands, not what it
+        # was told.
         return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
@@ -109,6 +113,8 @@ class _Servos(Device):
         rates = {}
         for n in self.on:
             position, speed = f"{n}_{self.name}", f"{n}_{self.name}_rate"
+            # The equation of second order as a position loop around a speed loop: in this form
+            # there is a speed that is asked for, which a limit can act on.
             asked = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
             # The speed that is asked for is limited, not the speed itself: a state that is clipped
             # would wind up behind its limit, and come off it late.
