@@ -64,6 +64,8 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     """
     axes = axes_of(model)
     sticks = [axis.stick for axis in axes if axis.stick is not None]
+    # The states of the bar and the tilt belong to it: they are fast beside the attitude, but what a
+    # stick does goes through them.
     of_attitude = {n for axis in axes for n in (axis.angle, axis.rate, *axis.flybar, *axis.tilt)}
     states = [n for n in naming.names(model.State) if n in of_attitude]
 

@@ -351,6 +351,8 @@ def _check_model(problem: Problem) -> None:
             )
     if not problem.model.linear:
         _check_start(problem, params)
+    # At the start values: a model that says linear and is not would be discretised exactly, and be
+    # wrong without any sign of it.
     if problem.model.linear and linear_misfit(problem.model, params) > _LINEAR:
         raise ValueError(
             f"model {problem.model.name} says linear=True, but its vector field or output is not "

@@ -206,6 +206,8 @@ def memory(
 
 def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
     """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
+    # On the unit circle, as it was identified: its continuous form is an approximation where no
+    # inverse of the hold exists.
     z = np.exp(1j * omega * baseline.dt)
     # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):

@@ -64,6 +64,7 @@ def _by_group(A: Array, B: Array, dt: Array, delays: Delays, linear: tuple[bool,
     """`discretize` where inputs are late by different times: what they add is superposed, so each
     group's columns are those of a model with these inputs alone."""
     zeros = jnp.zeros_like(B)
+    # Bp also where a group acts at once: its columns are zero, and one shape serves every delay.
     Ad, Bd, Bp, Bn = None, zeros, zeros, zeros if linear else None
     for group in sorted(set(delays.groups), key=lambda g: -1 if g is None else g):
         i = np.asarray(delays.members(group))

@@ -54,6 +54,7 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
         raise ValueError(
             "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
         )
+    # Two samples at least: one has no interval, and nothing to integrate over.
     shapes = {u.shape for u in jax.tree.leaves(inputs)}
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
         raise ValueError(f"inputs: expected the shape (N,) for all, N >= 2, got {sorted(shapes)}")

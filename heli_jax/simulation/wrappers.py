@@ -63,6 +63,7 @@ class Stopping(SolverWrapper):
     y = (state, going), where going is 1 until then and 0 from there on.
     """
 
+    # A number and not a truth value for `going`: diffrax takes derivatives of all that it carries.
     over: Callable[..., Any]
     linear: tuple[bool, ...] = eqx.field(static=True, default=())
 

@@ -156,6 +156,8 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     if free.prior is not None and free.prior.mean:
         # Twice the prior: a start beyond would only be pulled back.
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
+    # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
+    # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if coordinates.changes_sign(free):
         values = _either_sign(free, width, rng.standard_normal((2, size)))
@@ -262,6 +264,7 @@ class Search:
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        # The cost is a mean over the measured numbers, so this is one too.
         nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
 
