@@ -44,8 +44,8 @@ def flapping_rate_constant(p: Helicopter, Omega: Scalar, B: Scalar) -> Scalar:
         Omega: main rotor speed [rad/s].
         B: tip loss factor, 1 for lift up to the tip.
     """
-    # A flapping blade meets the air with a speed that grows with r, in a dynamic pressure that does
-    # so too, on the arm r: the integral of r^3 up to B R, hence B^4.
+    # The lift against a flapping rate is that of Omega r times the blade's own speed, which grows
+    # with r as well; times the arm r its integral up to B R goes with B^4.
     return (lock_number(p) / 16.0 * B**4) * Omega
 
 
@@ -143,8 +143,8 @@ def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
         T: thrust of the main rotor [N].
         tilt: of the tip-path plane.
     """
-    # The hub's spring and the thrust's arm turn the body by the same tilt. In one flight state only
-    # their sum shows; k_beta by itself takes a known hr or records at different thrusts.
+    # The hub's spring and the thrust's arm turn the body by the same tilt: the moments of one flight
+    # state show their sum. k_beta by itself takes a known hr or records at different thrusts.
     stiffness = p.k_beta + T * p.hr
     right = T * tilt.b1
     # The mast stands lr behind the centre of gravity: a force to the right there turns the nose

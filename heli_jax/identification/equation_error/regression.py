@@ -147,6 +147,7 @@ def _residual(
     columns = [*shown, *range(n, at.value.shape[1])]
     # [value, slope] side by side: what is done to the one is done to the other.
     both = np.concatenate([at.value[..., None], at.slope], axis=-1)
+    # Value and derivatives in one product: the regressors are the same for both.
     predicted = np.einsum("ekc,kN->eNc", both[np.ix_(rows, columns)], known)
     initial = np.zeros((len(rows), known.shape[1], 0))
     if hidden:
@@ -175,6 +176,7 @@ def _hidden(
         pushed[1:] = first @ forcing[:-1] + second @ forcing[1:]
         return recurrence(phi, pushed)
 
+    # The states before their derivatives, which are driven by them.
     h = integrated(forcing[..., :1])
     # d/dt of a derivative by a parameter: the same dynamics, driven also by what these change.
     forcing[..., 1:] += np.einsum("hjq,Nj->Nhq", dynamics[..., 1:], h[..., 0])

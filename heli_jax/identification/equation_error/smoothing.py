@@ -75,6 +75,8 @@ def smoothed_input(
 def _convolved(
     x: Float[np.ndarray, " N"], weights: Float[np.ndarray, "r w"]
 ) -> Float[np.ndarray, "r n"]:
+    # Only where the whole kernel lies within the samples: at the ends a kernel cut off would no
+    # longer keep the equations exact.
     return np.stack([np.convolve(x, w, mode="valid") for w in weights])
 
 

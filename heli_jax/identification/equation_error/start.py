@@ -130,6 +130,8 @@ def _setup(
         missing = needed_but_missing(model, model.Params(**{**base, **some, **flight.known}))
         if missing:
             raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
+    # One structure a flight: what is measured may differ from flight to flight, and with it which
+    # states are shown.
     structures = []
     for flight in flights:
         names = list(free)

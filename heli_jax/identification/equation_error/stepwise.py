@@ -101,6 +101,8 @@ class _Terms:
     def to_remove(self, inside: list[int]) -> dict[int, float]:
         """The F-ratios of what is in and may go, by number."""
         ratios = {}
+        # Each against all others that are in: what one term explains depends on which ones stand
+        # beside it.
         for j in (j for j in inside if self.names[j] not in self.forced):
             basis = basis_of(self.X[:, [i for i in inside if i != j]])
             ratios[j] = partial_f(basis, self.y, self.X[:, j], self.times)
