@@ -143,8 +143,8 @@ def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
         T: thrust of the main rotor [N].
         tilt: of the tip-path plane.
     """
-    # The hub's spring and the thrust's arm turn the body by the same tilt: the moments of one flight
-    # state show their sum. k_beta by itself takes a known hr or records at different thrusts.
+    # The hub's spring and the thrust's arm turn the body by the same tilt: the moments of one
+    # flight state show their sum. k_beta by itself takes a known hr or several thrusts.
     stiffness = p.k_beta + T * p.hr
     right = T * tilt.b1
     # The mast stands lr behind the centre of gravity: a force to the right there turns the nose
