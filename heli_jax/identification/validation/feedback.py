@@ -199,8 +199,6 @@ def _innovations(
     the record is too short."""
     scale = np.nanstd(past, axis=0)
     past = (past - np.nanmean(past, axis=0)) / np.where(scale > 0, scale, 1.0)
-    # By BIC, which is consistent: over thousands of samples AIC would take coefficients that fit
-    # the record's noise.
     best, least = None, np.inf
     longest = _ORDERS[-1]
     for order in _ORDERS:
