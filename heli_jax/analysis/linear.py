@@ -127,6 +127,8 @@ def eigenmodes(
         part = part / np.sum(part)
         shares = dict(zip(names, (float(p) for p in part), strict=True))
         size = abs(value)
+        # A mode that stays where it is does not oscillate; the ratio itself is rounding over
+        # rounding.
         damping = 1.0 if still else -value.real / size
         result.append(Mode(value, _mode_name(shares, motions), size, damping, shares))
     return tuple(result)

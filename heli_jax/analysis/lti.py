@@ -58,6 +58,7 @@ def d2c(
     n = A.shape[0]
     poles = np.asarray(np.linalg.eigvals(A), dtype=np.complex128)
     size = max(1.0, float(np.max(np.abs(poles), initial=0.0)))
+    # A pole at zero is a whole sample of delay, which no system of finite order in s has.
     if np.any(np.abs(poles) < 1e-12 * size):
         raise ValueError("the discrete system has a pole at z = 0: its logarithm does not exist")
     # Rounding may turn a real pole a little off the axis.
@@ -91,6 +92,7 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
         raise ValueError("den must have a power of one at least")
     if b.size > a.size:
         raise ValueError("num is of higher order than den: not a proper transfer function")
+    # A leading one in the denominator fixes the factor that both polynomials have in common.
     b, a = b / a[0], a / a[0]
     padded = np.concatenate([np.zeros(a.size - b.size), b])
     n = a.size - 1
@@ -104,6 +106,8 @@ def _state_space(num: ArrayLike, den: ArrayLike, dt: float) -> tuple[np.ndarray,
 
 def _polynomials(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Polynomials:
     den = np.real(np.poly(A))
+    # By coefficients and not as det(s - A + bc) - det(s - A), in which small coefficients are
+    # differences of large ones.
     num = D[0, 0] * den + _numerator(A, B[:, 0], C[0])
     return num, den
 

@@ -64,6 +64,8 @@ def attitude_hold(model: Model, params: Any, trimmed: Trim, pace: float = PACE) 
     """
     axes = axes_of(model)
     sticks = [axis.stick for axis in axes if axis.stick is not None]
+    # The states of the bar and the tilt belong to it: they are fast beside the attitude, but what a
+    # stick does goes through them.
     of_attitude = {n for axis in axes for n in (axis.angle, axis.rate, *axis.flybar, *axis.tilt)}
     states = [n for n in naming.names(model.State) if n in of_attitude]
 
@@ -101,5 +103,7 @@ def _least_energy(
     schur: Any = scipy.linalg.schur(shifted.T, sort="rhp")  # three with `sort`, which stubs ignore
     T, Z, k = schur
     W, slow = Z[:, :k].T, T[:k, :k].T
+    # Linear in place of a Riccati equation: without a weight on the states the inverse of its
+    # solution obeys Lyapunov's equation.
     X = scipy.linalg.solve_continuous_lyapunov(slow, W @ B @ B.T @ W.T)
     return B.T @ W.T @ np.linalg.solve(X, W)

@@ -151,6 +151,7 @@ def trim(
     # The same starts each time: a trim is a function of its arguments.
     rng = np.random.default_rng(0)
     offset = np.zeros(len(steady.unknowns))
+    # A search ends at a root near its start: where that is no flight, another start helps.
     for _ in range(_TRIES):
         result = jax.device_get(
             _equilibrium(model, params, condition, air, jnp.asarray(offset), power_off)
@@ -212,6 +213,7 @@ def _equilibrium(
 
     def point(z: Array, parameters: Any) -> tuple[Any, Any]:
         values = dict(zip(names, z, strict=True))
+        # What is solved for replaces what is given: here a climb, there the rotor's speed.
         fixed = {
             **ground,
             "dz": values.get("climb", condition.climb),
@@ -245,6 +247,8 @@ def _equilibrium(
     xi = jax.lax.stop_gradient(solution.value)
 
     def polish(z: Array, _: Any) -> tuple[Array, None]:
+        # Here `params` is not held back: a Newton step from a root has the derivative of the root
+        # by the parameters (implicit function), whatever way led there.
         return z - jnp.linalg.solve(jax.jacfwd(fn)(z, params), fn(z, params)), None
 
     xi, _ = jax.lax.scan(polish, xi, None, length=_POLISH)
@@ -275,6 +279,7 @@ def steady_flight(model: Model) -> SteadyFlight | None:
     found += [] if "x_collective" in inputs else ["Omega"]
     unknowns = [n for n in states if n in found]
     unknowns += [n for n in states if n.startswith("beta")]
+    # Wind and a measured rotor speed are given, not flown.
     unknowns += [n for n in inputs if not n.startswith("wind") and n != "Omega"]
     # A state whose derivative is another state does not vanish by itself, it is that state.
     no_equation = {"x", "y", "z", "phi", "theta", "psi"}
@@ -319,6 +324,7 @@ def _require(model: Model, power_off: bool = False) -> SteadyFlight:
 def plausible(result: Trim) -> Bool[Array, "..."] | np.bool_ | bool:
     """Whether the rotor turns, the blades push upwards, and the machine is not on its back."""
     state, inputs = result.state, result.inputs
+    # Absolute values and & in place of `and`: the same test serves numbers and batches of tracers.
     level = (abs(state.phi) < _UPRIGHT) & (abs(state.theta) < _UPRIGHT)
     Omega = state.Omega if hasattr(state, "Omega") else inputs.Omega
     if hasattr(inputs, "x_collective"):
@@ -369,6 +375,8 @@ def _why_heavy(model: Model, params: Any, result: Trim, stick: str) -> str:
 def _check_range(model: Model, params: Any, result: Trim, condition: Condition) -> None:
     if model.limits is None:
         return
+    # A root of equations outside their range is a number without a machine, such as a steady
+    # descent in a vortex ring.
     limits = model.limits(params, result.state, result.inputs)
     outside = [name for name, out in limits.items() if bool(out)]
     if outside:

@@ -42,6 +42,8 @@ class RotorForce(NamedTuple):
 
 def solidity(R: Scalar, c: Scalar) -> Scalar:
     r"""$\sigma = 2c/(\pi R)$ [1]."""
+    # N c R over the area pi R^2 with two blades, as the paper has both rotors: another number of
+    # blades needs a chord that makes up for it.
     return (2.0 / math.pi) * c / R
 
 
@@ -137,6 +139,8 @@ def torque(p: Helicopter, Omega: Scalar, theta0: Scalar, flow: Flow, inflow: Sca
     scale = p.rho * math.pi * p.R**3
     lifting = (p.B**3 / 3.0 * p.R) * Omega * theta0 - (0.5 * p.B**2) * inflow
     induced = inflow * (lifting + (0.25 * p.B**2) * flow.edgewise)
+    # The second part changes its sign where air comes from below: it then drives the rotor, which
+    # is what autorotation lives on. The first, profile drag, always brakes.
     return (scale * sigma * p.Cd0 / 8.0 * p.R**2) * Omega**2 + (scale * 0.5 * p.a * sigma) * induced
 
 
@@ -177,6 +181,8 @@ def tail_thrust(
         W: speed against its thrust [m/s].
         solve: how the induced velocity follows.
     """
+    # Two terms where the main rotor has three: without cyclic pitch no blade angle meets the
+    # edgewise flow by direction. The speed V2 acts through the induced velocity alone.
     half = 0.5 * p.a_T * solidity(p.R_T, p.c_T)
     b = (half * 0.5 * p.B**2 * p.R_T * p.K_Omega) * Omega
     T0 = (half * p.B**3 / 3.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2 * theta0T - b * W
@@ -201,6 +207,8 @@ def tail_torque(p: Helicopter, Omega: Scalar, theta0T: Scalar, inflow: Scalar) -
     sigma = solidity(p.R_T, p.c_T)
     scale = p.rho * math.pi * p.R_T**3 * sigma
     lifting = (p.B**3 / 3.0 * p.R_T * p.K_Omega) * Omega * theta0T - (0.5 * p.B**2) * inflow
+    # The same division as in `torque`: profile drag grows with the square of the rotor's speed, the
+    # rest is the power that goes into the air.
     drag = (scale * p.Cd0 / 8.0 * (p.R_T * p.K_Omega) ** 2) * Omega**2
     return drag + (scale * 0.5 * p.a_T) * inflow * lifting
 
@@ -220,5 +228,8 @@ def inflow_rate(p: Helicopter, force: RotorForce, through: Scalar) -> Scalar:
     """
     # 0.637 is theirs: the share of a sphere of air with the rotor's radius that takes part.
     area = math.pi * p.R**2
+    # Divided by rho pi R^2: of the air's mass a length is left, so the time constant of the inflow
+    # does not depend on the density, and at equilibrium this is the equation that
+    # `induced_velocity` solves.
     excess = (1.0 / (p.rho * area)) * force.T - 2.0 * force.vi * through
     return (1.0 / (0.637 * 4.0 / 3.0 * p.R)) * excess

@@ -150,6 +150,8 @@ def _check_record(model: _Parts, role: str) -> None:
 def _is_leaf(record: type, names: tuple[str, ...]) -> bool:
     """Whether JAX takes a record for one value, not for the values of its fields."""
     try:
+        # A class that JAX does not know as a pytree would be one opaque value: every function of it
+        # would then fail within jit, with words about something else.
         made = record(**dict.fromkeys(names, 1.0))
     except Exception:  # a class that looks at its values has to do without this check
         return False
@@ -223,6 +225,7 @@ class _Function:
         if not (
             jnp.issubdtype(array.dtype, jnp.floating)
             or jnp.issubdtype(array.dtype, jnp.integer)
+            # Limits are answers of yes or no.
             or self.role == "limits"
         ):
             self.refuse(f"expected a real number for {name!r}, got one of type {array.dtype}")

@@ -47,6 +47,8 @@ def _check_delays(model: Any) -> None:
         if unit is not None and not _is_second(unit):
             problem = f"expected {parameter} in s, got {unit!r}"
             _refuse(model, f"delays of {stick}", problem)
+        # Two would be two readings of one record at different times, and later code keeps them by
+        # input: the second would replace the first without a word.
         if stick in late:
             _refuse(model, "delays", f"expected one delay of {stick}, got two")
         late.add(stick)
@@ -54,6 +56,8 @@ def _check_delays(model: Any) -> None:
 
 def _is_second(unit: str) -> bool:
     try:
+        # Milliseconds are refused as well: the parameter's value would be taken for seconds as it
+        # stands, a delay a thousand times too long.
         return units.factor(unit, "s") == 1.0
     except ValueError:
         return False
@@ -74,6 +78,8 @@ def _names_of(model: Any, axis: Axis) -> Iterator[tuple[str, str, Any]]:
 
 def _tuple(model: Any, place: str, value: Any) -> tuple[Any, ...]:
     """The value, which has to be a tuple: a model is compiled, so nothing in it may change."""
+    # An Axis is a tuple itself: `axes=(Axis(...))` without its comma would pass for a tuple of
+    # names.
     if not isinstance(value, tuple) or isinstance(value, Axis):
         example = _EXAMPLES.get(place, '("c", "d")')
         _refuse(model, place, f"expected a tuple, as {example}, got {value!r:.60}")

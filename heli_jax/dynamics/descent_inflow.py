@@ -27,12 +27,16 @@ _REST = 1e-8
 """[m/s] of flow that is always there: the square root has a derivative even where nothing moves."""
 _BEGINS, _ENDS = 0.5, 2.2
 """descents over the induced velocity between which the wake is no stream tube"""
+# Fitted with the two ends above in place: another end changes the shape of q, and both numbers have
+# to be fitted to the measured curve again.
 _K, _K_V = 0.37, 5.8
 
 
 def _flow2(v: Scalar, V2: Scalar, W: Scalar) -> tuple[Scalar, Scalar]:
     """The square of the flow through the rotor [m^2/s^2] and its derivative by v [m/s]."""
     below, above = -W - _BEGINS * v, _ENDS * v + W
+    # The term enters by its square, so cutting q to zero outside the range leaves the flow with a
+    # continuous first derivative. Newton's steps and the gradients of a fit need that.
     product = below * above
     inside = product > 0
     q = jnp.where(inside, product, 0.0)
@@ -51,6 +55,8 @@ def mass_flow(v: Scalar, V2: Scalar, W: Scalar) -> Scalar:
         V2: square of the airspeed in the plane of the rotor [m^2/s^2].
         W: airspeed through the rotor against the thrust, positive in climb [m/s].
     """
+    # The sign of v and not that of a thrust: with dynamic inflow v is a state, and no thrust is at
+    # hand here.
     sign = jnp.where(v < 0, -1.0, 1.0).astype(jnp.result_type(v))
     return jnp.sqrt(_flow2(sign * v, V2, sign * W)[0])
 
@@ -94,7 +100,7 @@ def _induced_velocity_jvp(
     V2, W, T0, b = primals
     dV2, dW, dT0, db = tangents
     v = induced_velocity(*primals)
-    # By the sign of v and not of T0, as `mass_flow` has it: they agree, and at zero both vanish.
+    # By the sign of T0, where `mass_flow` has that of v: they agree, and at zero both vanish.
     sign = jnp.where(T0 < 0, -1.0, 1.0).astype(jnp.result_type(T0))
     x, c = sign * v, sign * W
     s2, ds2 = _flow2(x, V2, c)
@@ -102,6 +108,8 @@ def _induced_velocity_jvp(
     below, above = -c - _BEGINS * x, _ENDS * x + c
     q = jnp.where(below * above > 0, below * above, 0.0)
     ratio = q / (x * x + _K_V * V2 + _REST**2)
+    # Derivatives of s^2 by V2 and by c. In F = 2 x s + b x - t they come with 2 ds = d(s^2)/s,
+    # which is the x/s below; `slope` is the derivative of F by x.
     by_V2 = 1.0 - _K * _K_V * ratio * ratio
     by_c = 2.0 * (c + x) + 2.0 * _K * ratio * jnp.where(q > 0, below - above, 0.0)
     slope = 2.0 * s + x * ds2 / s + b

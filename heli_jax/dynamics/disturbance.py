@@ -92,6 +92,8 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         start=disturbed.start,
         noise_intensity=disturbed.noise_intensity,
         initial_sd=disturbed.initial_sd,
+        # With one pole each push has one state, and pushes do not depend on one another: there is
+        # nothing to correlate that the model does not correlate itself.
         correlation=disturbed.correlation if poles == 2 or model.correlation else None,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
@@ -136,9 +138,12 @@ def _disturbances(model: Model, on: tuple[str, ...], poles: int) -> tuple[Distur
             if other.state == state:
                 same = "twice" if other.name == name else f"by {other.name!r} as well"
                 raise ValueError(f"{name!r} names state {state!r}, which is disturbed {same}")
+        # A disturbance that is alone has the plain names, which `disturbances_of` knows in a model
+        # of one's own as well. A second one needs names that say what it acts on.
         ending = f"_{name}" if len(on) > 1 or model.disturbances else ""
         lags = tuple(f"w{i + 1}_{name}" for i in range(poles))
         added.append(Disturbance(name, state, f"sigma_w{ending}", f"tau_w{ending}", lags))
+    # A clash would hide the model's own field: its equations would read the disturbance.
     taken = {*naming.names(model.Params), *naming.names(model.State)}
     for d in added:
         for clash in sorted(taken & {d.sigma, d.tau, *d.lags}):
@@ -202,6 +207,13 @@ class _Disturbed(NamedTuple):
         return self.model.State(**{n: getattr(state, n) for n in states})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
+        """The model's derivatives with the pushes on them, and those of the pushes.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         # It adds to the derivative, as a gust's moment over the inertia would: a disturbance of
         # the angle itself would jump, and one of the output would not act back through the flybar.
         rates = naming.asdict(self.model.vector_field(p, self.undisturbed(s), u))
@@ -211,9 +223,23 @@ class _Disturbed(NamedTuple):
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
+        """The model's outputs: a push shows in them by the motion alone.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return self.model.output(p, self.undisturbed(s), u)
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The model's limits, by name.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         assert self.model.limits is not None
         return self.model.limits(p, self.undisturbed(s), u)
 
@@ -238,6 +264,9 @@ class _Disturbed(NamedTuple):
         own = self.model.initial_sd
         sds = dict(own(p)) if own is not None else {}
         for d in self.added:
+            # The gusts blew before the record began, so w has its stationary spread at the first
+            # sample. Zero there would call the first tau_w seconds calm, and a filter would trust
+            # them too much.
             sds |= dict.fromkeys(d.lags, getattr(p, d.sigma))
         return sds
 
@@ -265,5 +294,7 @@ def _filtered(d: Disturbance, p: Record, s: Record) -> dict[str, Scalar]:
     for name in d.lags:
         w = getattr(s, name)
         pull = -w if before is None else _gain(d) * before - w
+        # The same time constant for both lags: with one more of its own, a fit could not tell which
+        # is which.
         rates[name], before = pull / getattr(p, d.tau), w
     return rates

@@ -38,5 +38,10 @@ def throttle(
     """
     error = asked - Omega
     free = p.K_P * error + integral
+    # A motor cannot brake the rotor, nor give more than all it has. While it is at an end the
+    # throttle does not depend on the gains: such stretches of a record say nothing of K_P.
     held = jnp.clip(free, 0.0, 1.0)
+    # Without the last term the integral would grow for as long as full throttle is not enough, and
+    # the rotor would then overspeed until it had run down again. The division by K_P is why that
+    # gain, unlike K_I, may not be zero.
     return held, p.K_I * (error + (1.0 / p.K_P) * (held - free))

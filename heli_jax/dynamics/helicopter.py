@@ -171,6 +171,8 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
     if wind:
         for axis in "xyz":
             sticks[f"wind_{axis}"] = Annotated[Scalar, "m/s", f"wind along {axis}"]
+    # The class itself where nothing differs: a model's classes are static to jit, and equal fields
+    # in another class would be another program.
     if tuple(sticks) == HelicopterInputs._fields:
         return HelicopterInputs
     return NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
@@ -227,6 +229,8 @@ def _field(corrections: Corrections, State: type, p: Helicopter, s: Record, u: R
     # inflow, is closed in `aero.thrust`.
     s = _turning(corrections, s, u)
     m = motion(corrections, s, u)
+    # The flow is that of the body's motion alone, without the rotor's own induced velocity: this
+    # comes with the thrust, which depends on it.
     air = once(flow(corrections, p, s, u, m))
     force = main_rotor(corrections, p, s, u, air)
     tail = tail_rotor(corrections, p, u, m, s.Omega, inflow_of(corrections))
@@ -260,6 +264,8 @@ def _hub(
     where there are none but the thrust along the mast."""
     left = rotors.tail.T if corrections.tail_force else None
     if corrections.flapping:
+        # A rotor that flaps acts on the body by its tilt alone: eqs 14-15, which let the cyclic
+        # pitch turn the body at once, are replaced and not added to.
         loads = hub_loads(p, rotors.main.T, Tilt(s.a1, s.b1))
         right = loads.right if left is None else loads.right - left
         return Moments(loads.roll, loads.pitch, loads.yaw), (loads.forward, right)
@@ -314,7 +320,10 @@ def _limits(corrections: Corrections, p: Helicopter, s: Record, u: Record) -> di
     outside = {
         # Momentum theory alone ends there.
         **({} if corrections.windmill else {"vortex ring": ring}),
+        # Limits are told and not enforced: a solver that steps across one goes on smoothly, and the
+        # run is marked from there.
         "slow rotor": s.Omega < _SLOWEST * p.Omega,
+        # The advance ratio without the division: at rest a rotor has none, and V2 needs no root.
         "fast flight": (_FASTEST * p.R * s.Omega) ** 2 < air.V2,
     }
     # Without `rigid_body` nothing is divided by cos theta.

@@ -120,6 +120,7 @@ def hub_speed(p: Helicopter, m: Motion) -> tuple[Scalar, Scalar]:
         p: vehicle, SI.
         m: the `motion` of the body.
     """
+    # omega x r at r = (-lr, 0, -hr), of which forward and right count here.
     return m.u - p.hr * m.q, m.v + p.hr * m.p - p.lr * m.r
 
 
@@ -248,6 +249,8 @@ def _drag(p: Helicopter, m: Motion) -> tuple[Scalar, ...]:
     square = m.u**2 + m.v**2 + m.w**2
     # The root of a speed of zero has no derivative; this one has, and gives zero drag there.
     speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0 * square)
+    # Each axis has its area times the whole speed, not the square of its own component: with equal
+    # areas the drag then points against the motion, whatever its direction in the body.
     factor = once((0.5 * p.rho / p.m) * speed)
     return factor * p.Sx * m.u, factor * p.Sy * m.v, factor * p.Sz * m.w
 
@@ -269,6 +272,8 @@ def angular_accelerations(
         m: the `motion` of that state.
         M: the `moments`.
     """
+    # The body's axes are taken for principal ones: neither the paper nor a vehicle has Ixz. What is
+    # bolted on is rigid with the body, so it adds to the inertias and nowhere else.
     Ixx, Iyy, Izz = p.Ixx + p.Ixx_added, p.Iyy + p.Iyy_added, p.Izz
     if not corrections.rigid_body:
         return (1.0 / Ixx) * M.roll, (1.0 / Iyy) * M.pitch, (1.0 / Izz) * M.yaw

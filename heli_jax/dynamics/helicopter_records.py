@@ -32,6 +32,8 @@ class HelicopterInputs(NamedTuple):
     x_throttle: Annotated[Scalar, "1", "throttle stick"]
 
 
+# Beyond the paper, which has one stick for throttle and collective: fields that a variant adds are
+# kept apart, so that its records have those of its equations and no others.
 COLLECTIVE = Annotated[Scalar, "1", "collective stick"]
 """an input of its own where collective and throttle are apart"""
 ROTOR_SPEED = Annotated[Scalar, "rad/s", "rotor speed, measured"]
@@ -63,6 +65,9 @@ class HelicopterOutputs(NamedTuple):
     rotor_speed: Annotated[Scalar, "rad/s", "rotor speed"]
 
 
+# Switches and not subclasses: each departure from the paper can be tried by itself, and its effect
+# told from that of the others. A NamedTuple of booleans is static to jit, so a switch that is off
+# costs nothing.
 class Corrections(NamedTuple):
     """What of the paper is corrected or added; each for itself."""
 

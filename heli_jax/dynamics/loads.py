@@ -128,6 +128,7 @@ def rigid_hub_moments(
         roll = aero.cyclic_moment(p, s.Omega, tilt.roll)
         pitch = aero.cyclic_moment(p, s.Omega, tilt.pitch)
     if corrections.tip_loss:
+        # The moment of a cyclic pitch is the integral of r^2 theta times the arm r up to B R.
         roll, pitch = p.B**4 * roll, p.B**4 * pitch
     if corrections.speed_stability:
         lift = tip_path_plane.speed_lift(
@@ -135,6 +136,9 @@ def rigid_hub_moments(
         )
         per_speed = tip_path_plane.first_harmonic_moment(p, lift)
         forward, right = hub_speed(p, m)
+        # The advancing side lifts more, and a quarter of a turn later the rotor leans away from
+        # where it flies to: nose up ahead, to the left in a slip to the right. This speed
+        # stability is what hover's slow oscillation comes from.
         roll, pitch = roll - per_speed * right, pitch + per_speed * forward
     return Moments(roll, pitch, 0.0 * roll)
 
@@ -158,6 +162,8 @@ def flapping(
         force: of the main rotor.
     """
     B, pitch = _tip(corrections, p), cyclic(p, s, u)
+    # Only where the plane would settle: the body's rates and the hub's stiffness act on the way
+    # there, in `flapping_rates`.
     driven = Tilt(pitch.pitch, pitch.roll)
     if corrections.speed_stability:
         lift = tip_path_plane.speed_lift(p, s.Omega, collective(p, u), force.inflow, B)

@@ -137,6 +137,8 @@ class Model(eqx.Module):
     @property
     def delay_parameters(self) -> tuple[str, ...]:
         """The parameters that are delays of inputs or outputs."""
+        # Several inputs may share a delay, as all sticks share the radio: it is one unknown, named
+        # once.
         return tuple(dict.fromkeys(name for _, name in (*self.delays, *self.delay_lines)))
 
     @property
@@ -173,6 +175,7 @@ PITCH = Axis(
     ("beta_pitch", "dbeta_pitch"),
     ("a1",),
 )
+# Yaw has no added inertia: the stand has springs and weights about roll and pitch alone.
 YAW = Axis("yaw", "dpsi", "psi", "Izz", None, "x_yaw")
 """The axes under the names that they have in the models here."""
 
@@ -204,6 +207,8 @@ def initial_sd_of(model: Model, params: Record, dtype: DTypeLike) -> Float[Array
         params: the model's Params.
         dtype: of the result.
     """
+    # Zero where a state is not named: its first value is then known, or an unknown of the fit, and
+    # not something that the filter may correct.
     random = model.initial_sd(params) if model.initial_sd is not None else {}
     states = naming.names(model.State)
     return naming.ravel(model.State(**{n: random.get(n, 0.0) for n in states}), dtype)
@@ -256,6 +261,7 @@ def linear_misfit(model: Model, params: Record) -> float:
     params = plain(params)
     x1, x2, u1, u2 = draw(model.State), draw(model.State), draw(model.Inputs), draw(model.Inputs)
     with np.errstate(all="ignore"):
+        # Superposition at one random pair, which hardly any nonlinear formula passes by chance.
         summed = both(jax.tree.map(np.add, x1, x2), jax.tree.map(np.add, u1, u2))
         parts = both(x1, u1) + both(x2, u2)
         size = np.max(np.abs(summed)) + np.max(np.abs(parts))
@@ -298,7 +304,11 @@ def needed_but_missing(model: Model, params: Record) -> list[str]:
     # NaN goes through every operation that uses it: what the model reads shows at the end. One that
     # may be left out (c_paddle) has another in its place by jnp.where, and does not show.
     params = plain(params)
+    # Each missing one by itself, with the others at one: several NaN at a time would not say which
+    # of them was read.
     missing = [n for n, v in naming.asdict(params).items() if np.isnan(v)]
+    # The delay of an input is in no equation, since it acts on the record: no NaN comes through,
+    # and it is known to be read by its name.
     late = dict(model.delays).values()
     return [n for n in missing if n in late or np.isnan(_at_one(model, params, n, np.nan)).any()]
 

@@ -133,6 +133,7 @@ roll = Model(
     RollInputs,
     RollOutputs,
     linear=True,
+    # No tip-path plane: the moment of eq. 14 follows the cyclic pitch at once.
     axes=(ROLL._replace(tilt=()),),
 )
 """Free roll at constant rotor speed: eqs 21-22."""
@@ -170,6 +171,13 @@ def on_stand(model: Model) -> Model:
         raise ValueError(f"model {model.name!r} has no roll or pitch axis to put on a stand")
 
     def vector_field(p: Record, s: Record, u: Record) -> Record:
+        """The model's derivatives, slowed by the stand.
+
+        Args:
+            p: the model's Params, SI.
+            s: the model's State.
+            u: the model's Inputs.
+        """
         rates = model.vector_field(p, s, u)
         for axis in axes:
             inertia, added = _inertias(p, axis)
@@ -208,7 +216,9 @@ def roll_transfer_function(p: Helicopter, *, stand: bool = False) -> TransferFun
     """
     # Written out by hand beside the model that `linearize` differentiates: a test compares the two.
     k1 = flapping_rate_gain(p)
+    # The moment is linear in the cyclic pitch: k2 is that of a bracket (L3 x + L2 L4 beta) of one.
     k2 = cyclic_moment(p, p.Omega, 1.0 / (p.L1 * (p.L2 + p.L3))) / roll_inertia(p)
+    # The stand's constants are per unit of the machine's own inertia, as in `on_stand`.
     share = p.Ixx / roll_inertia(p)
     c1, c2, c3 = k1 / p.Omega, p.Omega**2, k1 * k2 * p.L2 * p.L4 / p.Omega
     # Zeros and ones made of k1 have its type and its batch axis.

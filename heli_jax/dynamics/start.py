@@ -50,6 +50,8 @@ def cannot_start(model: Model, params: Record, inputs: Mapping[str, float] | Non
     u = model.Inputs(
         **{n: np.float64((inputs or {}).get(n, 0.0)) for n in naming.names(model.Inputs)}
     )
+    # In NumPy's numbers, outside of jit: a model is asked at one point, and compiling it would take
+    # longer.
     bad = _not_finite(model, params, x, u)
     if not bad:
         return ""
@@ -83,6 +85,7 @@ def _not_finite(model: Model, params: Record, x: dict[str, Any], u: Record) -> t
     values = {f"the rate of {n}": v for n, v in naming.asdict(rates).items()}
     values |= {f"output {n}": v for n, v in naming.asdict(outputs).items()}
     bad = tuple(n for n, v in values.items() if not np.isfinite(float(v)))
+    # Derivatives only where the values are finite: those of a value that is none say nothing more.
     return bad or _no_slope(model, params, x, u)
 
 

@@ -37,10 +37,14 @@ def tail_rotor(
         force = tail_force(corrections, p, m, Omega, theta0T, solve)
         T, inflow = force.T, force.inflow
     else:
+        # Eq. 16 gives a moment alone. Divided by its arm it is the force that makes it, so that in
+        # every variant there is one way from a tail thrust to the moments and forces in `loads`.
         T = (1.0 / p.L_T) * aero.tail_moment(p, Omega, theta0T)
         inflow = 0.0 * T
     # Not computed where nothing reads it: a vehicle of the paper's may lack what it needs.
     Q = aero.tail_torque(p, Omega, theta0T, inflow) if corrections.tail_power else 0.0 * T
+    # Yaw, roll, the side force and the shaft's power all read these two: behind the barrier the
+    # iteration for the inflow runs once, and not once for each of them.
     return jax.lax.optimization_barrier(TailRotor(T, Q))
 
 
@@ -67,6 +71,9 @@ def tail_force(
     # from; eq. 16, without inflow, has none.
     forward, W = m.u, p.L_T * m.r - m.v
     if corrections.tail_force:
+        # omega x r at that place. The flow at the height h_T counts only where the force acts there
+        # as well: the tail damps the roll rate through both together, and one without the other
+        # would be a coupling in one direction.
         forward, W = forward - p.h_T * m.q, W - p.h_T * m.p
     V2 = forward**2 + (m.w + p.L_T * m.q) ** 2
     return aero.tail_thrust(p, Omega, theta0T, V2, W, solve)

@@ -44,6 +44,8 @@ def flapping_rate_constant(p: Helicopter, Omega: Scalar, B: Scalar) -> Scalar:
         Omega: main rotor speed [rad/s].
         B: tip loss factor, 1 for lift up to the tip.
     """
+    # The lift against a flapping rate is that of Omega r times the blade's own speed, which grows
+    # with r as well; times the arm r its integral up to B R goes with B^4.
     return (lock_number(p) / 16.0 * B**4) * Omega
 
 
@@ -60,6 +62,8 @@ def speed_lift(p: Helicopter, Omega: Scalar, theta0: Scalar, inflow: Scalar, B: 
         inflow: lambda R Omega [m/s].
         B: tip loss factor, 1 for lift up to the tip.
     """
+    # An advancing blade sees Omega r + V. To first order in V the pitch gives 2 Omega r V and the
+    # inflow V, each times the arm r: integrated up to B R these are the 2/3 and the 1/2.
     return (2.0 / 3.0 * B**3 * p.R) * Omega * theta0 - (0.5 * B**2) * inflow
 
 
@@ -76,6 +80,8 @@ def flap_back(p: Helicopter, Omega: Scalar, lift: Scalar, B: Scalar) -> Scalar:
         lift: `speed_lift`.
         B: tip loss factor, 1 for lift up to the tip.
     """
+    # The plane tilts until the lift that its flapping takes off is the lift that the speed adds.
+    # Both are moments of the same air on the same blade: density, chord and lift slope cancel.
     return (4.0 * p.K_mu / (p.R**2 * B**4)) * lift / (Omega * Omega + _STOPPED)
 
 
@@ -105,7 +111,11 @@ def flapping_rates(
         m: the `Motion` of the body, of which p and q [rad/s] count.
         B: tip loss factor, 1 for lift up to the tip.
     """
+    # The body's rates come in as they are, not by way of k: like a gyroscope the plane keeps its
+    # place in space while the hub turns under it, and the air then leads it after the hub.
     k = flapping_rate_constant(p, Omega, B)
+    # Omega over Omega^2 and not one over Omega: at rest there is then no precession instead of an
+    # infinite one.
     turn = (0.5 * p.k_beta / p.I_beta) * Omega / (Omega * Omega + _STOPPED)
     return Tilt(
         k * (driven.a1 - tilt.a1) + turn * tilt.b1 - m.q,
@@ -133,6 +143,8 @@ def hub_loads(p: Helicopter, T: Scalar, tilt: Tilt) -> HubLoads:
         T: thrust of the main rotor [N].
         tilt: of the tip-path plane.
     """
+    # The hub's spring and the thrust's arm turn the body by the same tilt: the moments of one
+    # flight state show their sum. k_beta by itself takes a known hr or several thrusts.
     stiffness = p.k_beta + T * p.hr
     right = T * tilt.b1
     # The mast stands lr behind the centre of gravity: a force to the right there turns the nose

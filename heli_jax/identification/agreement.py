@@ -31,7 +31,9 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
     for s in signals:
         names = list(s.measured)
         for b, a in ((b, a) for i, a in enumerate(names) for b in names[:i]):
+            # By flight: over several joined flights a bias of each would pass for correlation.
             x, y = s.residual(a), s.residual(b)
+            # Only samples at which both were measured: sensors of different rates share few.
             seen = np.isfinite(x) & np.isfinite(y)
             n = int(seen.sum())
             if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):

@@ -199,6 +199,8 @@ def _against_expected(
 ) -> dict[str, float] | None:
     """What a perfect model's simulation would leave, None without any disturbance."""
     layout = search.layout
+    # With every disturbance gone the simulation has to explain the record by itself, as with output
+    # error.
     if layout.disturbance and set(layout.disturbance) <= set(absent):
         return None
     at = (layout, search.data, optimum.noise, e, optimum.best.z)
@@ -209,6 +211,8 @@ def _feedback(
     problem: Problem, white: dict[str, Whiteness]
 ) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
     """Whether inputs follow the outputs, and what is to be said of it."""
+    # Whether feedback does harm depends on the residuals: with white innovations the direct method
+    # is unbiased in a closed loop too.
     found = feedback_of(problem)
     return found, tuple(feedback_notes(problem, found, all(w.white for w in white.values())))
 
@@ -235,6 +239,8 @@ def _no_disturbance(optimum: RelaxedOptimum) -> bool:
 
 def _params(problem: Problem, estimates: dict[str, Estimate]) -> Any:
     """The vehicle with the estimates in place."""
+    # Parameters alone: offsets, gains and shifts belong to the log, and a model that flies by
+    # itself has none of them.
     values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
     return naming.replace(problem.vehicle, **values)
 

@@ -40,6 +40,8 @@ def disturbed_sets(
     if len(names) < 2:
         raise ValueError(f"expected two disturbances or more to choose from, got {len(names)}")
     listed = ", ".join(names)
+    # A model with one disturbance, not the model without: the same estimator, the same noise and so
+    # a likelihood that can be set beside the others'.
     problems = {"no disturbance": _none(problem, with_disturbance(model, names[0]))}
     everything = f"all: {listed}"
     for name in names:
@@ -49,10 +51,14 @@ def disturbed_sets(
     if 0 < len(stated) < len(names) - 1:
         only = f"only {', '.join(stated)}"
         problems[only] = _of(problem, with_disturbance(model, stated))
+    # What is within all of them, with nothing of its own: only of such pairs does a likelihood
+    # ratio have a known distribution.
     smaller = list(problems)[1:]
     problems[everything] = _of(problem, with_disturbance(model, names))
     two = f"{everything}; two poles"
     problems[two] = _of(problem, with_disturbance(model, names, 2))
+    # Two poles are no extension of one: both have as many parameters, so the two are compared by
+    # AIC and not by a test.
     nested = [("no disturbance", name) for name in (*smaller, everything, two)]
     nested += [(name, everything) for name in smaller]
     return Alternatives(problems, tuple(nested))
@@ -62,6 +68,8 @@ def _of(problem: Problem, disturbed: Model) -> Problem:
     """The problem by filter error with that model, its noise's starts where there are some."""
     vehicle, known = naming.asdict(problem.vehicle), _known(problem, disturbed)
     same = same_parameters(disturbed, problem.model)
+    # Starts that were stated for a disturbance hold in every candidate that has it, whatever it is
+    # called there: alone it has the plain names.
     known |= {n: vehicle[m] for n, m in same.items()}
     fixed = [n for n, m in same.items() if m in problem.fixed_noise]
     return replace(
@@ -78,6 +86,8 @@ def _none(problem: Problem, disturbed: Model) -> Problem:
     the measurement noise is then laid out as in the others, and the likelihoods can be compared."""
     [d] = disturbances_of(disturbed)
     known = _known(problem, disturbed)
+    # Not zero: the logarithm of a size is what the layout holds. A billionth of the motion moves no
+    # digit of the likelihood.
     known |= {d.sigma: jnp.asarray(1e-9 * problem.motion), d.tau: jnp.asarray(1.0)}
     kept = (n for n in problem.fixed_noise if n == "sigma_y")
     return replace(

@@ -56,6 +56,8 @@ class _FirstGuess(NamedTuple):
 
 
 def _first_guess(problem: Problem) -> _FirstGuess:
+    # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
+    # with both can a coarse search compare starts.
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
@@ -75,6 +77,8 @@ def check(problem: Problem) -> Check:
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
     guess = _first_guess(problem)
+    # At the start values, since nothing else is known yet: where these are far off, what is
+    # determined there may differ from what is at the optimum, for which the fit asks again.
     verdict = verdict_of(problem, guess.layout, guess.e)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))

@@ -65,6 +65,7 @@ def check_free(name: str, free: Free, model: Model) -> None:
             raise ValueError(f"free.{name}.{key}: expected a finite number, got {value}")
     if free.prior is not None and free.prior.sd <= 0:
         raise ValueError(f"free.{name}.prior.sd must be above zero, got {free.prior.sd:g}")
+    # None is no answer any more: the Problem has filled it in by the kind of model.
     if free.sign not in ("keep", "any"):
         raise ValueError(f"free.{name}.sign: expected 'keep' or 'any', got {free.sign!r}")
     if name in model.positive:
@@ -97,6 +98,7 @@ def _check_bounds(name: str, free: Free) -> None:
 def _check_positive(name: str, free: Free) -> None:
     """Refuse what would let a parameter be zero or less that the model says is positive."""
     for key, value in (("start", free.start), ("lower", free.lower)):
+        # Zero will do as a lower bound, which is open, and not as a start, which has no logarithm.
         if value is not None and (value < 0 or (key == "start" and value == 0)):
             raise ValueError(
                 f"free.{name}.{key}: expected more than zero, since the model says that it is "

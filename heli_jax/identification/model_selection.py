@@ -80,6 +80,7 @@ def alternatives(
         free = {n: f for n, f in problem.free.items() if n not in ("kappa", "zeta")}
         machines[", no stand"] = (without_stand, free)
     for ending, (machine, free) in machines.items():
+        # Without the stand's own parameters nothing may be left to estimate.
         if not free:
             continue
         for words, poles in (("no disturbance", 0), ("one pole", 1), ("two poles", 2)):
@@ -148,6 +149,8 @@ def choose(
     fits: dict[str, Fit] = {}
     for name, problem in problems.items():
         report(f"comparing models: {name}")
+        # Every candidate by the same estimator and on the same samples, or their likelihoods would
+        # not be those of one record.
         fits[name] = fit(problem, **fit_options)
     pairs = [(a, b) for a, b in nested if a in fits and b in fits]
     sentences = _none_below_its_part(problems, pairs, fits, report, fit_options)
@@ -294,6 +297,7 @@ def _inside(free: Free, value: float) -> float:
 
 def _test(small: Candidate, large: Candidate) -> Nested:
     """Without a further unknown there is nothing to test: degrees of 0, and no p-value."""
+    # Both at their own optimum over the same samples, or the ratio has no known distribution.
     ratio = 2.0 * (large.log_likelihood - small.log_likelihood)
     degrees = large.unknowns - small.unknowns
     # Wilks: chi-squared with as many degrees of freedom as there are unknowns more.

@@ -131,6 +131,8 @@ class Problem:
         sizes = {d.sigma: self.motion for d in disturbances_of(self.model)} | self.push_scales
         free = {n: Free(sizes.get(n, 1.0)) for n in self.noise_names}
         for name in free:
+            # What somebody stated goes before the guess. Zero is the default of a sigma and no
+            # statement: it has no logarithm to begin with.
             value = float(getattr(self.vehicle, name))
             if math.isfinite(value) and value > 0:
                 free[name] = Free(value)
@@ -156,6 +158,8 @@ class Problem:
         disturbances = disturbances_of(self.model)
         if len(disturbances) < 2:
             return {}
+        # One flight for the matrices: a size to begin a search with needs no more, and the
+        # deviations are the largest of all flights.
         flight = self.training[0]
         sds = {
             n: max(float(np.nanstd(f.outputs[n])) for f in self.training if n in f.outputs)
@@ -347,6 +351,8 @@ def _check_model(problem: Problem) -> None:
             )
     if not problem.model.linear:
         _check_start(problem, params)
+    # At the start values: a model that says linear and is not would be discretised exactly, and be
+    # wrong without any sign of it.
     if problem.model.linear and linear_misfit(problem.model, params) > _LINEAR:
         raise ValueError(
             f"model {problem.model.name} says linear=True, but its vector field or output is not "

@@ -58,6 +58,8 @@ def _scale(A: np.ndarray, C: np.ndarray, sds: np.ndarray, state: int) -> float:
     for _ in range(_DEEPEST):
         effect = np.abs(reach[:, state])
         seen = np.isfinite(effect) & (effect > 0) & (sds > 0)
+        # The most sensitive output bounds the push: a larger one would have moved it further than
+        # was measured.
         least = min(least, float((sds[seen] / effect[seen]).min(initial=np.inf)))
         # The nearest outputs say it best: further on the same motion comes filtered.
         if np.isfinite(least):

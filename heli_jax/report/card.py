@@ -134,6 +134,7 @@ def _of_relations(fit: Fit) -> list[Gate]:
     v = fit.verdict
     lines = [_most("condition number", "all parameters", v.condition, "", ILL_CONDITIONED)]
     if len(v.names) > 1:
+        # Without the diagonal, which is one whatever the data are.
         size = np.abs(v.correlation - np.diag(np.diag(v.correlation)))
         i, j = np.unravel_index(int(np.nanargmax(size)), size.shape)
         of = f"{v.names[min(i, j)]}, {v.names[max(i, j)]}"

@@ -100,6 +100,8 @@ def _residuals(fit: Fit) -> dict[str, Any]:
 def _first_guess(problem: Problem) -> dict[str, Any] | None:
     """How the starts were found: where the fit began, not its result."""
     guess = problem.first_guess
+    # Not the fit's own `starts`: here stands how the first of them was found, with the noise's bias
+    # that such values have.
     if guess is None:
         return None
     selection = guess.selection
@@ -131,6 +133,8 @@ def _metrics(fit: Fit) -> dict[str, Any]:
 
 def _adequacy(adequacy: Adequacy) -> dict[str, Any]:
     return {
+        # With the limits that it was judged against, so that a file can be read without the version
+        # that wrote it.
         **adequacy._asdict(),
         "judged": [output._asdict() for output in adequacy.judged],
         # The limits of this version: a later one may have others.
@@ -194,6 +198,8 @@ def whiteness_note(fit: Fit) -> str:
             + (", which filter-error would use for a better estimate." if fit.disturbable else ".")
         )
     else:
+        # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
+        # samples.
         consequence = "The intervals count every sample as news and are too narrow."
     return (
         f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
@@ -304,6 +310,8 @@ def _plain(value: Any) -> Any:
         return bool(value)
     if isinstance(value, int | np.integer):
         return int(value)
+    # Infinite counts as missing too: strict JSON has neither, and a reader has one case to think
+    # of.
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
@@ -335,6 +343,8 @@ def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
 
 def _columns(s: Signals) -> dict[str, Any]:
     """The columns of one flight by their names."""
+    # The name of the flight in every row: a table program can group by it, whatever the rows'
+    # order.
     columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
     for output, measured in s.measured.items():
         columns[f"{output}_measured"] = measured

@@ -138,12 +138,27 @@ def responses(
     held = scipy.linalg.expm(both * dt) if np.isfinite(both).all() else both * np.nan
 
     def response(points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """The transfer function at some points, in s or in z.
+
+        Args:
+            points: s or z (k,), complex.
+            A: (n, n), continuous or discrete.
+            b: (n,), of the same kind.
+        """
         return _transfer(points, A, b, C[i], D[i, j])
 
     delay = dict(model.delays).get(input)
     late = 0.0 if delay is None else float(np.asarray(getattr(params, delay)))
 
     def turned(omega: np.ndarray, points: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """The same with the phase that the input's delay takes.
+
+        Args:
+            omega: (k,) [rad/s].
+            points: s or z (k,) at these.
+            A: (n, n), continuous or discrete.
+            b: (n,), of the same kind.
+        """
         return response(points, A, b) * np.exp(-1j * omega * late)
 
     return (
@@ -191,6 +206,8 @@ def memory(
 
 def discrete(baseline: Baseline, omega: np.ndarray) -> np.ndarray:
     """Hd(e^{i omega dt}) (k,) of the recursive least squares."""
+    # On the unit circle, as it was identified: its continuous form is an approximation where no
+    # inverse of the hold exists.
     z = np.exp(1j * omega * baseline.dt)
     # A pole on the unit circle gives inf there, which no curve draws.
     with np.errstate(all="ignore"):

@@ -151,6 +151,7 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     # The first flight where there is no baseline.
     i = next((i for i, s in enumerate(fit.signals) if baseline and s.flight == baseline.flight), 0)
     # What the flight states of the vehicle goes before the estimates, as in the fit.
+    # Signals hold the fitted flights first, in the order of `training`; those held out follow.
     known = problem.training[i].known if i < len(problem.training) else {}
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
     flight = FittedFlight(problem.model, params, fit, fit.signals[i])

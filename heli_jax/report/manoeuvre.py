@@ -88,6 +88,7 @@ def _by_unit(record: type, names: list[str]) -> list[tuple[str | None, list[str]
 
 def _short(values: dict[str, np.ndarray]) -> tuple[str, dict[str, np.ndarray]]:
     """Lengths [m] in the unit that suits them: a stick moves by millimetres."""
+    # One unit for all inputs of a panel, by the largest: they share its axis.
     largest = max(float(np.max(np.abs(v), initial=0.0)) for v in values.values())
     # The first unit in which the largest is 0.1 or more; metres where nothing moves.
     unit, factor = next((u for u in _LENGTHS if largest * u[1] >= 0.1), ("m", 1.0))

@@ -118,6 +118,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _estimate(saved: Mapping[str, Any]) -> Estimate:
+    # By name and these alone: a file may have keys that a later version added.
     return Estimate(**{name: saved[name] for name in Estimate._fields})
 
 
@@ -149,6 +150,7 @@ def _intervals(
 
 def _signals(path: Path, content: Mapping[str, Any]) -> tuple[Signals, ...]:
     """The flights of signals.csv, as the fit had them; NaN where a cell is empty."""
+    # The table itself does not say which flights were held out.
     held_out = {flight["flight"]: flight.get("hold_out", False) for flight in content["data"]}
     # An output may have been measured in the flights held out alone.
     outputs = [

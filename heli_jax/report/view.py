@@ -80,6 +80,7 @@ def write_view(
             flight = _flight(run, params, len(shown) + 1, first)
             size = size_of(run, float(params.R))
         shown.append(Shown(name, _pictures(run, model), flight, size))
+    # Flights that are not drawn are counted on the page, so that nobody takes those shown for all.
     page = filled(
         "view.html.j2",
         title=title,

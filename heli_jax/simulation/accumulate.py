@@ -246,6 +246,15 @@ def _in_blocks(
     def samples(
         x: list[Array], value: PyTree, u: list[list[Array]], now: PyTree, count: int
     ) -> PyTree:
+        """The value after `count` samples of a block.
+
+        Args:
+            x: the states at its begin.
+            value: before.
+            u: by sample the inputs.
+            now: the data of these samples.
+            count: how many, m at most.
+        """
         for j in range(count):
             data_now = jax.tree.map(lambda v, j=j: v[j], now)
             value = reducer.update(value, outputs(x, u, j), data_now)

@@ -50,6 +50,7 @@ def delays_of(
     """
     if isinstance(common, Delays):
         return common
+    # None and not zeros: without a delay the program has no second part in each interval.
     if common is None and not model.delays:
         return None
     own = dict(model.delays)
@@ -61,11 +62,15 @@ def delays_of(
         seconds = 0.0 if common is None else jnp.asarray(common)
         if key is not None:
             seconds = seconds + jnp.asarray(getattr(params, key))
+        # Both delays of an input add before they are divided: two fractions of a sample may make a
+        # whole one.
         samples = jnp.asarray(seconds) / dt
         # The whole part has no derivative; the rest has that of the delay.
         floor = jnp.floor(jax.lax.stop_gradient(samples))
         whole.append(floor.astype(int))
         rest.append(samples - floor)
+    # Which inputs are late is known when the program is made, by how much is not: a fit moves
+    # delays without compiling anew.
     groups = tuple(distinct.index(k) if k in distinct else None for k in keys)
     return Delays(groups, tuple(whole), tuple(rest))
 

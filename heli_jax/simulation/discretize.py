@@ -64,9 +64,11 @@ def _by_group(A: Array, B: Array, dt: Array, delays: Delays, linear: tuple[bool,
     """`discretize` where inputs are late by different times: what they add is superposed, so each
     group's columns are those of a model with these inputs alone."""
     zeros = jnp.zeros_like(B)
+    # Bp also where a group acts at once: its columns are zero, and one shape serves every delay.
     Ad, Bd, Bp, Bn = None, zeros, zeros, zeros if linear else None
     for group in sorted(set(delays.groups), key=lambda g: -1 if g is None else g):
         i = np.asarray(delays.members(group))
+        # The rest alone: whole samples are in the index by which an input is read.
         late = None if group is None else delays.rest[group] * dt
         moving = tuple(linear[j] for j in i) if linear else ()
         part = _discretize(A, B[:, i], dt, late, moving if any(moving) else ())
@@ -134,6 +136,8 @@ def process_noise(model: Model, params: Record, dt: Number) -> Float[Array, "n n
     if model.noise_intensity is None:
         return jnp.zeros(A.shape, A.dtype)
     g = naming.ravel(model.noise_intensity(params), A.dtype)
+    # The integral over the step, not intensity times dt: noise on a rate is, within one sample
+    # already, noise on its angle, correlated with it.
     return van_loan(A, jnp.zeros_like(g), g, jnp.asarray(dt, A.dtype)).Q
 
 

@@ -97,6 +97,7 @@ def stopped(
     _, s = jax.lax.fori_loop(0, _BISECTIONS, halve, (0.0 * one, one))
     # A run that begins beyond an event ends where it begins.
     s = jnp.where(over[0], 0.0, s)
+    # At that moment the one that has come is the smallest; the others are still above zero.
     which = jnp.argmin(values(end.state(s), end.inputs(s)))
     # argmax of no event is 0, so k and s are numbers of no meaning there: `came` chooses.
     came = jnp.any(over)
@@ -132,6 +133,14 @@ class _Interval(NamedTuple):
     # no step of a solver has to be made again.
     def state(self, s: Array) -> Record:
         def cubic(a: Array, b: Array, da: Array, db: Array) -> Array:
+            """Between two values with their slopes.
+
+            Args:
+                a: at the begin.
+                b: at the end.
+                da: slope at the begin, per second.
+                db: slope at the end.
+            """
             rest = 1.0 - s
             ends = rest**2 * (1.0 + 2.0 * s) * a + s**2 * (3.0 - 2.0 * s) * b
             return ends + self.h * s * rest * (rest * da - s * db)

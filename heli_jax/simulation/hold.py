@@ -52,6 +52,8 @@ def linear_inputs(model: Model, flight: FlightOrInputs, hold: Hold) -> tuple[boo
         for name in hold:
             if name not in names:
                 raise ValueError(f"hold: {model.name} has no input {name!r}{nearest(name, names)}")
+        # Input by input: what is named goes before the Flight, the others stay as their log has
+        # them.
         by_name |= hold
     for value in by_name.values():
         check_hold(value)
@@ -113,6 +115,8 @@ def segments(
     if delays is None:
         now = at(inputs, k)
         return [Segment(jnp.asarray(dt), now, _slope(linear, now, at(inputs, k + 1), dt))]
+    # Three samples: the one that is late by a fraction arrives within the interval, before it the
+    # one before still acts, and a line leads on to the next.
     before, now, after = (at(inputs, k + i, delays) for i in (-1, 0, 1))
     ends, ranks = _divided(delays)
     parts = []
@@ -143,6 +147,8 @@ def _divided(delays: Delays) -> tuple[list[Any], list[Any]]:
     if len(delays.rest) == 1:  # nothing to sort, and nothing that depends on a value
         return [0.0, delays.rest[0], 1.0], [0]
     rest = jnp.stack(delays.rest)
+    # Which delay is the shorter is no smooth question; the times between which the parts lie keep
+    # their derivatives.
     order = jnp.argsort(jax.lax.stop_gradient(rest))
     inner = rest[order]
     ranks = jnp.argsort(order)
@@ -172,6 +178,7 @@ def _line(delays: Delays, i: int, u: Any, ranks: list[Any], j: int) -> tuple[Any
 
 
 def _slope(linear: tuple[bool, ...], first: Record, second: Record, dt: Number) -> Record:
+    # Over the whole sample time also where a part is shorter: the line is that between two samples.
     slopes = jax.tree.map(lambda a, b: (b - a) / dt, first, second)
     return _chosen(linear, slopes, jax.tree.map(jnp.zeros_like, first))
 
@@ -197,6 +204,7 @@ def delayed(
             continue
         rest = delays.rest[group]
         if linear and linear[i]:
+            # On the line between the two samples, `rest` short of the second.
             acting.append(rest * earlier + (1.0 - rest) * current)
         else:
             # One that is late by a part of a sample has not arrived at the sample itself.

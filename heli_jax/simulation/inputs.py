@@ -40,6 +40,7 @@ def multistep_3211(
     """
     # In either direction, so that a machine without stability does not wander off to one side.
     u = np.zeros(n)
+    # Whole samples, one at least: a unit below the sample time would leave steps of no length.
     step, rest = max(1, round(unit / dt)), max(1, round(pause / dt))
     k = rest
     while k < n:

@@ -134,6 +134,11 @@ class Exact(_Stateless):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """One sample of the recurrence.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
+        """
         assert args.discrete is not None
         # Whole samples of a delay shift the inputs; the rest of it is in Bd and Bp.
         k, late = sample_index(t0), args.delays
@@ -207,6 +212,11 @@ class RK4(_Stateless):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """One step of the method.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in s.
+        """
         h: Any = t1 - t0
 
         # Written here although diffrax has Runge-Kutta methods: those stack the stages into arrays,
@@ -280,6 +290,11 @@ class PerSample(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """One sample in its parts.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as diffrax has them; time in samples.
+        """
         # The first failure counts: what comes after it is no news.
         y, result = y0, dfx.RESULTS.successful
         for length, now in self._parts(args, sample_index(t0)):

@@ -54,6 +54,7 @@ def held_inputs(model: Model, flight: FlightOrInputs, dt: Number | None) -> tupl
         raise ValueError(
             "expected dt, the sample time in seconds, beside inputs given as arrays, got none"
         )
+    # Two samples at least: one has no interval, and nothing to integrate over.
     shapes = {u.shape for u in jax.tree.leaves(inputs)}
     if len(shapes) != 1 or any(len(s) != 1 or s[0] < 2 for s in shapes):
         raise ValueError(f"inputs: expected the shape (N,) for all, N >= 2, got {sorted(shapes)}")
@@ -125,6 +126,7 @@ def per_sample(
             "controller: expected a diffrax solver with an error estimate, such as Dopri8(), got "
             f"{options.solver!r}"
         )
+    # Of the parameters at hand, which may be traced: a delay is estimated like any other parameter.
     delays = delays_of(model, params, options.delay, options.dt)
 
     term = field_term(model, model.vector_field)

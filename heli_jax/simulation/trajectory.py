@@ -45,6 +45,7 @@ class Trajectory(NamedTuple):
     @property
     def valid(self) -> Bool[Array, " N"]:
         """Where the run is within the model's range and finite."""
+        # Sample by sample: a run that diverges is of use up to where it does.
         finite = [jnp.isfinite(v) for v in jax.tree.leaves(self.states)]
         return functools.reduce(
             jnp.logical_and, [*finite, *(~out for out in self.outside.values())]

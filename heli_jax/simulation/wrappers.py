@@ -45,6 +45,12 @@ class StateFeedback(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """A sample with the inputs that the feedback makes of the state at its begin.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
+                them; time in samples.
+        """
         # One sample, index 0, stands for all: `at` takes the last where the index is past the end.
         u = self.feedback(y0, at(args.inputs, sample_index(t0)))
         held = args._replace(inputs=jax.tree.map(lambda v: jnp.asarray(v)[None], u))
@@ -57,6 +63,7 @@ class Stopping(SolverWrapper):
     y = (state, going), where going is 1 until then and 0 from there on.
     """
 
+    # A number and not a truth value for `going`: diffrax takes derivatives of all that it carries.
     over: Callable[..., Any]
     linear: tuple[bool, ...] = eqx.field(static=True, default=())
 
@@ -70,6 +77,12 @@ class Stopping(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """A sample, or none where the run is over.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
+                them; time in samples.
+        """
         # A batch cannot stop for one of its runs, so the step is made and its result not taken.
         state, going = y0
         new, _, _, _, result = self.solver.step(terms, t0, t1, state, args, None, made_jump)
@@ -100,6 +113,12 @@ class WithProcessNoise(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """A sample, and the noise that comes in over it.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
+                them; time in samples.
+        """
         # The draws travel as inputs: they are samples too, and diffrax carries only y and args.
         inputs, acting, draws = args.inputs
         held = args._replace(inputs=inputs)
@@ -130,6 +149,12 @@ class Accumulating(SolverWrapper):
         solver_state: PyTree,
         made_jump: bool | Bool[Array, ""],
     ) -> Any:
+        """The value at a sample, then the step from it.
+
+        Args:
+            terms, t0, t1, y0, args, solver_state, made_jump: as `diffrax.AbstractSolver.step` has
+                them; time in samples.
+        """
         held, data = args
         state, value = y0
         # Before the step: the outputs of a sample belong to the state at its beginning. Whoever

@@ -43,6 +43,8 @@ def with_delays(
     check_model(model)
     if not (isinstance(order, int) and 1 <= order <= _HIGHEST):
         raise ValueError(f"order: expected 1 to {_HIGHEST} states, got {order!r:.20}")
+    # Two ways, and not one for both: an input is a record, which can be read at any other time,
+    # exactly. An output is computed, and its past is there only if states carry it.
     late_in, late_out = _by_name(inputs), _by_name(outputs)
     if not late_in and not late_out:
         raise ValueError("expected an input or an output to delay, got none")
@@ -80,6 +82,8 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
     bare = model.without_stand
     new: dict[str, list[str]] = {}
     for name, parameter in parameters:
+        # Several inputs may name one parameter, as all sticks go through one radio: one unknown for
+        # all.
         new.setdefault(parameter, []).append(name)
     fields = {}
     for parameter, names in new.items():
@@ -87,6 +91,9 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
+        # NaN and not zero: a delay that nobody gave is asked for, there is no hidden default. It
+        # may become negative, for a stick that is logged late, so it is not marked positive as
+        # those of outputs are.
         quantity = Quantity("s", f"delay of {', '.join(names)}", math.nan)
         fields[parameter] = (quantity.annotation, math.nan)
     return dataclasses.replace(
@@ -94,6 +101,8 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         name=f"{model.name}+late",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
+        # What is said of free flight is said of the machine with its delay: without this, margins
+        # of a model on the stand would lose it.
         without_stand=None if bare is None else _with_input_delays(bare, parameters),
     )
 
@@ -121,6 +130,8 @@ def _with_output_delays(model: Model, late: tuple[tuple[str, str], ...], order: 
             raise ValueError(
                 f"model {model.name} has a parameter {parameter!r} already, expected another name"
             )
+    # What the models know of their delays is kept by name in `delay_lines` as well: a fit begins
+    # from several starts where one of these is free.
     device = _LateOutputs(model, dict(late), order)
     return device.made(
         "late-outputs",
@@ -137,6 +148,8 @@ class _LateOutputs(Device):
             parameter: Quantity("s", f"delay of {name} in the log", math.nan, True)
             for name, parameter in late.items()
         }
+        # The states are the past of the output over the delay, so they have its unit, and a line's
+        # delay has to be positive: it remembers, and cannot look ahead as a reader of a log can.
         units = {n: naming.unit(model.Outputs, n) for n in late}
         states = {
             state: Quantity(units[n], f"past of {n}, Legendre coefficient {i}")
@@ -147,6 +160,13 @@ class _LateOutputs(Device):
         self.late, self.order = late, order
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of the lines' states, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         measured = self.measured(p, s, u)
         rates = {}
         for n, parameter in self.late.items():
@@ -157,15 +177,28 @@ class _LateOutputs(Device):
         return rates
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
+        """The outputs, those that are late read from their lines.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+            y: the outputs before the delay.
+        """
         return naming.replace(
             y,
             **{
-                n: sum(getattr(s, state) for state in line_states(n, self.order)) for n in self.late
+                # Shifted Legendre polynomials are all one at the far end of the delay, where the
+                # signal is as it was one delay ago: the sum of the coefficients is its value there.
+                n: sum(getattr(s, state) for state in line_states(n, self.order))
+                for n in self.late
             },
         )
 
     def first(self, p: Record) -> dict[str, Any]:
         # As if the machine had always been where it starts: the first coefficient is the mean.
+        # At rest at zero instead, the line would show a step from zero to the first output, one
+        # delay long, which no flight has.
         at_first = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
         first = super().first(p)
         return first | {line_states(n, 1)[0]: getattr(at_first, n) for n in self.late}
@@ -182,6 +215,8 @@ def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
         order: states of the line.
     """
     device = _LateInput(model, name, dict(model.delays)[name], order)
+    # The delay of this input is no longer one of the record: left in both places it would act
+    # twice.
     rest = tuple((n, parameter) for n, parameter in model.delays if n != name)
     return device.made(
         "line",
@@ -206,9 +241,23 @@ class _LateInput(Device):
         self.name, self.parameter = name, parameter
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        """The inputs, the late one read from its line.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return naming.replace(u, **{self.name: sum(getattr(s, n) for n in self.parts.states)})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of the line's states, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         past = [getattr(s, n) for n in self.parts.states]
         changes = line_rates(past, getattr(u, self.name), getattr(p, self.parameter))
         return dict(zip(self.parts.states, changes, strict=True))
@@ -232,8 +281,12 @@ def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
     """
     rates = []
     for i in range(len(past)):
+        # The signal enters at the near end of the delay, where Legendre's polynomials are 1 and -1
+        # in turn.
         change = value if i % 2 == 0 else -value
         for j, m in enumerate(past):
             change = change - m if j > i or (i - j) % 2 == 0 else change + m
+        # The line's rates grow as one over the delay. One of less than about 12 ms is too fast for
+        # the steps of 5 ms at most in which models that are not linear are solved.
         rates.append((2 * i + 1) / delay * change)
     return rates

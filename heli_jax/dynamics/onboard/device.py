@@ -45,6 +45,8 @@ class Device(abc.ABC):
 
     def __init__(self, model: Model, parts: Parts) -> None:
         self.model = model
+        # Before anything is made: a name that is taken would silently replace the model's own
+        # field.
         _check_new(model, parts)
         title = type(self).__name__.strip("_")
 
@@ -59,15 +61,34 @@ class Device(abc.ABC):
         self.Outputs = with_more(model.Outputs, parts.outputs)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
-        """The inputs that reach the model; those from outside unless the device drives it."""
+        """The inputs that reach the model; those from outside unless the device drives it.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return u
 
     @abc.abstractmethod
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """The derivatives of the device's own states, per second."""
+        """The derivatives of the device's own states, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
-        """The outputs, from those of the model."""
+        """The outputs, from those of the model.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+            y: the outputs of the model itself.
+        """
         return y
 
     def first(self, p: Record) -> dict[str, Any]:
@@ -81,16 +102,36 @@ class Device(abc.ABC):
         return self.model.State(**{n: getattr(s, n) for n in naming.names(self.model.State)})
 
     def vector_field(self, p: Record, s: Record, u: Record) -> Record:
-        """Of the model behind its device."""
+        """Of the model behind its device.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         of_model = self.model.vector_field(p, self.inner(s), self.inputs(p, s, u))
+        # The device's states stand behind the model's: matrices of the model keep their rows and
+        # columns.
         return self.State(**naming.asdict(of_model), **self.rates(p, s, u))
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """What the log has."""
+        """What the log has.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return self.shown(p, s, u, self.measured(p, s, u))
 
     def measured(self, p: Record, s: Record, u: Record) -> Record:
-        """The outputs of the model itself."""
+        """The outputs of the model itself.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return self.model.output(p, self.inner(s), self.inputs(p, s, u))
 
     def start(self, p: Record) -> Record:
@@ -100,12 +141,20 @@ class Device(abc.ABC):
     def noise_intensity(self, p: Record) -> Record:
         """The model's own; no device adds noise to the state."""
         assert self.model.noise_intensity is not None
+        # A device computes or filters: noise of a sensor is measurement noise, which the fit has by
+        # itself.
         own = naming.asdict(self.model.noise_intensity(p))
         zero = 0.0 * next(iter(own.values()))
         return self.State(**own, **dict.fromkeys(self.parts.states, zero))
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """Those of the model, with the inputs that reach it."""
+        """Those of the model, with the inputs that reach it.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         assert self.model.limits is not None
         return self.model.limits(p, self.inner(s), self.inputs(p, s, u))
 
@@ -123,6 +172,8 @@ class Device(abc.ABC):
             # The device rests too: a state more to solve for, and its derivative to vanish.
             steady = SteadyFlight((*states, *steady.unknowns), (*states, *steady.equations))
         bare = model.without_stand
+        # Time constants, frequencies and damping of a device are above zero whatever the model
+        # around which it stands: a fit then searches their logarithm.
         positive = tuple(n for n, q in self.parts.params.items() if q.positive)
         fields = {
             "name": f"{model.name}+{suffix}",
@@ -139,6 +190,8 @@ class Device(abc.ABC):
             "without_stand": None if bare is None else again(bare),
             "positive": (*model.positive, *positive),
         }
+        # What is not named here stays as it is. `initial_sd` and `correlation` go by names of
+        # states, so they hold for a State that has grown; axes and delays name what is still there.
         return dataclasses.replace(model, **{**fields, **changes})
 
 
@@ -192,7 +245,11 @@ def quotient(above: str | None, below: str | None) -> str | None:
     if above is None or below is None:
         return None
     try:
+        # By exponents of the base units and not as text: rad/s over 1 has to come out as rad/s, and
+        # what cancels has to vanish.
         exponents = units.base_of(above), units.base_of(below)
+        # Params are kept in SI. A unit that would need a factor is not that of a stored number, and
+        # no unit is better than one that is wrong by it.
         si = all(
             units.factor(u, units.as_text(e)) == 1.0
             for u, e in zip((above, below), exponents, strict=True)

@@ -90,6 +90,7 @@ def with_gyro(
 
 def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
     """Sticks with the states that are their rates."""
+    # The model's axes say which rate a stick turns: most loops need no table of their own.
     known = {a.stick: a.rate for a in axes_of(model) if a.stick is not None}
     if on is None:
         own = [a for a in axes_of(model) if a.name in axes and a.stick in known]
@@ -121,6 +122,8 @@ def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, s
 @functools.cache
 def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suffix: str) -> Model:
     for stick, _ in loops:
+        # The loop computes the input from the state at hand, so there is no record of it to read
+        # further back, as exact delays do: the past has to be carried along in states.
         if stick in dict(model.delays):
             model = with_delay_line(model, stick)
     return _RateLoop(model, loops, law).made(
@@ -135,10 +138,14 @@ class _RateLoop(Device):
         params: dict[str, Quantity] = {}
         states: dict[str, Quantity] = {}
         for stick, rate in loops:
+            # The stick of the loop takes the place and the unit of the input that it drives, so
+            # that a log of sticks fits the model with its loop and without.
             unit = naming.unit(model.Inputs, stick), naming.unit(model.State, rate)
             params |= _gains(stick, *unit, law)
             if law.integral:
                 angle = quotient(unit[1], "1/s")
+                # The integral is an angle and a state: it remembers, which makes a heading hold of
+                # a rate loop.
                 states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
             if law.lag:
                 states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as the gyro has it")
@@ -146,19 +153,38 @@ class _RateLoop(Device):
         self.loops, self.law = loops, law
 
     def seen(self, s: Record, stick: str, rate: str) -> Any:
-        """The rate as the loop has it."""
+        """The rate as the loop has it.
+
+        Args:
+            s: the State, with the loop's own states.
+            stick: the input that the loop drives.
+            rate: the state that is the rate.
+        """
         return getattr(s, f"{stick}_gyro" if self.law.lag else rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        """What the loops ask of the machine in place of their sticks; other inputs pass.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         driven = {}
         for stick, rate in self.loops:
+            # From the state and not from an output: an output may be delayed or filtered by the
+            # sensors of the log, which are not those of the loop.
             measured, gain = self.seen(s, stick, rate), getattr(p, f"Kp_{stick}")
             if not self.law.command:
+                # A damper has no Kc: a gain before the pedal would be exchangeable with the pedal's
+                # own effect.
                 driven[stick] = getattr(u, stick) - gain * measured
                 continue
             command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
             driven[stick] = gain * (command - measured)
             if self.law.feedforward:
+                # It stands outside the loop: it changes what the stick does, not poles and margins.
+                # So a record with the stick at rest, or flown by gusts alone, says nothing of it.
                 driven[stick] = driven[stick] + getattr(p, f"Kff_{stick}") * command
             if self.law.integral:
                 held = getattr(p, f"Ki_{stick}") * getattr(s, f"{stick}_integral")
@@ -166,11 +192,21 @@ class _RateLoop(Device):
         return naming.replace(u, **driven)
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of integrals and lagged rates, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         rates = {}
         for stick, rate in self.loops:
             measured = self.seen(s, stick, rate)
             if self.law.integral:
                 command = getattr(p, f"Kc_{stick}") * getattr(u, stick)
+                # Nothing limits the integral: no device here has end stops that it could wind up
+                # against, and a rate limit of the servos delays what is asked for without holding
+                # it.
                 rates[f"{stick}_integral"] = command - measured
             if self.law.lag:
                 lag = getattr(p, f"tau_gyro_{stick}")
@@ -181,6 +217,8 @@ class _RateLoop(Device):
 def _gains(stick: str, of_stick: str | None, of_rate: str | None, law: Law) -> dict[str, Quantity]:
     """The parameters of one loop; the stick's unit is that of the input that it drives."""
     per_rate = quotient(of_stick, of_rate)
+    # None of the gains is marked positive: their sign depends on that of the input's effect, which
+    # is how a servo is mounted.
     gains = {f"Kp_{stick}": Quantity(per_rate, f"rate loop of {stick}, proportional", math.nan)}
     if law.command:
         command = quotient(of_rate, of_stick)

@@ -43,6 +43,9 @@ def with_sensors(
     check_model(model)
     if not (imu or lowpass or delay):
         raise ValueError("expected imu, lowpass or delay, got none")
+    # In the order of the signal's way to the log, so that a low-pass can be on what the IMU shows.
+    # The delay comes last since its line follows slow signals best: behind the low-pass it errs
+    # least.
     model = _with_imu(model) if imu else model
     model = _with_lowpass(model, tuple(lowpass)) if lowpass else model
     return with_delays(model, outputs=delay, order=order) if delay else model
@@ -71,6 +74,13 @@ class _LowPass(Device):
         self.on = on
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of the low-passed outputs, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         y = self.measured(p, s, u)
         return {
             f"{n}_lowpass": (getattr(y, n) - getattr(s, f"{n}_lowpass"))
@@ -79,11 +89,21 @@ class _LowPass(Device):
         }
 
     def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
+        """The outputs, those that are low-passed read from their states.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+            y: the outputs before the low-pass.
+        """
         return naming.replace(y, **{n: getattr(s, f"{n}_lowpass") for n in self.on})
 
     def first(self, p: Record) -> dict[str, Any]:
         # As if the machine had always been where it starts.
         y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
+        # Zero in its place would show as a start-up transient of the filter, which a logger that
+        # runs before the record begins has long behind it.
         return {f"{n}_lowpass": getattr(y, n) for n in self.on}
 
 
@@ -107,11 +127,27 @@ class _Imu(Device):
             n: Quantity("m/s^2", f"specific force {words[n]} at the IMU")
             for n in self.motion.outputs
         }
+        # Its place has zero as default, the centre of gravity, where the levers vanish: the one
+        # position that needs no measurement. Nothing else here has a default.
         super().__init__(model, Parts(params, {}, outputs))
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """None: an accelerometer has no states.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         return {}
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
+        """The model's outputs and the specific force beside them [m/s^2].
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         y = naming.asdict(self.measured(p, s, u))
         return self.Outputs(**y, **specific_force(self.model, self.motion, p, s, u))

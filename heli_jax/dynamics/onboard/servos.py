@@ -62,6 +62,8 @@ def _with_servos(
     def again(bare: Model) -> Model:
         return _with_servos(bare, on, rate_limit, delay, name)
 
+    # The delay goes outside the servo: the two commute, and an input that is late by its record is
+    # exact and costs no states.
     made = device.made(f"{name}s", again)
     return with_input_delays(made, dict.fromkeys(on, f"delay_{name}")) if delay else made
 
@@ -75,6 +77,8 @@ class _Servos(Device):
             f"zeta_{name}": Quantity("1", "servo's damping ratio", math.nan, True),
         }
         if rate_limit:
+            # Equal servos share their parameters, the limit too: one number for inputs of different
+            # units would be two limits under one name.
             unit = quotient(_one_unit(model, on), "s")
             params[f"rate_{name}"] = Quantity(unit, "servo's greatest speed", math.nan, True)
         states = {}
@@ -86,13 +90,31 @@ class _Servos(Device):
         self.on, self.rate_limit, self.name = on, rate_limit, name
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
+        """The inputs that are moved by servos, where these stand; the others as they are.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
+        # The position alone reaches the model: blades follow where the servo stands, not what it
+        # was told.
         return naming.replace(u, **{n: getattr(s, f"{n}_{self.name}") for n in self.on})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of positions and speeds, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
         omega, zeta = (getattr(p, f"{k}_{self.name}") for k in ("omega", "zeta"))
         rates = {}
         for n in self.on:
             position, speed = f"{n}_{self.name}", f"{n}_{self.name}_rate"
+            # The equation of second order as a position loop around a speed loop: in this form
+            # there is a speed that is asked for, which a limit can act on.
             asked = omega / (2.0 * zeta) * (getattr(u, n) - getattr(s, position))
             # The speed that is asked for is limited, not the speed itself: a state that is clipped
             # would wind up behind its limit, and come off it late.

@@ -76,6 +76,8 @@ def specific_force(
         s: the model's State.
         u: the model's Inputs.
     """
+    # From the model's own derivatives, so that thrust, drag and gusts are in it without being
+    # named: an accelerometer shows all forces but weight.
     rates = model.vector_field(p, s, u)
     of_kind = {"linear": _linear, "body": _body, "ground": _ground}[motion.kind]
     force = of_kind(model, p, s, u, rates)
@@ -83,6 +85,8 @@ def specific_force(
 
 
 def _g(p: Record) -> Any:
+    # The model's own g where it has one: a fit in which weight and specific force had two values
+    # would find the difference as a force.
     return getattr(p, "g", _G)
 
 
@@ -96,6 +100,8 @@ def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vec
     def of(record: Record, name: str) -> Any:
         return getattr(record, name, 0.0)
 
+    # omega x v and omega x (omega x r) are products of two small numbers, of which a linear model
+    # knows nothing: kept here, they would make the output nonlinear.
     turning = _cross((of(rates, "p"), of(rates, "q"), of(rates, "r")), _at(p))
     return (
         of(rates, "u") + _g(p) * of(s, "theta") + turning[0],
@@ -106,6 +112,8 @@ def _linear(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vec
 
 def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
     omega, velocity = (s.p, s.q, s.r), (s.u, s.v, s.w)
+    # u, v and w are components along axes that turn: their derivatives lack omega x v, without
+    # which a steady turn would show no acceleration.
     along = _sum((rates.u, rates.v, rates.w), _cross(omega, velocity))
     cos_theta = jnp.cos(s.theta)
     weight = (
@@ -120,6 +128,7 @@ def _body(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vecto
 def _ground(model: Model, p: Record, s: Record, u: Record, rates: Record) -> Vector:
     # Forward, right, down over the ground; the model's z is up. Then yaw, pitch, roll into the
     # body (Stevens and Lewis, 2003, eq. 1.3-20).
+    # Acceleration less gravity while still along the ground, where gravity has one component.
     x, y, z = rates.dx, rates.dy, -rates.dz - _g(p)
     (cphi, sphi), (ctheta, stheta), (cpsi, spsi) = (
         (jnp.cos(angle), jnp.sin(angle)) for angle in (s.phi, s.theta, s.psi)

@@ -193,6 +193,8 @@ def _simulate(
 ) -> Float[np.ndarray, " N"]:
     """Hd driven by the whole input, started from the first measured outputs."""
     n = den.size - 1
+    # The whole record and not one step ahead: where sampling is fast any model predicts the next
+    # output well, since the last one is nearly the same.
     forced = np.convolve(u, num / den[0])[n : u.size]
     band = np.tile(np.asarray(den / den[0])[:, None], u.size - n)
     past = np.convolve(np.concatenate([y[:n], np.zeros(n)]), den / den[0])[n : 2 * n]
@@ -264,6 +266,8 @@ def _combinations(
     # The vehicle may state a stand that this model does not stand on.
     p = p if reads(model, p, "zeta") else naming.replace(p, zeta=0.0 * p.zeta)
     ratios = ratios_from_denominator(p, den, output)
+    # Told even where they are impossible: that the paper's way gives them on this record is what a
+    # reader compares with the fit.
     values = {n: float(v) for n, v in ratios.values.items()}
     doubts = []
     wrong = [f"{n} = {v:.4g}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]

@@ -17,6 +17,8 @@ _LAGS = 2.0
 
 def covariance(rows: Rows) -> Float[np.ndarray, "q q"]:
     """Of the estimates (q, q), by the residuals where the search ended."""
+    # The sandwich: curvature on both sides, between them the variance of the gradient as the
+    # residuals have it. Where these are white it becomes the ordinary formula.
     bread = np.linalg.pinv(rows.J.T @ rows.J, hermitian=True)
     scores = by_instant(rows.J * rows.r[:, None], rows.times)
     return bread @ _long_run(scores) @ bread
@@ -37,6 +39,8 @@ def partial_f(
         times: which rows belong to one instant, as `Rows.times`.
     """
     size = np.linalg.norm(x)
+    # The estimate of one more regressor beside others is that of what they leave of both signals
+    # (Frisch and Waugh, 1933): so each candidate costs one product, not a regression.
     x, y = x - basis @ (basis.T @ x), y - basis @ (basis.T @ y)
     power = float(x @ x)
     # What the others give already has nothing of its own to say.
@@ -69,6 +73,8 @@ def _long_run(scores: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "k k"]:
     total = scores.T @ scores
     for lag in range(1, min(lags, scores.shape[0] - 1) + 1):
         product = scores[lag:].T @ scores[:-lag]
+        # Falling weights keep the sum positive semi-definite; cut off at a lag, it could give a
+        # negative variance (Newey and West).
         total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
     return total
 

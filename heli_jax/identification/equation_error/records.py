@@ -47,6 +47,8 @@ def whole_segments(flight: Flight, names: Sequence[str]) -> tuple[list[slice], d
 
 def shortest(half: int) -> int:
     """Samples of the shortest segment that is worth smoothing."""
+    # Between the margins three widths of the kernel are left, so a few values that do not share
+    # their samples.
     return 2 * smoothing.margin(half) + 6 * half
 
 
@@ -60,6 +62,8 @@ def width(flights: Sequence[Flight]) -> int:
             continue
         sd = {n: flight.sd.get(n) or noise_guess(y) for n, y in flight.outputs.items()}
         widths.append(smoothing.half_width({n: y[longest] for n, y in bridged.items()}, sd))
+    # One kernel for all flights, since they are regressed together: that whose motion is fastest
+    # decides, or its dynamics would be smoothed away.
     return min(widths, default=smoothing.HALF_WIDTHS[0])
 
 
@@ -105,6 +109,8 @@ def _segment(
         )
         made[name] = whole[:, n:]
     z = np.stack([made[name] for name in structure.signals])  # (z, orders, n)
+    # A state may be made of several signals and of their derivatives: all were smoothed by the same
+    # kernel, so the sum is that state smoothed, without an error of its own.
     states = {i: np.einsum("rz,zrn->n", c, z) for i, c in structure.shown.items()}
     # What is a derivative of highest order already has none left; `_by_derivatives` goes once.
     rates = {
@@ -116,6 +122,8 @@ def _segment(
         rates[i] if i in rates else made[name][0]
         for i, name in zip(structure.rows, structure.equations, strict=True)
     ]
+    # Neighbours within a kernel are made of the same samples: leaving most of them out loses next
+    # to nothing, and hidden states are integrated in fewer steps.
     empty, every = np.zeros((0, z.shape[-1])), max(1, half // _RESOLVED)
     return Segment(
         (np.stack(list(states.values())) if states else empty)[:, ::every],

@@ -17,6 +17,8 @@ from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.records import Record, Segment
 from heli_jax.identification.equation_error.structure import Matrices, Structure, matrices
 
+# Instants are counted in whole numbers over all segments and flights. A gap of this many is longer
+# than any lag over which `errors` sums, so nothing is correlated across it.
 _APART = 1_000_000
 _STEPS = 30
 _SMALL = 1e-6
@@ -87,9 +89,15 @@ def _of_flight(
         times.append(np.arange(full.shape[1]) + k * _APART)
     lengths = [part.shape[1] for part in residuals]
     n = sum(lengths)
+    # Residuals and derivatives become columns of one matrix: weighed and projected together, so
+    # that J stays the derivative of r.
     scale = np.array([weights[name] for name in structure.equations])[:, None, None]
     together = (scale * np.concatenate(residuals, axis=1)).reshape(e * n, 1 + q)
     beside = scale * _beside(nuisances, lengths, e)
+    # Initial values and constants enter linearly, so at any parameters their best values are known:
+    # they are taken out by projection and need no start. That the responses to initial values move
+    # with the parameters is left out of J. A step is then not quite that of Gauss and Newton, which
+    # the search allows for: it takes a step only where the sum of squares falls.
     together = _projected(together, beside.reshape(e * n, -1))
     number = [regression.equations.index(name) for name in structure.equations]
     return Rows(
@@ -121,6 +129,8 @@ def _projected(
     """What of the columns of x the columns of `away` cannot give."""
     size = np.linalg.norm(away, axis=0)
     away = away[:, size > 0] / size[size > 0]
+    # With pivoting, columns that others give already, as a very slow free motion beside the
+    # constant, come last and are dropped instead of filling the basis with rounding.
     factors: Any = scipy.linalg.qr(away, mode="economic", pivoting=True)
     basis, triangle = factors[:2]
     basis = basis[:, np.abs(np.diag(triangle)) > 1e-9]
@@ -137,6 +147,7 @@ def _residual(
     columns = [*shown, *range(n, at.value.shape[1])]
     # [value, slope] side by side: what is done to the one is done to the other.
     both = np.concatenate([at.value[..., None], at.slope], axis=-1)
+    # Value and derivatives in one product: the regressors are the same for both.
     predicted = np.einsum("ekc,kN->eNc", both[np.ix_(rows, columns)], known)
     initial = np.zeros((len(rows), known.shape[1], 0))
     if hidden:
@@ -165,6 +176,7 @@ def _hidden(
         pushed[1:] = first @ forcing[:-1] + second @ forcing[1:]
         return recurrence(phi, pushed)
 
+    # The states before their derivatives, which are driven by them.
     h = integrated(forcing[..., :1])
     # d/dt of a derivative by a parameter: the same dynamics, driven also by what these change.
     forcing[..., 1:] += np.einsum("hjq,Nj->Nhq", dynamics[..., 1:], h[..., 0])
@@ -179,6 +191,8 @@ def _hidden(
 def _first_order_hold(A: Float[np.ndarray, "h h"], step: float) -> tuple[np.ndarray, ...]:
     """x(k+1) = phi x(k) + first f(k) + second f(k+1) for x' = A x + f, f straight between."""
     h = A.shape[0]
+    # One exponential of a block matrix gives the transition and both integrals (Van Loan, 1978),
+    # without the inverse of A that closed forms have and an integrator lacks.
     block = np.zeros((3 * h, 3 * h))
     block[:h, :h], block[:h, h : 2 * h] = A * step, np.eye(h) * step
     block[h : 2 * h, 2 * h :] = np.eye(h)
@@ -199,6 +213,7 @@ def recurrence(
         f: what is added at each sample, for many columns.
     """
     N, h, c = f.shape
+    # As many blocks as each is long: about twice the root of N steps in Python in place of N.
     b = max(1, int(np.sqrt(N)))
     blocks = -(-N // b)
     x = np.zeros((blocks * b, h, c))
@@ -243,8 +258,11 @@ def search(
         size = np.where(keep_sign, x, 1.0)
         step = _damped(at.r, at.J * size, damping)
         with np.errstate(over="ignore"):
+            # At most a factor of e^2 a step: far from the optimum the linear step of a logarithm
+            # can be hundreds.
             new = np.where(keep_sign, x * np.exp(np.clip(step, -2.0, 2.0)), x + step)
         tried = _finite(lambda new=new: regression.rows(new, weights))
+        # Put so that a cost that is no number counts as no gain.
         if tried is None or not tried.cost < at.cost:
             damping = 10.0 * damping
             if damping > 1e8:
@@ -269,6 +287,8 @@ def _finite(make: Callable[[], Rows]) -> Rows | None:
 def _damped(r: np.ndarray, J: np.ndarray, damping: float) -> np.ndarray:
     norms = np.linalg.norm(J, axis=0)
     used = norms > 0
+    # Columns of one length make the damping relative to each parameter's own curvature, which is
+    # Marquardt's, whatever the units are.
     scaled = J[:, used] / norms[used]
     step = np.zeros(J.shape[1])
     normal = scaled.T @ scaled + damping * np.eye(int(used.sum()))

@@ -23,6 +23,9 @@ _MOST_LEFT_OUT = 0.05
 """part of a signal's motion that smoothing may take away beside the noise"""
 _BRIDGED = 3
 """missing samples in a row that a straight line replaces; more end a segment"""
+# Of the fourth power the kernel and its first three derivatives vanish at the ends. Sums over
+# samples are then close to the integrals that integration by parts is about, for all derivatives
+# that are taken here, and the parts at the ends are zero.
 _SHAPE = Polynomial([1.0, 0.0, -1.0]) ** 4
 _AREA = float(_SHAPE.integ()(1.0) - _SHAPE.integ()(-1.0))
 
@@ -60,7 +63,11 @@ def smoothed_input(
     """
     whole = int(np.floor(late / dt))
     rest = late / dt - whole
+    # Whole samples of the delay by index, the rest of it within the weights: so a delay changes the
+    # smoothed input without steps. Before the record the input is taken to be as at its beginning.
     shifted = u[np.clip(np.arange(u.size) - whole, 0, u.size - 1)]
+    # A held input jumps. Weights at the samples would put each jump in the middle of an interval,
+    # half a sample late or early, and the regression would find that as a delay.
     weights = _of_held(dt, half, rest) if held else _of_samples(dt, half, rest)
     return _convolved(shifted, weights)
 
@@ -68,6 +75,8 @@ def smoothed_input(
 def _convolved(
     x: Float[np.ndarray, " N"], weights: Float[np.ndarray, "r w"]
 ) -> Float[np.ndarray, "r n"]:
+    # Only where the whole kernel lies within the samples: at the ends a kernel cut off would no
+    # longer keep the equations exact.
     return np.stack([np.convolve(x, w, mode="valid") for w in weights])
 
 
@@ -78,6 +87,7 @@ def _of_samples(dt: float, half: int, rest: float) -> Float[np.ndarray, "r w"]:
     # The sum over samples is not quite the integral. So that a constant stays one and has no
     # derivatives, and a line and a parabola have theirs, the weights are put right by the kernel.
     weights[0] /= weights[0].sum()
+    # In this order: each later row is cleared of what the rows before it would make of it.
     weights[1] -= weights[1].sum() * weights[0]
     weights[1] /= -(weights[1] @ j)
     weights[2] -= weights[2].sum() * weights[0]
@@ -116,9 +126,13 @@ def half_width(outputs: Mapping[str, np.ndarray], sd: Mapping[str, float]) -> in
     for half in HALF_WIDTHS:
         inner = slice(margin(half), -margin(half))
         for name, y in outputs.items():
+            # A wide kernel takes half a width away at either end of every segment: a short record
+            # would be left with little to regress.
             if y.size < 8 * half:
                 return best
             left = float(np.std(y[inner] - smoothed(y, 1.0, half)[0]))
+            # What smoothing takes away should be noise. A little of the motion may go as well, and
+            # the two add as independent variances do.
             if left > np.hypot(sd[name], _MOST_LEFT_OUT * float(np.std(y))):
                 return best
         best = half
@@ -141,6 +155,8 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     seen = np.flatnonzero(np.isfinite(y))
     if seen.size < 2:
         return y
+    # NaN outside: a line between two samples is a guess with two ends, beyond the last there is
+    # none.
     filled = np.interp(np.arange(y.size), seen, y[seen], left=np.nan, right=np.nan)
     for before, after in itertools.pairwise(seen):
         if after - before - 1 > _BRIDGED:

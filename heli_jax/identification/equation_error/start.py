@@ -89,6 +89,8 @@ def equation_error_start(
         forced = [n for n, keep in keeps if keep]
         selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
         out = [n for n in regression.names if n not in selection.selected]
+        # Terms that are out are zero from here on, and the others are regressed again: where
+        # regressors go together the values of those that stay move.
         kept = setup._replace(base={**setup.base, **dict.fromkeys(out, 0.0)})
         if selection.selected:
             regression = regression._replace(names=selection.selected, base=kept.base)
@@ -123,9 +125,13 @@ def _setup(
     base = {**params, **stated}
     some = dict(zip(free, generic(len(free)), strict=True))
     for flight in flights:
+        # Generic numbers stand for what is free, so that NaN is left only where a constant that
+        # somebody has to give is missing.
         missing = needed_but_missing(model, model.Params(**{**base, **some, **flight.known}))
         if missing:
             raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
+    # One structure a flight: what is measured may differ from flight to flight, and with it which
+    # states are shown.
     structures = []
     for flight in flights:
         names = list(free)
@@ -174,11 +180,15 @@ def _optimum(setup: _Setup, regression: Regression) -> Optimum:
     starts = [np.where(keep, np.where(known, at_hand, 1.0), 0.0)]
     if known.any():
         starts.append(np.where(known, at_hand, starts[0]))
+    # Equations differ in unit and noise, and share parameters. Before there are residuals each is
+    # weighed by the size of its left-hand side; then by its own residuals, which least squares of
+    # several equations asks for.
     weights = _sizes(regression)
     runs = [search(regression, x, keep, weights) for x in starts]
     values, rows = min(runs, key=lambda run: run[1].cost)
     for _ in range(_ROUNDS - 1):
         weights = {
+            # The floor keeps an equation that is met exactly from drowning all others.
             name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
             for i, (name, w) in enumerate(weights.items())
         }
@@ -206,6 +216,8 @@ def _without_null(
                 f"free.{n}.start: missing, expected a value to begin with: {reasons[n]}"
             )
     names = list(names)
+    # One at a time, and regressed again: of two that are exchangeable only one has to go, and the
+    # other is determined as soon as the first is held.
     while names:
         regression = _regression(setup, names)
         optimum = _optimum(setup, regression)
@@ -229,6 +241,7 @@ def _undetermined(
     for name, norm in zip(names, norms, strict=True):
         if norm == 0:
             return name, "no measured state or output moves with it"
+    # Columns of one length: units must not decide which direction counts as small.
     _, sizes, directions = np.linalg.svd(optimum.rows.J / norms, full_matrices=False)
     if sizes[-1] > _NULL * sizes[0]:
         return None
@@ -286,6 +299,8 @@ def _inside(free: Free, value: float) -> float:
     """The value, or where it lies outside the bounds the nearest one a little inside."""
     low = -math.inf if free.lower is None else free.lower
     high = math.inf if free.upper is None else free.upper
+    # Strictly inside: in the coordinates of a bounded parameter its bounds are at infinity, and so
+    # is zero in those of a logarithm.
     if low < value < high:
         return value
     span = high - low if math.isfinite(high - low) else max(abs(low if value <= low else high), 1.0)

@@ -62,6 +62,8 @@ def select(
     inside, steps = list(range(len(names))), []
     # At most each term out and in a few times: rounding must not turn in a circle.
     for _ in range(4 * len(names)):
+        # Out before in: the limit to remove is at most that to enter, so a term that has just come
+        # in is not thrown out by the same number.
         leaving = terms.to_remove(inside)
         worst = min(leaving, key=lambda j: leaving[j], default=None)
         if worst is not None and leaving[worst] < limits[1]:
@@ -85,6 +87,8 @@ class _Terms:
     def __init__(
         self, rows: Rows, values: np.ndarray, names: tuple[str, ...], forced: frozenset[str]
     ) -> None:
+        # About the point where all terms are in r = y - X v, so X = -J: the nonlinear problem as
+        # the linear regression that F-ratios are defined for.
         self.X, self.y = -rows.J, rows.r - rows.J @ values
         self.times, self.names, self.forced = rows.times, names, forced
 
@@ -97,6 +101,8 @@ class _Terms:
     def to_remove(self, inside: list[int]) -> dict[int, float]:
         """The F-ratios of what is in and may go, by number."""
         ratios = {}
+        # Each against all others that are in: what one term explains depends on which ones stand
+        # beside it.
         for j in (j for j in inside if self.names[j] not in self.forced):
             basis = basis_of(self.X[:, [i for i in inside if i != j]])
             ratios[j] = partial_f(basis, self.y, self.X[:, j], self.times)

@@ -35,6 +35,7 @@ def _stacked(model: Model, names: tuple[str, ...], base: dict[str, Any], values:
         A, B, C, D = jacobians(model, params)
         return jnp.block([[A, B], [C, D]])
 
+    # Forward: a matrix has more entries than a model has parameters.
     return matrix(values), jax.jacfwd(matrix)(values)
 
 
@@ -95,6 +96,8 @@ def structure(
     rows = [n + names.index(y) for y in outputs]
     signals = (*outputs, *inputs)
     # y - D u = C x, with coefficients that are known.
+    # An output with a free parameter in its row shows no state: what it shows depends on what is to
+    # be found. It becomes an equation to be regressed instead.
     known = [i for i, row in enumerate(rows) if not depends[row].any()]
     right = np.zeros((len(known), ORDERS, len(signals)))
     for k, i in enumerate(known):
@@ -122,6 +125,8 @@ def _solved(
         return {}
     inverse = np.linalg.pinv(left, rcond=1e-10)
     spanned = inverse @ left
+    # Where a row of A^+ A is that of the identity, this unknown is determined, whatever the others
+    # are: a record with few outputs shows some states and not the rest.
     alone = np.abs(spanned - np.eye(left.shape[1])).max(axis=1) < _DETERMINED
     solution = np.tensordot(inverse, right, axes=1)
     return {int(i): solution[i] for i in np.flatnonzero(alone)}
@@ -138,6 +143,8 @@ def _by_derivatives(
     right = []
     for i in rows:
         # x_i' - A_ik x_k - B_i u = A_ij x_j with the shown k and the others j.
+        # One order up, which is the time derivative of what shows the state. The highest order
+        # comes round to the front and is dropped: `_solved` has left it empty.
         side = np.roll(shown[i], 1, axis=0)
         side[0, :] = 0.0
         side = side - sum(value[i, k] * shown[k] for k in shown)
@@ -167,6 +174,9 @@ def held(model: Model, base: Mapping[str, float], structures: Sequence[Structure
     for hidden in {s.hidden for s in structures}:
         block = np.ix_(hidden, hidden)
         depends = np.abs(at.slope[block]) > 0
+        # An entry with a parameter on such a loop sets an eigenvalue of what nobody measured. With
+        # the hidden states integrated at a wrong one, least squares would fit the rest to the wrong
+        # signal.
         loop = _closing((at.value[block] != 0) & ~depends.any(axis=-1))
         found |= {names[j] for j in np.flatnonzero((depends & loop[..., None]).any(axis=(0, 1)))}
     return found | set(dict(model.delays).values())
@@ -180,6 +190,7 @@ def generic(count: int) -> Float[np.ndarray, " q"]:
 def _closing(plain: np.ndarray) -> np.ndarray:
     """Where an entry (i, j) closes a loop: on the diagonal, or where i drives j by plain ones."""
     n = plain.shape[0]
+    # After n rounds every chain of plain entries is in, since one without repetition is no longer.
     drives = np.eye(n, dtype=bool)
     for _ in range(n):
         drives = drives | (plain.T.astype(int) @ drives.astype(int) > 0)

@@ -39,6 +39,8 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         low=column([b[0] for b in bounds]),
         high=column([b[1] for b in bounds]),
         prior_mean=column([f.prior.mean if f.prior else 0.0 for f in frees]),
+        # An infinite sd in place of a missing prior: its row is zero, and problems that differ in
+        # their priors share one compiled program.
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
         flights=tuple(_flight_data(problem, f, dtype) for f in flights),
         push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},

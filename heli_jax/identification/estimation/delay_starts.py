@@ -29,6 +29,8 @@ def delay_starts(
     late = [n for n in problem.model.delay_parameters if n in problem.free]
     if not late:
         return z0[None, :]
+    # Only delays differ between the starts: the other parameters have no valleys of this kind, and
+    # what differs in the ends is then due to the delay alone.
     rng = np.random.default_rng(seed)
     rows = np.tile(np.asarray(z0, np.float64), (1 + len(_STEPS), 1))
     for name in late:
@@ -46,6 +48,7 @@ def delay_starts(
 def _values(free: Free) -> np.ndarray:
     low, high = transforms.limits(free)
     if np.isfinite(low) and np.isfinite(high):
+        # Off the bounds, at which a bounded coordinate is infinite.
         return low + (high - low) * np.array([0.1, 0.35, 0.65, 0.9])
     if transforms.changes_sign(free):
         return free.start + np.array(_STEPS)

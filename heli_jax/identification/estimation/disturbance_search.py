@@ -196,7 +196,13 @@ def without_disturbance(search: Search, optimum: RelaxedOptimum) -> RelaxedOptim
 def silenced(
     search: Search, optimum: RelaxedOptimum, sigmas: tuple[str, ...]
 ) -> Float[Array, " q"]:
-    """z of an optimum with the named standard deviations of disturbances all but zero."""
+    """z of an optimum with the named standard deviations of disturbances all but zero.
+
+    Args:
+        search: whose layout says where the sizes stand in z.
+        optimum: where z and the noise are taken from.
+        sigmas: the parameters to be silenced.
+    """
     # Far below the smallest noise rather than zero, whose logarithm no z holds.
     smallest = min(float(s) for by_name in optimum.noise.sd for s in by_name.values())
     z = optimum.best.z

@@ -183,6 +183,7 @@ class Estimator(abc.ABC):
 
     def noise_unknowns(self, layout: Layout) -> int:
         """How many standard deviations of measurement noise are estimated beside z."""
+        # They count in AIC and BIC: two models that need different noises differ in unknowns.
         return len(signals(layout))
 
     def deviance(
@@ -196,6 +197,8 @@ class Estimator(abc.ABC):
             first: the cost that is compared with.
             n: how many numbers are measured.
         """
+        # The cost is a mean over n: times n it is the sum of squares of whitened rows, minus twice
+        # the log-likelihood but for a constant.
         return n * (cost - first)
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:

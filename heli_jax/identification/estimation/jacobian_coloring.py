@@ -39,6 +39,7 @@ def seeded(layout: Layout) -> np.ndarray | None:
 def _columns(layout: Layout) -> _Columns:
     states, shared = len(layout.states), layout.first_nuisance
     outputs = sorted({n for names in layout.outputs for n in names})
+    # What all flights share is felt by every row: each has a direction to itself.
     colour = list(range(shared))
     window, bias, flight = [-1] * shared, [-1] * shared, [-1] * shared
     number, first_bias = 0, 0
@@ -113,6 +114,8 @@ def spread_out(layout: Layout, data: Data, along: Float[Array, "n c"]) -> Float[
         data: the numbers of the problem.
         along: the derivatives of all rows, a column a colour.
     """
+    # A derivative along a direction is the sum over its unknowns. Since no row feels two of them,
+    # each row's sum is the derivative by the one that it does feel.
     columns, reach = _columns(layout), _reach(layout, data)
     shared = (columns.window < 0) & (columns.bias < 0) & (columns.flight < 0)
     # Numbers below zero never meet: rows have -2 where unknowns have -1.

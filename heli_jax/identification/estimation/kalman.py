@@ -205,6 +205,13 @@ def _sum(terms: Iterable[Any]) -> Any:
 def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
     # Rows written out one by one are a program whose length grows with the square of the states.
     def move(x: Array, P: Array, now: tuple[Array, Array]) -> _Estimate:
+        """The state and its covariance a sample on.
+
+        Args:
+            x: (n,), corrected.
+            P: (n, n).
+            now: what drives this step (n,), and what feeds through.
+        """
         # A sum of products: the derivative of the matrix product Ad @ x costs ten times as much.
         x = jnp.sum(system.Ad * x[None, :], axis=1) + now[0]
         return x, product(product(system.Ad, P), system.Ad.T) + system.Q
@@ -318,6 +325,13 @@ def _local(drive: _Drive) -> _Filter:
         return C, equations.outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
 
     def move(x: Array, P: Array, sample: Any) -> _Estimate:
+        """The state and its covariance a sample on, along the linearised model.
+
+        Args:
+            x: (n,), corrected.
+            P: (n, n).
+            sample: inputs and slopes of each part of the interval.
+        """
         held, _, slopes = sample
         estimate = (x, P)
         slopes = (None,) * len(held) if slopes is None else slopes

@@ -96,6 +96,8 @@ def _scan(
             for n, y in flight.outputs.items():
                 m = run.outputs[names.index(n)]
                 seen = jnp.isfinite(y)
+                # Over the noise, as in the fit itself: otherwise the output with the largest
+                # numbers would choose the time shift.
                 ys.append(_centred(y, seen) / s[n])
                 ms.append(_centred(m, seen) / s[n])
         y, m = jnp.concatenate(ys), jnp.concatenate(ms)
@@ -154,6 +156,8 @@ def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
     if free.prior is not None and free.prior.mean:
         # Twice the prior: a start beyond would only be pulled back.
         width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
+    # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
+    # keeps its sign.
     values = free.start * np.exp(width * rng.standard_normal(size))
     if coordinates.changes_sign(free):
         values = _either_sign(free, width, rng.standard_normal((2, size)))
@@ -191,6 +195,8 @@ class Search:
             progress: called with a sentence after each of several starts.
         """
         runs = self._run(self.layout, noise, points, progress)
+        # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
+        # good a place is.
         runs = [self._better_than_nothing(run, noise) for run in runs]
         if self.bounded.kinds == self.layout.kinds:
             return runs
@@ -258,6 +264,7 @@ class Search:
 
     def _better_than_nothing(self, run: Optimum, noise: Noise) -> Optimum:
         """A run that ends worse than no model at all (an unstable one, say) did not converge."""
+        # The cost is a mean over the measured numbers, so this is one too.
         nothing = self.misfit_of_nothing(noise) / measured_count(self.data)
         return run._replace(converged=run.converged & (run.cost <= 1.5 * nothing + 10.0))
 

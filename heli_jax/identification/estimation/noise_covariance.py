@@ -52,6 +52,7 @@ def noise_guess(signal: np.ndarray) -> float:
     Third differences of white noise have variance 20 sd^2; what is smooth all but vanishes in
     them. Robust against the corners of a response (median of absolute values).
     """
+    # A gap makes NaN of the differences across it alone: no sample has to be filled in.
     d = np.diff(signal, 3)
     d, signal = d[np.isfinite(d)], signal[np.isfinite(signal)]
     # Where gaps leave no four samples in a row, the signal itself bounds its noise.
@@ -108,6 +109,8 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # Residuals that overflowed show no noise.
         if not np.isfinite(change):
             break
+        # The noise first and the parameters after it: the parameters of one round are the best for
+        # the noise of the round before, and where both stay they are so for each other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
         if change < _UNCHANGED or not bool(best.converged):

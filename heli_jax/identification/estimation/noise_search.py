@@ -53,6 +53,8 @@ def one_noise_guess(
         "sigma": np.log(10.0) * np.arange(-3.0, 2.5),
         "tau": np.log(10.0) * np.arange(-1, 2),
     }
+    # One factor for all sigmas and one for all taus: the grid stays two-dimensional however many
+    # disturbances there are.
     kinds = {n: "sigma" if n in layout.sigmas else "tau" for n in layout.disturbance if n in names}
     used = [k for k in steps if k in kinds.values()]
     grid = np.stack(np.meshgrid(*(steps[k] for k in used), indexing="ij"), axis=-1)
@@ -61,10 +63,13 @@ def one_noise_guess(
     for name, kind in kinds.items():
         points[:, layout.disturbance_at(name)] += grid[:, used.index(kind)]
     costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)
 
 
 @eqx.filter_jit
 def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
+    # One point after another: side by side they would need the memory of as many filters, for a
+    # search of a few points.
     return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)

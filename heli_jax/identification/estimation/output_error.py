@@ -34,6 +34,8 @@ class OutputError(Estimator):
             noise: of the measurements, by which the rows are divided.
             u: the unknowns, in the units of the model.
         """
+        # No measurement enters the simulation: that keeps the estimates free of a bias by output
+        # noise, which equation error has, and is why gusts are taken for noise.
         runs = predict(layout, data, u)
         y, sd = measured_signals(layout, data, noise)
         simulated = jnp.concatenate([run.outputs.reshape(-1) for run in runs])

@@ -99,6 +99,7 @@ def differentiate(
 
         # Several unknowns a direction, each felt by rows of its own: see jacobian_coloring.
         directions = jnp.asarray(seeds.T, z.dtype)
+        # The residuals are the same for all directions: with None vmap computes them once.
         r, J, (_, runs, innovations) = jax.vmap(along, out_axes=(None, -1, None))(directions)
         J = spread_out(layout, data, J)
     simulated = None if runs is None else outputs_of(unpack(layout, data, z), runs)

@@ -38,6 +38,8 @@ def innovations_together(
     y = jnp.stack([_columns([by_name[n] for by_name in measured]) for n in names], axis=2)
     x0 = jnp.stack([_first_state(layout, drive, dtype) for drive in drives])
     error, variance = filtered_records(system, Records(U, acting, y, x0))
+    # Shorter records were filled up behind their end. A filter only looks back, so nothing of that
+    # reaches the samples before it.
     lengths = [by_name[names[0]].shape[0] for by_name in measured]
     return [
         Innovations(
@@ -61,10 +63,13 @@ def _system(
     def held(inputs: Any) -> Any:
         return held_columns(model, params, inputs, dt, u.shift, linear)
 
+    # The matrices come out once and not by record: they do not depend on the inputs, and that they
+    # are the same in all flights is what makes these a group.
     Ad, B, U, acting = jax.vmap(held, -1, (None, None, 1, 1))(inputs)
     _, _, C, D = jacobians(model, params)
     rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
     Q = process_noise(model, params, dt)
+    # The scales are unknowns of the fit and common to all flights, so they may stand in R.
     R = jnp.square(_shared_sd(noise, u, names, group))
     P0 = first_covariance(model, params, Ad.dtype)
     return Gaussian(Ad, B, C[rows], D[rows], Q, R, P0), U, acting

@@ -50,6 +50,8 @@ def by_windows(
         z0: the start.
         best: the best optimum so far.
     """
+    # Only where the ordinary way failed: windows bring unknowns of their own and a program to
+    # compile.
     if bool(best.converged) or not _applies(problem) or not _diverges(search, noise, e):
         return None
     cut = _cut(problem)

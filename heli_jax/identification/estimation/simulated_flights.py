@@ -125,6 +125,14 @@ def _side_by_side(
     stacked = jax.tree.map(lambda *v: jnp.concatenate(v), *each)
 
     def window(inputs: Any, known: dict[str, Any], dt: Any, state: Any) -> tuple[Any, Any]:
+        """States and outputs of one window; vmap makes them of all.
+
+        Args:
+            inputs: the model's Inputs, arrays (m,).
+            known: by name what is known of this flight alone, SI.
+            dt: [s].
+            state: the model's State at its first sample; None for the model's own.
+        """
         params = layout.model.Params(**{**data.base, **u.params, **u.noise, **known})
         # Any member's number will do: the inputs of all of them move alike between samples.
         late = delays_of(layout.model, params, u.shift, dt)
@@ -146,6 +154,13 @@ def _side_by_side(
         windows = slice(first, first + count)
 
         def joined(v: Array, windows: slice = windows, n: int = n) -> Array:
+            """One flight's windows end to end.
+
+            Args:
+                v: (signals, windows, samples) of all flights.
+                windows: those of this flight.
+                n: its samples.
+            """
             # The sample after these m is the next window's first; past n stand repetitions.
             return v[:, windows, :m].reshape(v.shape[0], -1)[:, :n]
 

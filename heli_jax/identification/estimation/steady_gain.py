@@ -83,6 +83,8 @@ def filtered_records(system: Gaussian, records: Records) -> tuple[Array, Array]:
     n, count = records.x0.shape[1], -(-N // _CHUNK)
 
     def chunk(state: _State, part: Any) -> tuple[_State, Any]:
+        # By chunks: within one the loop has no branch, and a gain that has settled is noticed one
+        # chunk late at most.
         return jax.lax.cond(state.steady, _frozen, _transient, system, state, *part)
 
     # What the last chunk is filled up with comes behind the record and is cut off again.
@@ -110,6 +112,8 @@ def _transient(
     def step(carry: tuple[Array, Array, _Gain], now: Any) -> tuple[Any, Any]:
         x, P, _ = carry
         U, acting, y = now
+        # The covariance does not see the measurements, so one recursion serves all records; only
+        # the states beside it are many.
         P, gain = riccati(Ad, C, Q, R, P)
         nu = y - acting @ D.T - x @ C.T
         x = x @ Ad.T + nu @ gain.G.T + U @ B.T
@@ -127,6 +131,7 @@ def _frozen(
     """A chunk with the gain that there is."""
     G, white = state.gain
     v = y - acting @ system.D.T
+    # With a gain that stays, prediction and correction are one matrix, the filter's closed loop.
     x, X = recurrence(system.Ad - G @ system.C, v @ G.T + U @ system.B.T, state.x)
     sd = 1.0 / jnp.diagonal(white)
     error = (v - X @ system.C.T) @ (white * sd[:, None]).T
@@ -172,6 +177,8 @@ def _riccati(
 ) -> tuple[Array, _Gain, tuple[Array, Array]]:
     """`riccati`, the Kalman gain, and Ad times the covariance of the corrected state."""
     H = P @ C.T
+    # By its Cholesky factor the innovation of each output is freed of what the outputs before it
+    # tell: the same numbers as when they are taken one after another.
     L = jnp.linalg.cholesky(C @ H + jnp.diag(R))
     white = jax.scipy.linalg.solve_triangular(L, jnp.eye(R.shape[0], dtype=R.dtype), lower=True)
     whitened = H @ white.T
@@ -198,6 +205,7 @@ def _riccati_jvp(primals: Any, tangents: Any) -> Any:
     whitened = gain.white @ dS @ gain.white.T
     half = jnp.tril(whitened) - 0.5 * jnp.diag(jnp.diagonal(whitened))
     d_white = -half @ gain.white
+    # The gain's own derivative enters the states, although it drops out of the covariance.
     dK = (dP @ C.T + P @ dC.T - K @ dS) @ (gain.white.T @ gain.white)
     return (following, gain), (d_following, _Gain(dAd @ K + Ad @ dK, d_white))
 

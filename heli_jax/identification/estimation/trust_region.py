@@ -97,6 +97,8 @@ def within_reach(
         unit: of the unknowns y, in which reach is not given; 0 where one stays put.
     """
     reach = reach / jnp.where(unit > 0, unit, 1.0)
+    # In each unknown by itself: the others go as far as they wanted, and the direction is bent
+    # rather than shortened.
     nearer = jnp.clip(state.y_eval, y - reach, y + reach)
     return eqx.tree_at(lambda s: s.y_eval, state, nearer)
 

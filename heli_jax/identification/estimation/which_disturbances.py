@@ -33,13 +33,18 @@ def those_that_show(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
         optimum = relaxed_from(search, optimum.noise, optimum.best.z).after(optimum)
     several = [d for d in disturbances_of(search.layout.model) if d.sigma in search.layout.sigmas]
     absent: list[Disturbance] = []
+    # One after another, each beside those that have not been given up: two that can stand for one
+    # another would both be found superfluous if each were left out of the full set.
     for d in several:
+        # The cheap question first: a disturbance that is well determined needs no search without
+        # it.
         if _is_known(search, optimum, d):
             continue
         optimum = _begun_again(search, optimum, d)
         optimum, shows = _with_or_without(search, optimum, d)
         if not shows:
             absent.append(d)
+    # Both of its parameters: without a size the correlation time is in no likelihood.
     names = [n for d in absent for n in (d.sigma, d.tau) if n in search.layout.disturbance]
     return optimum._replace(absent=tuple(names))
 
@@ -86,6 +91,8 @@ def _with_or_without(
 ) -> tuple[RelaxedOptimum, bool]:
     """The optimum and whether a disturbance shows; without it where it does not."""
     layout, data = search.layout, search.data
+    # Without it all other parameters are fitted anew, from where they are: a likelihood ratio is
+    # that of two optima, not of one and a point.
     z = silenced(search, optimum, (d.sigma,))
     alone = evaluate(layout, data, optimum.noise, z)
     # The rows are laid out about the level of their own innovations.

@@ -78,6 +78,7 @@ def _determined(
     prior = np.diag([u.prior for u in unknowns])
     # The rank is that without the weak priors: they give every nuisance a finite interval, and so
     # would lend one to each parameter that a bias or an initial state can take the place of.
+    # A prior is a measurement of the parameter itself: a row with one over its sd.
     total = directions(np.vstack([bare, prior]), scale)
     kept = total.singular > null_below * max(total.singular[0], 1e-300)
     without_weak = covariance_of(total, kept, scale)
@@ -177,6 +178,8 @@ def analyse(
     dead = _without_effect(sensitivity, unknowns)
     least = null_below * max(determined.total.singular[0], 1e-300)
     exchange = Exchange(sensitivity, without_weak, least)
+    # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
+    # number that the prior has put there.
     groups = _groups(determined.null, determined.covariance, unknowns, dead, exchange)
     # What the data alone say, so that no prior is in it.
     resting = _groups(data.null, data.covariance, unknowns, (), exchange)

@@ -79,6 +79,8 @@ def directions(sensitivity: np.ndarray, scale: np.ndarray) -> Directions:
     q = scale.size
     # With fewer rows than unknowns the decomposition would leave the null directions out.
     padded = np.vstack([sensitivity * scale, np.zeros((q, q))])
+    # Each unknown in units of its scale: without that, what counts as the weakest direction would
+    # hang on the units of parameters.
     _, singular, right = np.linalg.svd(padded, full_matrices=False)
     return Directions(singular, right)
 
@@ -91,6 +93,8 @@ def covariance_of(total: Directions, kept: np.ndarray, scale: np.ndarray) -> np.
         kept: (q,) which of them are determined.
         scale: (q,) in relative coordinates, as `directions` had it.
     """
+    # Only along what is determined: with the rest every variance would be infinite, also those of
+    # parameters that the data determine well.
     V = total.right[kept].T / total.singular[kept]
     return np.outer(scale, scale) * (V @ V.T)
 

@@ -35,6 +35,8 @@ def of_disturbances(layout: Layout, e: Evaluation, skip: tuple[str, ...] = ()) -
     at = [layout.disturbance_at(n) for n in names]
     # Those that are skipped have no column to project out, and neither has what changes nothing.
     others = [i for i in range(J.shape[1]) if i not in at and np.linalg.norm(J[:, i]) > _NO_EFFECT]
+    # What the parameters of interest can take the place of is no information about a disturbance:
+    # it goes away with their columns.
     rows = projected(J[:, at], J[:, others], _NULL)
     norms = np.linalg.norm(J[:, at], axis=0)
     shown = norms > _NO_EFFECT
@@ -59,6 +61,8 @@ def _of_columns(
     """
     if not names:
         return []
+    # Over the norms before the projection: a direction is open where little is left of its columns,
+    # not where they were small to begin with.
     _, sizes, right = np.linalg.svd(rows / norms)
     open_ = sizes < _NULL * max(sizes[0], 1e-300)
     if open_.any():
@@ -68,6 +72,7 @@ def _of_columns(
             + ". Disturb one place less, or fix one of them."
             for v in right[open_]
         ]
+    # The unknowns are logarithms, so these sds are relative and one limit serves sizes and times.
     covariance = (right.T / sizes**2) @ right / np.outer(norms, norms)
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sds, sds)

@@ -62,6 +62,8 @@ def sentences(facts: Facts) -> tuple[str, ...]:
     """What the data determine, what they do not, and what can be done, most important first."""
     lines = [_without_effect(name) for name in facts.without_effect]
     lines += [_not_determined(group, facts) for group in facts.groups]
+    # Each parameter is spoken of once, in the sentence that says most: what comes later leaves out
+    # what an earlier one has named.
     in_groups = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
     partners = [n for n in facts.undetermined if n not in in_groups]
     not_determined = in_groups | set(partners)
@@ -86,6 +88,8 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
     if facts.resting and not not_determined:
         return [_resting(group, facts) for group in facts.resting]
     shares = facts.prior_share.items()
+    # To say that the data determine what the prior alone holds would be the worst mistake here: its
+    # interval is as narrow as any.
     by_prior = [n for n, share in shares if share > _BY_PRIOR and n not in not_determined]
     by_data = [
         u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
@@ -205,6 +209,8 @@ def way_out(
     """
     parameters = [u.name for u in facts.unknowns if u.name in names and u.is_parameter]
     off = [*switches, *dict.fromkeys(s for s in map(_switch, names) if s)]
+    # What costs nothing first: a switch, then what has to be known from elsewhere, then another
+    # flight.
     ways = [f"switch off {listed(off, 'or')}"] if off else []
     ways += _fix(parameters, len(names) == 1, count)
     ways += dict.fromkeys(facts.remedies[n] for n in parameters if n in facts.remedies)

@@ -177,6 +177,8 @@ def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool
         # Twice the gain in log-likelihood of white noise with unknown variance: n log(1/(1 - VAF)),
         # which noise alone makes chi-squared with one degree of freedom an unknown.
         gain = -n * np.log(max(1.0 - output.vaf, 1e-300))
+        # One output that stands out is enough: the others may be ones that these inputs do not
+        # move.
         if unknowns < 1 or scipy.special.chdtrc(unknowns, max(gain, 0.0)) < _BY_CHANCE:
             return True
     return not outputs
@@ -216,6 +218,8 @@ def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> Out
     explained, other = _explained(error, _of_all_flights(name, evidence.records))
     if not np.isfinite(m.vaf):
         return OutputAdequacy(name, False, m.vaf, float("nan"), white, lag1, ratio)
+    # By the share of what is not white noise: a good model of a noisy sensor has a low VAF, and no
+    # better model could raise it.
     enough = explained >= EXPLAINED
     if ratio is None:
         noise_alone = (white or other <= NEARLY_WHITE) and m.vaf >= WORSE

@@ -29,6 +29,8 @@ def notes(
         simulated: by flight and output (N,), SI.
         sd: by flight and output that of the measurement noise, SI, a scalar of NumPy or JAX.
     """
+    # At the start values, before anything is fitted: these doubts are worth most while a record can
+    # still be flown again.
     sentences = sampling(problem, {n: f.start for n, f in problem.free.items()})
     for flight, outputs, noise in zip(problem.training, simulated, sd, strict=True):
         sentences += _feeble(flight, outputs, noise)
@@ -66,6 +68,7 @@ def _few_changes(flight: Flight, free: int) -> list[str]:
 
 def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
     """A sentence for each flight whose sampling a mode of the linearised model reaches."""
+    # Gains and shifts of the inputs stand among the values too, and move no mode.
     free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
     params = naming.replace(problem.vehicle, **free)
     sentences = []

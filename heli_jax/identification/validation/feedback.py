@@ -86,6 +86,8 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
         return ()
     y = np.stack(list(outputs.values()), axis=1)
     u = np.stack(list(inputs.values()), axis=1)
+    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # answer to an input, and would pass for feedback.
     innovations = _innovations(y, np.concatenate([y, u], axis=1))
     if innovations is None:
         return ()
@@ -182,6 +184,8 @@ def _decimated(
     every = max(1, int(np.ceil(1.0 / (flight.dt * _RATE) - 1e-9)))
 
     def thinned(x: np.ndarray) -> np.ndarray:
+        # Means of blocks and not every n-th sample: what is faster than the lower rate would come
+        # back as something slow.
         whole = x[: x.size // every * every].reshape(-1, every)
         return whole.mean(axis=1)  # NaN where one of them is missing
 

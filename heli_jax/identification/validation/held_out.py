@@ -49,6 +49,8 @@ def validate(
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
     data = data_of(problem, held, other)
+    # From any point a linear model's are found in one step, so zero, the middle of their weak
+    # priors, will do.
     begin = jnp.zeros(other.size - layout.first_nuisance, z.dtype)
     if not problem.model.linear:
         begin = start_vector(other, data, problem)[layout.first_nuisance :]

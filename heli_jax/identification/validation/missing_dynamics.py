@@ -54,6 +54,7 @@ def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
         flights: those that were fitted.
     """
     pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
+    # By output and input over all flights, so that one missing servo is one sentence.
     found: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
         one = explained_by(flight.residuals[output], flight.inputs[name], flight.dt)
@@ -89,6 +90,8 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
     e, drive = residual - residual.mean(), u - u.mean()
     if not (np.std(e) > 0 and np.std(drive) > 0):
         return None
+    # The filter of the residual is put on the input as well: prewhitening leaves the response
+    # between the two as it was, and makes the F test's independent errors true.
     whitening = _whitening(e)
     e, drive = (np.convolve(v, whitening)[: v.size] for v in (e, drive))
     # Column k is the input k samples before; the first samples have no past.
@@ -103,9 +106,12 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
     share = float(np.sum((U.T @ y) ** 2) / np.sum(y**2))
     freedom = n - rank - 1
     F = (share / rank) / max((1.0 - share) / freedom, 1e-300)
+    # The upper tail itself, not one less the lower: beyond 1e-16 that difference is zero.
     p_value = float(scipy.special.fdtrc(rank, freedom, F))
     # Less what as many numbers explain of noise.
     share = max(0.0, 1.0 - (1.0 - share) * (n - 1) / freedom)
+    # By each lag alone, since the coefficients of a regression on neighbouring lags swing against
+    # one another where the input moves slowly.
     correlation = np.abs(X.T @ y) / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
     return Explained(share, p_value, float(np.argmax(correlation)) * dt)
 

@@ -67,6 +67,8 @@ def operating_point(
         return EVERYWHERE
     # A trim solves for the states that the machine has; those of a disturbance are none of them.
     quiet = _undisturbed(model)
+    # A trim is a place where the machine can stay; the mean of a record is none, and its matrices
+    # would hold accelerations that were only passing.
     if is_full_nonlinear(quiet):
         at_trim = _trimmed(quiet, params, _condition(outputs, dt))
         if at_trim is not None:
@@ -87,6 +89,7 @@ def modes_of_flight(
         substeps: of the simulation.
     """
     here = naming.replace(params, **{n: jnp.asarray(v) for n, v in flight.known.items()})
+    # What is known of this flight first: an added mass moves the trim.
     at = operating_point(model, here, flight.inputs, flight.outputs, flight.dt, substeps=substeps)
     try:
         return modes(model, here, at.state, at.inputs), at.words
@@ -180,6 +183,13 @@ def _undisturbed(model: Model) -> Model:
     State: Any = NamedTuple("State", [(n, fields[n]) for n in kept])  # type: ignore[misc]
 
     def vector_field(p: Any, s: Any, u: Any) -> Any:
+        """The model's derivatives where the disturbance is zero.
+
+        Args:
+            p: the model's Params, SI.
+            s: the State without the disturbance.
+            u: the model's Inputs.
+        """
         rates = model.vector_field(p, _extended(model, s), u)
         return State(**{n: getattr(rates, n) for n in kept})
 

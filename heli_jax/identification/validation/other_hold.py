@@ -45,6 +45,8 @@ def other_hold(
     moving = [_moving_inputs(problem, f, in_doubt) for f in problem.training]
     if not any(moving) or not np.all(np.isfinite(e.J)):
         return []
+    # Other inputs to the same program in place of another program: compiling costs far more than an
+    # evaluation.
     if not _feeds_through(problem):
         other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
     elif not in_doubt:

@@ -84,6 +84,7 @@ class _Reference:
     def __init__(self, omega: np.ndarray, H: np.ndarray) -> None:
         self.finite = bool(np.isfinite(H).any())
         good = np.isfinite(H) & (np.abs(H) > 0)
+        # Where the response is zero or not finite it has no phase.
         self.log_omega, self.phase = np.log(omega[good]), frequency.phase(H[good])
 
     def beside(self, omega: np.ndarray, H: np.ndarray) -> np.ndarray:

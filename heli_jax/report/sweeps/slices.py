@@ -115,6 +115,8 @@ def _binned(x: Column, y: Column) -> _Bins | None:
     if starts.size < 2:
         return None
     parts = np.split(values, starts[1:])
+    # Quantiles and not mean and sd: a few runs that nearly diverge would move both out of the
+    # panel.
     quantiles = np.array([np.quantile(part, [0.05, 0.5, 0.95]) for part in parts]).T
     middle = np.array([np.median(part) for part in np.split(along, starts[1:])])
     return _Bins(middle, *quantiles, apart=apart)

@@ -38,6 +38,8 @@ def _ratio(fit: Fit, name: str) -> tuple[float, float] | None:
     value = float(getattr(fit.params, over)) / float(getattr(fit.params, under))
     v = fit.verdict
     # log(x/y) = log x - log y; what is fixed has no weight, for it has no sd.
+    # The sd of a ratio takes the correlation of its two: a and Ixx may both be vague where a/Ixx is
+    # sharp.
     weights = np.array([(n == over) - float(n == under) for n in v.names])
     missing = {*v.undetermined, *v.without_effect}
     if any(w and n in missing for w, n in zip(weights, v.names, strict=True)):

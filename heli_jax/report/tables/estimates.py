@@ -32,6 +32,7 @@ def parameters(fit: Fit) -> Table:
 
 def prior_note(problem: Problem, fit: Fit) -> str:
     """Where the prior share of parameters without a prior comes from; empty where there is none."""
+    # A prior share without a prior would look like a mistake of the table.
     names = [
         n
         for n, e in fit.estimates.items()
@@ -68,6 +69,7 @@ def nuisances(fit: Fit) -> Nuisances:
     """What was estimated beside the parameters."""
     head = ("unknown", "estimate", "sd", "95 % interval", "unit")
     rows = {n: _nuisance(n, e) for n, e in fit.nuisance.items()}
+    # With windows there is one for each window and state, which would bury the gains and biases.
     folded = [row for n, row in rows.items() if "/initial " in n]
     return Nuisances(
         Table(head, [row for n, row in rows.items() if "/initial " not in n]), Table(head, folded)
@@ -164,5 +166,7 @@ def starts(fit: Fit) -> Table:
         )
         for i, s in enumerate(fit.starts)
     ]
+    # Starts beside ends: whether equal costs come from equal parameters is what several starts are
+    # for.
     ends = [*(f"{n}, start" for n in names), *(f"{n}, end" for n in names)]
     return Table(("", *ends, "cost", "steps", "led to"), rows)
