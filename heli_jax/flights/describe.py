@@ -23,6 +23,8 @@ from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
+# bracket was opened that has to be closed.
 _UNIT_AT_END = re.compile(
     r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))(s|sec|ms|us|µs|ns|min)(?(open)[\])])$"
 )
@@ -170,6 +172,8 @@ def describe_flights(
 
 def _describe_channels(log: ChannelLog) -> LogInfo:
     topics = tuple(_describe_topic(topic) for topic in log.topics)
+    # A topic with a single sample, published when the firmware began, says nothing of how long the
+    # flight lasted.
     last = [float(t.times[-1]) for t in log.topics if t.clock and t.times.size > 1]
     return LogInfo(
         path=log.path,
@@ -214,6 +218,8 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         signal, guessed = _guess_time(table, surveys)
     else:
         signal, guessed = _asked_time(table, surveys, time), False
+    # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
+    # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
@@ -239,6 +245,8 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     nan = float("nan")
     if survey.values is None:
         return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan, unit)
+    # Infinite cells are not counted as missing, but the numbers are over finite ones, or a single
+    # one would make mean and spread infinite.
     n_nan = int(np.count_nonzero(np.isnan(survey.values)))
     x = survey.values[np.isfinite(survey.values)]
     numbers = (nan, nan, nan, nan)
@@ -293,6 +301,7 @@ def _likely_unit(stamps: np.ndarray | None) -> str:
     with np.errstate(all="ignore"):
         step = float(np.median(np.diff(stamps)))
         length = float(stamps[-1] - stamps[0])
+    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
     for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
         if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
             return unit
@@ -322,6 +331,8 @@ def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     with np.errstate(all="ignore"):
         seconds = stamps * scale
         steps = np.diff(seconds)
+    # A column that was named as the clock may be anything, so what follows has to hold: finite
+    # stamps that increase, by steps that are no rounding.
     problem = _clock_problem(seconds, steps)
     nan = float("nan")
     if problem:
@@ -331,6 +342,7 @@ def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     uneven = isinstance(grid, Uneven)
     # Stamps that are a grid but for their rounding have no gaps, however coarse it is.
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
+    # Gaps are told one by one; they would else be the whole of the jitter.
     short = steps[steps <= _GAP_STEPS * usual]
     return TimeInfo(
         column=name,

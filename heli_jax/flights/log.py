@@ -91,9 +91,11 @@ class ChannelLog:
         Raises:
             InputError: there is no such channel; with the nearest name there is.
         """
+        # A search and no index: a log has some hundred topics, and names are asked for a few times.
         for topic in self.topics:
             if name in topic.columns:
                 return topic
+        # Cut, because the search for the nearest is quadratic in the length of a name.
         known = {n[:60] for n in self.names}
         raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
 
