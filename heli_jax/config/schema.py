@@ -158,8 +158,8 @@ class StartMethodConfig(_Strict):
     """equation-error: by regression of the records themselves, for linear models"""
     stepwise: bool = False
     """whether terms that hardly help to predict are left at zero"""
-    # Not less for removal than for entry by default: the same limit keeps a term that was just good
-    # enough to come in.
+    # Entry and removal have one limit unless stated; where its number comes from stands with
+    # `F_ENTER`.
     f_enter: Positive = F_ENTER
     """partial F-ratio from which on a term enters"""
     f_remove: Positive = F_ENTER

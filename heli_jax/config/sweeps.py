@@ -163,7 +163,6 @@ def _of_designs(section: DesignConfig, model: Model, path: Path, seed: int) -> D
     parts = []
     for i, part in enumerate(section.of):
         try:
-            # Designs nest, and so do the seeds that are made for them.
             parts.append(_design(part, model, path, _seed_of_part(seed, i)))
         except InputError:
             raise

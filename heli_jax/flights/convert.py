@@ -81,6 +81,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     names = _names(log, selection.signals)
     clocks = _clocks(log, names, selection, notes)
     names = [name for name in names if log.topic_of(name).name in clocks]
+    # Nothing is resampled that was not asked to be: a copy at the log's own samples loses nothing.
     if selection.rate is None:
         columns = _as_logged(log, names, clocks)
     else:
@@ -186,6 +187,7 @@ def _clocks(
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
+        # Only where nothing is asked for: who names a short topic wants just that.
         if not selection.signals and span < _SHARE * max(spans.values()):
             del clocks[name]
             notes.append(f"left out: topic {shown(name)}, which covers {span:.3g} s")

@@ -158,6 +158,8 @@ def describe_flights(
     Raises:
         InputError: as `describe_log`.
     """
+    # All flights of a file are read by one pass of its reader, so `number` chooses among them and
+    # spares no time.
     log = chosen_flights(path, open_flights(path), number)
     if not isinstance(log, tuple):
         yield describe_table(log, time, unit)
@@ -278,6 +280,8 @@ def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, boo
         # Of a path, log.roll.time, the last part is the name.
         if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
             return _with_unit(table, surveys, name)
+    # Without a name to go by, the first column that increases all along is taken. The result names
+    # it, so that a wrong guess is seen.
     for name in numeric:
         values = _values(surveys, name)
         if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
@@ -338,6 +342,8 @@ def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     if problem:
         return TimeInfo(name, unit, nan, nan, False, nan, (), problem)
     usual = float(np.median(steps))  # the mean would count the gaps
+    # The same question as where a flight is read, so that `info` and a fit agree on what a uniform
+    # clock is.
     grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale)
     uneven = isinstance(grid, Uneven)
     # Stamps that are a grid but for their rounding have no gaps, however coarse it is.

@@ -106,6 +106,7 @@ class ChannelLog:
             InputError: there is no such channel, or its rows have no times.
         """
         topic = self.topic_of(name)
+        # `info` shows such rows; only who asks for times has to be told that there are none.
         if not topic.clock:
             problem = "its rows have an order and no times, so nothing can be fitted to them"
             raise wrong(self.path, problem, f"channel {shown(name)}")
