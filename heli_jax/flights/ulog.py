@@ -141,8 +141,8 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
         if kind == 0x44:  # 'D', nearly all of them
             number = data[body] | data[body + 1] << 8 if size > 1 else -1
             topic = content.subscriptions.get(number)
-            # A message may leave out the padding at its end, so two lengths are right, and any
-            # other is damage.
+            # A message may leave out the padding at its end, so any length from that without it to
+            # that with all of it is right. Any other is damage.
             if topic is not None and topic.dtype.itemsize <= size - 2 <= topic.longest:
                 topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
             else:

@@ -198,7 +198,7 @@ class _Product(_Combined):
 class _Zipped(_Combined):
     @property
     def size(self) -> int:
-        # All parts are of one size, which was checked.
+        # `zipped` has checked that all parts are of one size.
         return self.parts[0].size
 
     def values(self, start: int, stop: int) -> Columns:

@@ -236,7 +236,7 @@ def reopen(path: Path, job: Job, where: str) -> Store:
             f"{where}: {path} is of another sweep: {changes[0]}{more}; expected the same, or "
             "another --out"
         )
-    # A store that was killed while it was made, or from which a folder was taken away.
+    # A variable's folder may have been taken away since the store was made.
     missing = sorted(variables(job).keys() - store.names)
     if missing:
         raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
