@@ -13,6 +13,7 @@ from typing import Any
 
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 
+# The width of a terminal that nobody has widened.
 _WIDTH = 80
 _MOST_CHANNELS = 150
 """that are listed without being asked for: a PX4 log has a thousand"""
@@ -44,6 +45,7 @@ def print_flights(flights: Sequence[LogInfo], pattern: str | None = None) -> Non
 def as_json(flights: Sequence[LogInfo]) -> str:
     """The flights of one log as JSON, without channels twice; what is no number is null."""
     log = flights[0]
+    # What is of the file stands once; a file may hold many flights.
     content = {
         "path": log.path,
         "format": log.format,
@@ -51,6 +53,7 @@ def as_json(flights: Sequence[LogInfo]) -> str:
         "sha256": log.sha256,
         "flights": [_flight_content(flight) for flight in flights],
     }
+    # NaN is no JSON, though Python writes it: other programs could not read the text.
     return json.dumps(_finite(content), indent=1, allow_nan=False)
 
 
@@ -86,6 +89,7 @@ def _finite(value: Any) -> Any:
 
 
 def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[str]:
+    # A table has one clock and no firmware, so most of the lines below would be empty.
     if not flight.topics:
         yield from _clock_lines(flight.time)
         yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
@@ -98,6 +102,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
         yield f"firmware: {flight.firmware}"
     length = "unknown: no topic has times" if math.isnan(flight.duration) else ""
     yield f"duration: {length or f'{flight.duration:.6g} s'}"
+    # What was lost or assumed stands before the numbers, which are read with that in mind.
     yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
     yield from _topic_lines(flight.topics)
     yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
@@ -145,6 +150,7 @@ def _topic_lines(topics: Sequence[TopicInfo]) -> Iterator[str]:
         elif clock.problem:
             yield f"{start} {clock.problem}"
         else:
+            # The longest says whether a rate can bridge them; the number alone does not.
             gaps = max((gap.length for gap in clock.gaps), default=0.0)
             longest = f"{gaps:.3g} s" if gaps else ""
             jitter = _percent(clock.jitter)
@@ -153,6 +159,7 @@ def _topic_lines(topics: Sequence[TopicInfo]) -> Iterator[str]:
 
 def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInfo]:
     if pattern is None:
+        # None rather than the first hundred, which would look like all there are.
         return list(columns) if len(columns) <= _MOST_CHANNELS else []
     # The brackets of gyroADC[0] are meant as they stand: of patterns only * and ? are known.
     literal = pattern.replace("[", "[[]")
@@ -169,6 +176,8 @@ def _channel_lines(
         )
         yield f"{len(columns)} channels; {which}"
         return
+    # The column of units is as wide as it has to be, and away where the log states none: the names
+    # need the room.
     units = max((len(_cut(c.unit, 8)) for c in shown), default=0)
     units = max(units, 4) if units else 0
     name = _WIDTH - 3 * (_NUMBER + 1) - 6 - (units + 1 if units else 0)

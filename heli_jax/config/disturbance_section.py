@@ -11,6 +11,7 @@ def _size_choice(value: Any) -> Any:
     """One number above zero, or one for each of several disturbances by name."""
     given = value.values() if isinstance(value, dict) else [value]
     for number in given:
+        # In Python true is the number 1. Infinity has no spread to draw from, and no time constant.
         real = isinstance(number, int | float) and not isinstance(number, bool)
         if not (real and 0 < number < float("inf")):
             raise ValueError(
@@ -35,11 +36,15 @@ class DisturbanceConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    # One axis, whose parameters are sigma_w and tau_w without a name behind them; `on` with several
+    # gives each state a size of its own.
     axis: str | None = None
     """one of the model's axes: roll, pitch, yaw, heave, ..."""
     # Any, since the validators before it have said what it may be, here and below.
     on: Annotated[Any, BeforeValidator(_on_choice)] = None
     """states or axes, each with a disturbance of its own"""
+    # Two poles for a push that is smoother than a lag of white noise; both have the same time
+    # constant.
     poles: Literal[1, 2] = 1
     sigma_w: Annotated[Any, BeforeValidator(_size_choice)] = None
     """standard deviation, in the state's unit per second (SI), of several by name: needed to
@@ -58,10 +63,13 @@ class DisturbanceConfig(BaseModel):
     @property
     def parameters(self) -> dict[str, float | None]:
         """By the name of each parameter its value, None where none is given."""
+        # The names of parameters have to be those that `with_disturbance` gives them.
         several, values = len(self.names) > 1, {}
         for name in self.names:
             for key in ("sigma_w", "tau_w"):
                 given = getattr(self, key)
+                # One number stands for all, which only a time constant may: it is in seconds
+                # whatever is pushed.
                 of_it = given.get(name) if isinstance(given, dict) else given
                 values[f"{key}_{name}" if several else key] = of_it
         return values
@@ -84,6 +92,8 @@ class DisturbanceConfig(BaseModel):
             if name not in (*self.parameters, "sigma_y"):
                 known = ", ".join((*self.parameters, "sigma_y"))
                 raise ValueError(f"fixed: expected some of {known}, got {name!r}")
+            # What is left out begins with a guess from the record, and a guess is no value to be
+            # kept.
             if name != "sigma_y" and self.parameters[name] is None:
                 raise ValueError(f"{name}: missing, expected its value, since it is fixed")
         return self

@@ -51,6 +51,7 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
         for text in overrides:
             _override(content, text)
     config = _validated(content, str(path))
+    # The model before the vehicle, since its Params say which constants a vehicle may have.
     model = _model(config, path)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle)
@@ -60,6 +61,8 @@ def _model(config: Config, path: Path) -> Model:
     folder = path.absolute().parent
     if isinstance(config.model, LinearConfig):
         if config.corrections is not None:
+            # Corrections are of the equations of the whole helicopter; the entries of a linear
+            # model are what its file says.
             raise InputError(f"{path}: corrections: a linear model takes none")
         return _started(config, path, _linear(config.model, path).model)
     model = models.by_name(config.model, f"{path}: model", folder)
@@ -80,6 +83,8 @@ def _linear(model: LinearConfig, path: Path) -> LinearModel:
 
 def _started(config: Config, path: Path, model: Model) -> Model:
     """The model with the configuration's devices around it, and its initial state."""
+    # The devices first: their states can be named in the initial state as those of the bare model
+    # are.
     model = with_onboard(model, config.onboard, path)
     if not config.initial_state:
         return model
@@ -117,6 +122,8 @@ def _override(content: dict[str, Any], text: str) -> None:
     where = f"--set {text!r:.80}"
     if not equals or not key.strip():
         raise InputError(f"{where}: expected key.path=value")
+    # The value is read as YAML reads it, so that --set fit.seed=1 is a number and =null switches a
+    # section off.
     _set(content, key.strip(), parse_value(value, where), where)
 
 
@@ -166,6 +173,8 @@ def _sentence(error: ErrorDetails) -> str:
     place = _place(error["loc"])
     value = error.get("input")
     if error["type"] == "extra_forbidden":
+        # The nearest of those that stand at the same place: a key of another section would be no
+        # help.
         known = _known_keys(error["loc"])
         return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
     if error["type"] == "missing":
@@ -223,6 +232,8 @@ def _vehicle(config: Config, path: Path, model: Model) -> Vehicle:
         vehicle = _of_linear(config, config.model, path, model)
     else:
         vehicle = _of_model(config, path, model)
+    # Checked here for all kinds of models: a mass or a time constant of zero divides, and what
+    # comes of that would be told far from its name.
     for name in model.positive:
         constant = vehicle.constants.get(name)
         if constant is not None and constant.value <= 0:
@@ -245,6 +256,8 @@ def _of_model(config: Config, path: Path, model: Model) -> Vehicle:
 
 def _found_by_fit(config: Config) -> tuple[str, ...]:
     """The parameters that a fit finds without any value at hand."""
+    # A regression of the records needs no start, so neither the configuration nor the vehicle has
+    # to have one.
     if config.fit is None or config.fit.start.method == "given":
         return ()
     return tuple(config.fit.free)
@@ -283,6 +296,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     config, path = experiment.config, experiment.path
     # Without what is None: an absent key means the same, and stays right where a default changes.
     content = config.model_dump(mode="json", exclude_none=True)
+    # A shipped model keeps its name, which means the same on any machine.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
     for free in content.get("fit", {}).get("free", {}).values():

@@ -41,6 +41,8 @@ def _read_flight(
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
     for name in f.known:
+        # A constant of one flight alone is part of the machine, so only a parameter can be one: a
+        # misspelt name would leave the vehicle's value in its place without a word.
         if name not in naming.names(model.Params):
             raise InputError(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
@@ -50,6 +52,7 @@ def _read_flight(
     try:
         flight = read_flight(
             experiment.path.parent / f.log,
+            # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
             inputs=signals(model, "inputs", f.signals.inputs, f"{where}.signals", gain),
             outputs=signals(model, "outputs", f.signals.outputs, f"{where}.signals"),
@@ -84,6 +87,7 @@ def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
 
 
 def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
+    # A flight that a script made has no source, and nobody who would read a note on it.
     if not notes or flight.source is None:
         return flight
     source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
@@ -122,6 +126,8 @@ def signals(
     # Every input acts on the machine, so none can be left out; of the outputs one is enough.
     if role == "inputs" and missing:
         raise InputError(f"{where}.inputs: {missing[0]} missing, model {model.name} needs it")
+    # No output, no residual: there would be nothing to fit, and nothing to compare a simulation
+    # with.
     if not stated:
         raise InputError(f"{where}.{role}: expected one of {', '.join(known)}, got none")
     out = {}

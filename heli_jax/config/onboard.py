@@ -15,6 +15,8 @@ from heli_jax.errors import InputError
 
 
 class _Strict(BaseModel):
+    # An unknown key is an error: a device that is misspelt would be left out, and its lag would
+    # pass for a delay of the machine.
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -37,12 +39,14 @@ def _names_or_pairs(value: object) -> object:
 
 
 def _one_or_several(value: object) -> object:
+    # One kind of servo is the usual case and needs no list.
     return [value] if isinstance(value, dict) else value
 
 
 # Any, since the validator before it has said what it may be.
 Names = Annotated[Any, BeforeValidator(_names)]
 NamesOrPairs = Annotated[Any, BeforeValidator(_names_or_pairs)]
+# The most states that `with_delays` takes: refused here, where the key has a place.
 Order = Annotated[int, Field(ge=1, le=8)]
 
 
@@ -50,6 +54,8 @@ class ServosConfig(_Strict):
     """Equal servos on some inputs (`with_servos`)."""
 
     on: Names
+    # Off unless asked for: it is the one device here that makes a linear model nonlinear, which
+    # costs the exact step.
     rate_limit: StrictBool = False
     delay: StrictBool = False
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9_]*$")] = "servo"
@@ -116,6 +122,8 @@ def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Mode
     """
     if config is None:
         return model
+    # The order is part of the meaning: a rate loop commands servos that stand before it, sensors
+    # see the motion that comes of both, and the delay of the radio is outside of all.
     steps: list[tuple[str, Callable[..., Model], BaseModel]] = [
         *(("servos", with_servos, servos) for servos in config.servos),
         *(

@@ -32,6 +32,7 @@ def problem(experiment: Experiment) -> Problem:
         raise InputError(f"{path}: fit: missing, expected fit.free with a parameter to estimate")
     if not config.fit.free:
         raise InputError(f"{path}: fit.free: nothing is free, expected a parameter to estimate")
+    # Before the logs are read, which may take minutes.
     _check_intervals(config.fit, path)
     nuisance = _nuisance(config.fit)
     flights = read_flights(experiment, gain=nuisance.input_gain)

@@ -39,6 +39,8 @@ def _model_choice(value: Any) -> Any:
         return value
     if not isinstance(value, dict):
         raise ValueError(f"expected a model's name or {{linear: FILE}}, got {value!r:.60}")
+    # By hand: of a union pydantic would report every member, a model's name that is no text among
+    # them.
     for key in value:
         if key != "linear":
             raise ValueError(f"unknown key {key!r:.40}{nearest(str(key), ['linear'])}")
@@ -68,6 +70,8 @@ class OutputConfig(_Strict):
 class SignalsConfig(_Strict):
     time: TimeConfig | None = None
     """of a table of rows; the topics of an autopilot's log have clocks of their own"""
+    # Names are checked where the model is known: what it has for inputs and outputs is not known
+    # here.
     inputs: dict[str, InputConfig]
     outputs: dict[str, OutputConfig]
 
@@ -81,6 +85,8 @@ class FlightConfig(_Strict):
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.
     window: tuple[Finite, Finite] | None = None
+    # Such a run is predicted and never fitted: agreement with it is the only one that no free
+    # parameter was bent to.
     hold_out: bool = False
     known: dict[str, Finite] = {}
 
@@ -152,6 +158,8 @@ class StartMethodConfig(_Strict):
     """equation-error: by regression of the records themselves, for linear models"""
     stepwise: bool = False
     """whether terms that hardly help to predict are left at zero"""
+    # Entry and removal have one limit unless stated; where its number comes from stands with
+    # `F_ENTER`.
     f_enter: Positive = F_ENTER
     """partial F-ratio from which on a term enters"""
     f_remove: Positive = F_ENTER
@@ -161,6 +169,8 @@ class StartMethodConfig(_Strict):
     def _consistent(self) -> "StartMethodConfig":
         if self.stepwise and self.method == "given":
             raise ValueError("stepwise: expected method: equation-error with it, got given")
+        # A term that enters and at once falls below the limit of removal would be taken in and out
+        # for ever.
         if self.f_remove > self.f_enter:
             raise ValueError(
                 f"f_remove: expected at most f_enter ({self.f_enter:g}), got {self.f_remove:g}"
@@ -180,6 +190,8 @@ class FitConfig(_Strict):
     """given, equation-error, or {method: equation-error, stepwise: true}"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
+    # Unless given, the number depends on what is free: the misfit has a valley for each period by
+    # which a delay is wrong, and one start finds the nearest.
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """points to start from; one unless given, five where a delay is free"""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -191,7 +203,10 @@ class FitConfig(_Strict):
 
 
 class RLSConfig(_Strict):
+    # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
+    # One forgets nothing: all samples count alike, as for a machine that does not change in a
+    # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
@@ -296,6 +311,8 @@ class AxisConfig(_Strict):
 class DesignConfig(_Strict):
     """A design of experiments: which values the axes take, one design point after the other."""
 
+    # Which of the other keys a kind may have is refused where the design is made, with a sentence
+    # that says why.
     design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
     n: int | None = None
     """design points, for lhs and sobol"""

@@ -28,6 +28,7 @@ def first_guesses(
     """
     config, path = experiment.config.fit, experiment.path
     assert config is not None
+    # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
     if config.start.method == "given":
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
@@ -39,12 +40,17 @@ def first_guesses(
     # Not before it is needed: it takes a second to import.
     from heli_jax.identification.equation_error.start import equation_error_start
 
+    # Without stepwise selection every term stays in: to leave one out is a change of the model,
+    # which has to be asked for.
     limits = (config.start.f_enter, config.start.f_remove) if config.start.stepwise else None
     try:
         guess = equation_error_start(
             experiment.model, experiment.vehicle.params, flights, free, stepwise=limits
         )
     except ValueError as e:
+        # What is wrong with the vehicle is not in the section `fit`.
         place = f"{path}" if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+    # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
+    # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess

@@ -63,6 +63,8 @@ def sweep_job(
         InputError: something of it cannot be; the sentence says what and where.
     """
     sweep, path = experiment.config.sweep, experiment.path
+    # `simulates` has refused a configuration without one, and has to be asked first, for where
+    # inputs come from.
     assert sweep is not None
     where = f"{path}: sweep"
     model, params = _model(experiment, sweep)
@@ -74,6 +76,7 @@ def sweep_job(
         # Two beginnings would contradict each other.
         if made is not None:
             raise InputError(f"{where}.start: expected simulate.start, which makes the inputs")
+        # A logged stick is the whole stick and has the trim in it: it would be added twice.
         trimmed = Trimmed(Condition(**sweep.start.model_dump()), sticks=False, of=experiment.model)
     # An initial state would be overwritten by the trim without a word.
     if trimmed is not None and experiment.config.initial_state:
@@ -97,6 +100,8 @@ def sweep_job(
                 pilot,
             ),
         )
+    # It names its file already, and is a ValueError too: the next clause would put a wrong place
+    # before it.
     except InputError:
         raise
     except ValueError as e:
@@ -110,9 +115,11 @@ def _model(experiment: Experiment, sweep: SweepConfig) -> tuple[Model, Any]:
     values = {} if disturbance is None else disturbance.parameters
     # A model of one's own may have a parameter called sigma_w, which is then no disturbance's.
     drawn = [n for n in _axes(sweep) if n in ("seed", *values) and n not in plain]
+    # Without such an axis nothing is drawn, and the states of a disturbance would only cost time.
     if not drawn or disturbance is None:
         return experiment.model, experiment.vehicle.params
     for name, value in values.items():
+        # Filter error guesses what is left out from a record; a sweep has no record to guess from.
         if value is None and name not in drawn:
             raise InputError(
                 f"{experiment.path}: disturbance.{name}: missing, expected a number to draw it with"
@@ -184,6 +191,7 @@ def _range(name: str, axis: AxisConfig, model: Model, path: Path) -> Range:
     for key in ("values", "column", "n"):
         if getattr(axis, key) is not None:
             raise ValueError(f"axes.{name}.{key}: expected lower and upper here")
+    # Neither has a default: what is a wide range of one parameter is a narrow one of another.
     if axis.lower is None or axis.upper is None:
         raise ValueError(f"axes.{name}: expected lower and upper")
     # A logarithmic axis stays one in SI, since units of parameters have no offset.
@@ -214,6 +222,8 @@ def _table(section: DesignConfig, model: Model, path: Path) -> Design:
         raise ValueError("file: missing, expected a table in CSV or Parquet")
     if not section.axes:
         raise ValueError("axes: expected at least one, as Ixx: {} for a column Ixx, got none")
+    # By the readers of logs: a table of values has the same formats, and the same sentences on what
+    # is wrong in it.
     source = open_table(path.parent / section.file)
     for name, axis in section.axes.items():
         for key in ("lower", "upper", "values", "n"):
@@ -234,6 +244,7 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
     if axis.unit is None:
         return 1.0
     try:
+        # A seed and a model's own parameter may have no unit, and then take a plain number alone.
         return units.factor(axis.unit, axis_unit(model, name) or "1")
     except ValueError as e:
         raise ValueError(f"axes.{name}.unit: {e}") from e
@@ -241,6 +252,7 @@ def _scale(name: str, axis: AxisConfig, model: Model, path: Path) -> float:
 
 def _reduce(section: ReduceConfig, where: str, path: Path) -> Reduce:
     reducer: Any = section.how  # a name, or what a path leads to: anything at all
+    # Our own names first, so that no module of the user's changes what rms means.
     if reducer not in REDUCERS and reducer not in LINEAR and is_path(reducer):
         reducer = by_path(reducer, f"{where}.how", path.absolute().parent)
         if not callable(reducer) and not isinstance(reducer, Streaming):

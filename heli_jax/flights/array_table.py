@@ -57,6 +57,8 @@ class ArrayTable:
         require_columns(self.path, self.names, names)
         arrays = {name: np.asarray(self._arrays[name], np.float64) for name in names}
         sizes = {name: values.size for name, values in arrays.items()}
+        # A file may hold records of several lengths. Only those that are asked for together have to
+        # fit, so that a summary of two numbers beside a log does no harm.
         first = next(iter(names))
         other = next((n for n in names if sizes[n] != sizes[first]), None)
         if other is not None:
@@ -81,6 +83,8 @@ class ArrayTable:
 
     def time_unit(self, name: str) -> str | None:
         """The unit that the file states, where it is one of time."""
+        # The CF conventions write a clock's unit as 'seconds since 1970-01-01', of which the epoch
+        # does not matter: times count from the first sample.
         unit = self._units.get(name, "").split(" since ")[0].strip()
         words = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
         unit = words.get(unit, unit)
@@ -95,25 +99,32 @@ def open_mat(path: Path) -> ArrayTable:
         OSError: it cannot be read.
     """
     data = read_regular(path, "a MATLAB file", _LARGEST)
+    # MATLAB puts 512 bytes of its own in front of the mark of HDF5, which is 8 bytes long.
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
     try:
         whole = mat_file.read_arrays(data)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     arrays = {n: part for name, array in whole.items() for n, part in _vectors(name, array)}
     return ArrayTable(str(path), "mat", data, arrays)
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    # Text and complex numbers are no samples, and more than two dimensions leave open which one is
+    # the time.
     if value.dtype.kind not in "biuf" or value.ndim > 2 or not value.size:
         return
+    # MATLAB knows no vector: what it calls one is a matrix of a single row or column.
     if value.ndim < 2 or 1 in value.shape:
         yield name, value.ravel()
         return
     # Samples run along the longer side.
     table = value if value.shape[0] >= value.shape[1] else value.T
+    # Quaternions and motors are matrices of a few columns. An image would fill the list of
+    # channels.
     for i in range(min(table.shape[1], _MOST_ELEMENTS)):
         yield f"{name}[{i}]", table[:, i]
 
@@ -137,6 +148,8 @@ def open_netcdf(path: Path) -> ArrayTable:
     # Any: name -> array, and name -> unit.
     def read() -> tuple[dict[str, Any], dict[str, str]]:
         # Times stay numbers: `time_unit` knows what they are.
+        # The engine is named, so that what else is installed does not decide which library reads
+        # the file.
         with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_times=False) as file:
             _require_few_cells(path, sum(v.size for v in file.variables.values()))
             arrays, units = {}, {}
@@ -181,6 +194,8 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim <= 2:
                 cells += int(item.size or 0)  # an empty dataset has none
                 _require_few_cells(path, cells)
+                # A structure's path is as `open_mat` gives it for older versions, so that a
+                # configuration does not depend on the version in which a file was saved.
                 dotted = name.replace("/", ".") if kind == "mat 7.3" else name
                 for part, values in _vectors(dotted, np.asarray(item)):
                     arrays[part] = values
@@ -188,6 +203,8 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
                     units[part] = unit if isinstance(unit, str) else ""
 
         with h5py.File(path, "r") as file:
+            # This visits every object once and follows no links, of which a circle would never end
+            # and one to another file would read that.
             file.visititems(visit)
         return arrays, units
 
@@ -205,6 +222,8 @@ def _guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
     import warnings
 
     try:
+        # What a library warns of while it reads a damaged file is about its own functions. The
+        # sentence below is the one that names the file.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return read()
@@ -212,6 +231,7 @@ def _guarded[T](path: Path, what: str, read: Callable[[], T]) -> T:
     except (Exception, MemoryError) as e:
         from heli_jax.errors import InputError
 
+        # Our own refusals, such as too many values, say more than that the file is not whole.
         if isinstance(e, InputError):
             raise
         raise wrong(str(path), f"is no whole {what} ({type(e).__name__})") from e

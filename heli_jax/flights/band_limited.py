@@ -44,6 +44,8 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
     Returns:
         (M,), in the samples' unit; NaN where more is missing than two new steps, or five old ones.
     """
+    # A missing sample is taken out and not set to any value: the fit of even samples knows what to
+    # do where none stands.
     known = np.isfinite(values)
     if np.count_nonzero(known) < 2:
         return np.full(times.size, np.nan)
@@ -52,6 +54,8 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
     seconds, values = seconds[known], values[known]
     even_step, even = even_samples(seconds, values, usual)
     filtered = _low_pass(even, even_step, times - seconds[0], step)
+    # The stamps on both sides of each time say how wide the gap is in which it lies. Where that is
+    # too wide the fit has drawn a straight line, which is no measurement.
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
     gap = seconds[behind] - seconds[behind - 1]
     inside = (times >= seconds[0] - usual) & (times <= seconds[-1] + usual)
@@ -69,6 +73,8 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
     span = float(seconds[-1] - seconds[0])
     # Bounded whatever the stamps: four even samples for each that there is.
     step = max(usual, span / (4 * seconds.size))
+    # Even but for the rounding of the stamps: the samples are taken as they are, which is exact and
+    # needs no fit.
     if np.ptp(np.diff(seconds)) < 1e-3 * step:
         return span / (seconds.size - 1), values
     at = (seconds - seconds[0]) / step
@@ -79,7 +85,12 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
     line = np.interp(np.arange(count), np.r_[at, at[-1] + 1], np.r_[values, values[-1] + slope])
     for begin in range(0, count, _BLOCK):
         end = min(begin + _BLOCK, count)
+        # A band of equations is solved for each block, so that its memory does not grow with the
+        # log. What is near a block's end lacks its neighbours; the overlap is eight times as long
+        # as the taps, is computed twice and kept once.
         first, last = max(begin - _OVERLAP, 0), min(end + _OVERLAP, count)
+        # The small number keeps a stamp that lies on the block's last sample, whatever its
+        # rounding.
         rows = slice(*np.searchsorted(at, [first, last - 1 + 1e-9]))
         block = _fitted(at[rows] - first, values[rows], line[first:last])
         even[begin:end] = block[begin - first : end - first]
@@ -102,6 +113,8 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
     weights = _sinc(at[:, None] + half - columns)
     weights /= weights.sum(1, keepdims=True)  # a constant stays one, to the last digit
     # Diagonals from the middle down: LAPACK takes ten times as long for those above it.
+    # The equations of least squares: a sample and another share a weight only within the taps, so
+    # the matrix is a band.
     band = np.zeros((_TAPS, padded.size))
     for lag in range(_TAPS):
         products = weights[:, : _TAPS - lag] * weights[:, lag:]
@@ -117,12 +130,19 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
     middle = energy.size // 2
     for lag in range(middle + 1):
         band[lag, : padded.size - lag] += energy[middle + lag]
+    # Within a gap a slow signal costs neither misfit nor penalty, and the matrix would be singular.
+    # The ridge is far too small to be seen elsewhere, and draws the difference from the line to
+    # zero.
     band[0] += _RIDGE
     # At the ends samples stand on one side alone, and their noise would grow outward.
     band[0, : half + _END] += _END_RIDGE
     band[0, -half - _END :] += _END_RIDGE
+    # The penalty is on the signal and not on its difference from the lines, so that of the lines
+    # goes to the right-hand side.
     beyond = np.pad(padded, middle, mode="reflect", reflect_type="odd")
     right -= np.convolve(beyond, energy, mode="valid")
+    # By Cholesky: the ridge has made the matrix positive definite, and the cost is linear in the
+    # samples.
     correction = solveh_banded(band, right, lower=True)
     return (padded + correction)[half : half + line.size]
 
@@ -139,8 +159,12 @@ def _low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float)
     taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
     # As the mirror image through each end goes on: value and slope stay.
     padded = np.pad(even, taps, mode="reflect", reflect_type="odd")
+    # The kernel is tabled and interpolated: the Bessel function of its window would else be
+    # computed anew for every weight.
     x = np.linspace(0, 1, _TABLE)
     window = np.i0(_BETA * np.sqrt(1 - x**2)) / np.i0(_BETA)
+    # The cutoff is midway between what passes and what is stopped; a sinc of cutoff f has twice f
+    # in its argument, which is the sum of the two.
     kernel = np.sinc((PASSED + STOPPED) * _REACH * x) * window
     filtered = np.empty(times.size)
     at_once = max(1, _AT_ONCE // taps)
@@ -150,5 +174,7 @@ def _low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float)
         away = np.abs(at[:, None] - columns) * (step / (new_step * _REACH))
         weights = np.interp(away, x, kernel, right=0.0)
         samples = padded[np.clip(columns + taps, 0, padded.size - 1)]
+        # Divided by the sum of the weights, so that a constant stays the same whatever part of the
+        # kernel falls between samples.
         filtered[begin : begin + at_once] = np.sum(weights * samples, 1) / np.sum(weights, 1)
     return filtered

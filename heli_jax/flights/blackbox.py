@@ -37,6 +37,8 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
         raise wrong(str(path), "is no blackbox log, expected one that begins with its header")
     if len(starts) > _MOST_FLIGHTS:
         raise wrong(str(path), f"expected at most {_MOST_FLIGHTS} flights, got {len(starts)}")
+    # Of the whole file and not of a flight's bytes, so that it is the number that sha256sum gives
+    # for the file a user has.
     sha256 = hashlib.sha256(data).hexdigest()
     flights: list[ChannelLog] = []
     problems: list[InputError] = []
@@ -44,6 +46,8 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
         try:
             log = _flight(str(path), data[start:end], sha256, len(data), (i + 1, len(starts)))
         except InputError as e:
+            # One flight that cannot be read shall not cost the others of the file. Its problem is
+            # told only where there is nothing else to show.
             problems.append(e)
             continue
         if log is not None:
@@ -70,9 +74,12 @@ def _flight(
     main = main_frames(frames, head)
     if not main.times.size:
         return None
+    # P frames have the names and signs of I frames, so one layout is right for all rows.
     layout = head.layouts["I"]
     units = _units(layout, head)
     topics = [Topic("main", main.times * 1e-6, _columns(main.values, layout), units, "time")]
+    # H frames make no topic: they hold the origin that the positions of G frames are told from, and
+    # are added to these.
     topics += [t for letter in "SG" if (t := _other(frames, letter, head, main)) is not None]
     return ChannelLog(
         path=path,
@@ -81,6 +88,7 @@ def _flight(
         sha256=sha256,
         topics=tuple(topics),
         firmware=head.settings.get("Firmware revision", head.settings.get("Firmware type", "")),
+        # The lines named Field say how the bytes are packed, which is no setting of the machine.
         parameters={k: v for k, v in head.settings.items() if not k.startswith("Field ")},
         notes=_losses(frames, main),
         flight=flight,
@@ -98,6 +106,8 @@ def _columns(values: np.ndarray, layout: FrameLayout) -> dict[str, np.ndarray]:
 
 def _units(layout: FrameLayout, head: Header) -> dict[str, str]:
     """The units that are sure whatever the version of the firmware."""
+    # A field that is not here keeps a count without a unit. A unit that is right for some firmware
+    # alone would be copied into a configuration, and scale a fit by a wrong factor.
     units = {"time": "us", "headspeed": "rpm", "tailspeed": "rpm"}
     if head.settings.get("gyro_scale", "").lower() == _DEGREES_PER_SECOND:
         gyros = [n for n in layout.names if n.startswith(("gyroADC[", "gyroRAW[", "gyroUnfilt["))]
@@ -129,6 +139,8 @@ def _other(frames: Frames, letter: str, head: Header, main: MainFrames) -> Topic
         times, clock = main.times[np.maximum(last, 0)], "time of the main frame before"
     names = {"S": "slow", "G": "GPS"}
     columns = _columns(values.astype(np.int64), layout)
+    # A field such as time may stand in several kinds of frames, but a channel's name has to be one
+    # topic's alone.
     taken = set(head.layouts["I"].names)
     columns = {k if k not in taken else f"{names[letter]}.{k}": v for k, v in columns.items()}
     return Topic(names[letter], times * 1e-6, columns, {}, clock)
@@ -140,8 +152,11 @@ def _home(frames: Frames, head: Header, main: MainFrames) -> tuple[np.ndarray, n
     if "H" not in head.layouts or not frames.starts["H"].size:
         return np.zeros((count, 2), np.int64), np.zeros(count, bool)
     homes = other_frames(frames, "H", head, main, None)[:, :2]
+    # The header decides how many fields there are. Whoever adds a home indexes two columns,
+    # latitude and longitude, so a damaged header must not leave one alone.
     if homes.shape[1] < 2:
         homes = np.repeat(homes, 2, axis=1)
+    # The home can be set anew in flight, so the last H frame in front of each position counts.
     before = np.searchsorted(frames.starts["H"], frames.starts["G"]) - 1
     return homes[np.maximum(before, 0)], before >= 0
 

@@ -23,9 +23,12 @@ LARGEST_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
 
 def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
     """Numbers of seven bits a byte, the lowest first; the top bit says that more follow."""
+    # The sum makes a new array: the caller still needs the positions at which the groups begin.
     byte = _bytes(data, at)
     values, at = byte & 127, at + 1
     more = np.flatnonzero(byte & 128)
+    # Only the numbers that go on are looked at again. Most end with their first byte, since what is
+    # logged are small differences from a prediction.
     for shift in (7, 14, 21, 28):
         if not more.size:
             break
@@ -36,6 +39,7 @@ def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
     # 32 bits end with the fifth byte: a number that goes on is damage, which the firmware's own
     # tools read as zero.
     values[more] = 0
+    # Five groups of seven bits are 35, of which a number of the firmware has the lowest 32.
     return (values & 0xFFFFFFFF)[:, None], at
 
 
@@ -52,7 +56,14 @@ def negative_14_bit(data: np.ndarray, at: np.ndarray) -> Decoded:
 
 
 def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
-    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag."""
+    """A byte says which of up to eight fields are not zero; these follow. One alone has no tag.
+
+    Args:
+        data: the bytes of the log (B,) uint8.
+        at: positions (M,) where the groups begin.
+        count: fields of each group, 1 to 8.
+    """
+    # The tag would take more room than it saves, so the firmware leaves it out.
     if count == 1:
         return signed_vb(data, at)
     tag, at = _bytes(data, at), at + 1
@@ -72,6 +83,7 @@ def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
     nibble = np.zeros(at.size, np.int64)
     for k in range(4):
         size = (tag >> (2 * k)) & 3
+        # Code 0 is missing: such a field takes no bits, and its value stays zero.
         for code, bits in ((1, 4), (2, 8), (3, 16)):
             i = np.flatnonzero(size == code)
             if not i.size:
@@ -81,6 +93,7 @@ def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
             three = _joined(data, first, 3)
             values[i, k] = _signed(three >> (24 - 4 * (nibble[i] & 1) - bits), bits)
             nibble[i] += bits // 4
+    # The next field begins with a whole byte: half a byte that is left over stays empty.
     return values, start + ((nibble + 1) >> 1)
 
 
@@ -106,6 +119,7 @@ def _three(
     lead = _bytes(data, at)
     values = np.zeros((at.size, 3), np.int64)
     kind = lead >> 6
+    # Of kind 3 only the first byte is sure; the lengths that stand in it are added field by field.
     after = at + 1 + np.where(kind < 3, kind, 0)
     for code, layout in enumerate(layouts):
         i = np.flatnonzero(kind == code)
@@ -113,6 +127,8 @@ def _three(
             word = _joined(data, at[i], code + 1)
             for k, (bits, shift) in enumerate(layout):
                 values[i, k] = _signed(word >> shift, bits)
+    # The positions are moved on in place: where a field begins depends on how long those before it
+    # are.
     _whole_bytes(data, lead, values, after, np.flatnonzero(kind == 3))
     return values, after
 
@@ -134,6 +150,8 @@ def _whole_bytes(
 
 
 def _bytes(data: np.ndarray, at: np.ndarray) -> np.ndarray:
+    # Clipped, because most positions are guesses that may lie beyond the end of the file. Eight
+    # bytes wide, because shifted bytes of uint8 would overflow.
     return data.take(at, mode="clip").astype(np.int64)
 
 
@@ -147,11 +165,14 @@ def _joined(data: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
 
 def _signed(number: np.ndarray, bits: int) -> np.ndarray:
     """The lowest `bits` bits as two's complement."""
+    # Half the range is added before the mask and taken off behind it. That needs no branch, so that
+    # it does for whole arrays what a comparison does for one number.
     half = 1 << (bits - 1)
     return ((number + half) & ((1 << bits) - 1)) - half
 
 
 def _nothing(data: np.ndarray, at: np.ndarray) -> Decoded:
+    # Such a field takes no byte of the frame: its prediction is its value.
     return np.zeros((at.size, 1), np.int64), at
 
 
@@ -188,6 +209,8 @@ def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Deco
             and end - field < LARGEST_GROUP.get(encoding, 1)
         ):
             end += 1
+        # The only group whose layout depends on how many fields are in it. The others always hold
+        # as many as there is room for, and what is too many is left out.
         if encoding == TAG8_8SVB:
             numbers, at = tag8_8svb(data, at, end - field)
         else:

@@ -70,6 +70,8 @@ class _Walk:
         self.bytes = np.frombuffer(data, np.uint8)
         self.is_letter = np.zeros(256, bool)
         self.is_letter[[*map(ord, layouts), _EVENT]] = True
+        # A piece is as long as the numbers of all its candidates fit in memory: any byte may be
+        # one, each with as many int64 as the widest frame has fields.
         widest = max(len(layout.names) for layout in layouts.values())
         self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
         self.frames = Frames({}, {})
@@ -91,23 +93,33 @@ class _Walk:
     def _walk_piece(self, first: int, last: int) -> None:
         """Walk from `self.at` to the first frame that begins at `last` or behind it."""
         candidates = {letter: self._candidates(letter, first, last) for letter in self.layouts}
+        # One array serves all kinds of frames, since a byte is the letter of one kind at most. No
+        # frame ends at zero, so zero says that there is none.
         ends = np.zeros(last - first, np.int64)
         for each in candidates.values():
             ends[each.starts - first] = each.ends
         begins = first + np.flatnonzero(ends)
+        # A list, since Python reads single elements of it several times as fast as those of an
+        # array, and the walk does nothing else.
         next_end, visited = ends.tolist(), []
         while self.at < last and not self.frames.end:
             end = next_end[self.at - first]
             if end:
                 visited.append(self.at)
+            # Events are decoded one by one on the way: they are rare, and each type has another
+            # form.
             elif self.data[self.at] == _EVENT:
                 end = self._event_end(self.at)
             if end:
                 self.at, self.in_damage = end, False
                 continue
             self._note_damage()
+            # On at the next candidate and not at the next letter: a letter that stands in numbers
+            # by chance seldom leads to another one.
             i = int(np.searchsorted(begins, self.at, side="right"))
             self.at = int(begins[i]) if i < begins.size else last
+        # A letter within another frame's numbers is a candidate too. Only those that the walk came
+        # upon from the end of a frame are frames.
         for letter, each in candidates.items():
             i = np.flatnonzero(np.isin(each.starts, visited, assume_unique=True))
             self.kept[letter].append(_Candidates(each.starts[i], each.ends[i], each.values[i]))
@@ -117,6 +129,8 @@ class _Walk:
         values, ends = decode(self.bytes, starts + 1, self.layouts[letter].encodings)
         # A frame leads to another, or to the end of the file.
         whole = (ends <= self.size) & (ends - starts <= LONGEST_FRAME)
+        # A single byte is a letter by chance often enough. That another letter stands just where
+        # the frame would end is what makes it likely to be one.
         follows = self.is_letter[self.bytes.take(ends, mode="clip")]
         i = np.flatnonzero(whole & (follows | (ends == self.size)))
         return _Candidates(starts[i], ends[i], values[i])
@@ -132,6 +146,8 @@ class _Walk:
     def _event_end(self, at: int) -> int:
         """Where the event at `at` ends; 0 where it is none."""
         kind = self.data[at + 1] if at + 1 < len(self.data) else -1
+        # The type alone is one byte, which damage makes by chance. The words behind it do not come
+        # about so, and the end of a log is believed only with them.
         if kind == _END:
             self.frames.end = self.data.startswith(_END_OF_LOG, at + 2)
             return at + 2 + len(_END_OF_LOG) if self.frames.end else 0
@@ -156,6 +172,8 @@ class _Walk:
 
     def _skip_numbers(self, at: int, count: int) -> int:
         for _ in range(count):
+            # At most five bytes, as a number of 32 bits has, or damage could claim the rest of the
+            # file.
             length = next((n for n, b in enumerate(self.data[at : at + 5], 1) if b < 128), 5)
             at += length
         return at

@@ -54,6 +54,8 @@ class Header:
         part, whole = (1, 1) if not match else (int(match[1]), int(match[2] or 0))
         if match and not match[2]:
             part, whole = 1, part
+        # Bounded, because the iterations between I frames are laid out as an array by whoever
+        # predicts them, and the header of a damaged file may claim any number.
         return min(max(between, 1), _MOST_ITERATIONS), part, max(whole, 1)
 
 
@@ -68,15 +70,21 @@ def read_header(path: str, data: bytes) -> Header:
         end = data.find(b"\n", at, at + _LONGEST_HEADER)
         if end < 0 or end > _LONGEST_HEADER:
             raise wrong(path, "the header is cut off, expected frames behind it")
+        # In Latin-1 every byte is a letter: the name of a craft in another encoding must not refuse
+        # the flight.
         name, _, value = data[at + 2 : end].decode("latin-1").partition(":")
         settings[name.strip()] = value.strip()
         at = end + 1
     version = settings.get("Data version", "")
+    # Other versions pack the same encodings in another way, and would be read as wrong numbers
+    # without any error.
     if version != "2":
         raise wrong(path, f"data version {shown(version)}, expected 2", "blackbox header")
     layouts = {
         letter: _layout(path, settings, letter) for letter in "ISGH" if _has(settings, letter)
     }
+    # Neither serves alone: P frames are differences from I frames, and of these there is one in
+    # 32 ms.
     if "I" not in layouts or "Field P predictor" not in settings:
         raise wrong(path, "no fields of I and P frames, expected both", "blackbox header")
     layouts["P"] = _layout(path, settings, "P", layouts["I"])
@@ -105,6 +113,8 @@ def _layout(
         names, signed = named.names, named.signed
     predictors = _numbers(path, settings, f"Field {letter} predictor", len(names))
     encodings = _numbers(path, settings, f"Field {letter} encoding", len(names))
+    # One field of unknown length makes all that stands behind it unreadable, so the flight is
+    # refused before any frame is decoded.
     for kind, numbers, known in (
         ("predictor", predictors, range(_LAST_PREDICTOR + 1)),
         ("encoding", encodings, KNOWN),

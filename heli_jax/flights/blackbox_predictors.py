@@ -34,6 +34,8 @@ class MainFrames:
 def main_frames(frames: Frames, head: Header) -> MainFrames:
     """The frames I and P with predictions added, in the order of the file."""
     layout = head.layouts["I"]
+    # The finder keeps each kind apart. A difference needs the frame that stood before it in the
+    # file, so the two kinds are merged by their positions.
     starts = np.concatenate([frames.starts["I"], frames.starts["P"]])
     order = np.argsort(starts, kind="stable")
     is_first = (np.arange(starts.size) < frames.starts["I"].size)[order]
@@ -44,6 +46,8 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
     for k in range(1, int(length.max(initial=0))):
         rows = first[length > k] + k
         # An I frame counts as both frames before the first P frame.
+        # The k-th frame of every run needs those before it alone, which the last turns have made
+        # whole.
         before = values[rows - 1]
         earlier = values[rows - 2] if k > 1 else before
         values[rows] = _predicted(values[rows], before, earlier, head)
@@ -69,10 +73,14 @@ def _runs(
 
 
 def _predict_first(values: np.ndarray, rows: np.ndarray, layout: FrameLayout, head: Header) -> None:
+    # Nothing stands before an I frame, so of the predictors only constants and the motors' own can
+    # be meant in it.
     for column, predictor in enumerate(layout.predictors):
         constant = _constant(predictor, head)
         if constant:
             values[rows, column] += constant
+    # Behind the constants: the first motor is itself a difference from one, and has to be whole
+    # before the others are made of it.
     _add_motor(values, rows, layout.predictors, layout)
     values[rows] = _wrapped(values[rows], layout)
 
@@ -112,6 +120,8 @@ def _predicted(
     rows[:, previous] += before[:, previous]
     rows[:, line] += 2 * before[:, line] - earlier[:, line]
     both = before[:, mean] + earlier[:, mean]
+    # Division in C goes towards zero, NumPy's towards minus infinity: odd negative sums would be
+    # off by one, and each frame would hand the error on to the next.
     rows[:, mean] += np.sign(both) * (np.abs(both) // 2)
     for column in np.flatnonzero(predictors == header.INCREMENT):
         rows[:, column] += _next_iteration(before[:, column], head)
@@ -124,6 +134,8 @@ def _predicted(
 def _next_iteration(before: np.ndarray, head: Header) -> np.ndarray:
     """The first iteration behind each of `before` (R,) that the firmware logs."""
     between, part, whole = head.intervals
+    # The condition is the one by which the firmware leaves iterations out. The count is not in the
+    # frame, so it has to be made up in the same way.
     phase = np.arange(between)
     logged = (phase + part - 1) % whole < part
     logged[0] = True  # an I frame
@@ -145,6 +157,8 @@ def _plausible(
     """The frames whose times go on from the last one's, and these times [us]."""
     resumed = set(np.searchsorted(starts, np.asarray(frames.resumes, np.int64)).tolist())
     rows = np.flatnonzero(_inside(first, length, stamps.size))
+    # Modulo 2^32, so that the turn of the counter is a small step like any other, and a step back
+    # is a huge one.
     steps = np.diff(stamps[rows]) & 0xFFFFFFFF
     # Nearly always nothing is wrong, and the runs need not be looked at one by one.
     if rows.size and not resumed and np.all(steps < _LONGEST_JUMP):
@@ -157,6 +171,8 @@ def _plausible(
         stamp = int(stamps[begin])
         # The firmware's counter starts again at zero after 71 minutes.
         base = stamp if now is None else now + ((stamp - now) & 0xFFFFFFFF)
+        # After a pause that the firmware announces the time may jump by any amount. Without one a
+        # jump means that the stamp was misread.
         if not (now is None or begin in resumed or _goes_on(now, stamp)):
             # Two I frames that agree with each other outvote what stood before them.
             if rejected is None or not _goes_on(rejected, stamp):
@@ -168,6 +184,8 @@ def _plausible(
                 times.pop()
         rejected = None
         steps = np.diff(stamps[begin : begin + count]) & 0xFFFFFFFF
+        # The False behind the end stops the search in a run without any jump. Of one with a jump
+        # the frames in front of it are kept.
         whole = int(np.argmin(np.append(steps < _LONGEST_JUMP, False))) + 1
         keep.append(np.arange(begin, begin + whole))
         times.append(base + np.concatenate([[0], np.cumsum(steps[: whole - 1])]))
@@ -209,6 +227,8 @@ def other_frames(
             if home is not None:
                 values[:, column] += home[:, min(coordinate, 1)]
             coordinate += 1
+        # The time is a difference from the last main frame in the file, which is why those are
+        # computed before all others.
         elif predictor == header.LAST_TIME and main.times.size:
             values[:, column] += main.times[np.maximum(last, 0)]
         else:

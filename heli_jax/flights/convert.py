@@ -69,6 +69,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         InputError: the log cannot be read, a signal or a clock is missing, the signals have several
             clocks and no rate is given, or rate and window make no sense.
     """
+    # Before the log is opened, which may take minutes.
     _check(str(path), selection)
     log = open_log(path, selection.flight)
     notes: list[str] = []
@@ -80,6 +81,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     names = _names(log, selection.signals)
     clocks = _clocks(log, names, selection, notes)
     names = [name for name in names if log.topic_of(name).name in clocks]
+    # Nothing is resampled that was not asked to be: a copy at the log's own samples loses nothing.
     if selection.rate is None:
         columns = _as_logged(log, names, clocks)
     else:
@@ -114,6 +116,7 @@ def _as_channels(table: Table, selection: Selection, notes: list[str]) -> Channe
     numeric = [c for c in info.columns if c.kind == "number"]
     names = [c.name for c in numeric if whole or c.count == rows]
     twice = next((n for n in names if names.count(n) > 1), None)
+    # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
     numbers = dict(table.numbers(names))
@@ -132,6 +135,8 @@ def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
             name
             for topic in log.topics
             for name in topic.columns
+            # ULog and DataFlash name a channel by topic and field, the others by field alone. The
+            # clock is left out under either name, since it is written as the column `time`.
             if topic.clock and name not in (topic.clock, f"{topic.name}.{topic.clock}")
         ]
         if not names:
@@ -148,6 +153,7 @@ def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
                 raise wrong(log.path, problem)
             names += matches
     names = list(dict.fromkeys(names))
+    # Behind the patterns, of which several may name the same channel.
     require_few_columns(log.path, len(names))
     if TIME in names:
         problem = f"{TIME!r} is the name of the clock that is written, expected other signals"
@@ -164,11 +170,14 @@ def _clocks(
     """
     clocks, problems = {}, []
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
+        # All channels of a topic share its stamps, so any one of them tells the clock.
         times, _ = log.channel(next(iter(topic.columns)))
         elapsed = times - log.first_time
         try:
             clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, selection.window)
         except InputError as e:
+            # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
+            # there is.
             if selection.signals:
                 raise
             problems.append(e)
@@ -178,6 +187,7 @@ def _clocks(
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
+        # Only where nothing is asked for: who names a short topic wants just that.
         if not selection.signals and span < _SHARE * max(spans.values()):
             del clocks[name]
             notes.append(f"left out: topic {shown(name)}, which covers {span:.3g} s")
@@ -215,6 +225,8 @@ def _as_logged(
 def _resampled(
     log: ChannelLog, names: Sequence[str], clocks: Mapping[str, TopicClock], rate: float
 ) -> dict[str, np.ndarray]:
+    # Counted before any signal is resampled, so that a slip in the rate is refused before it fills
+    # the memory.
     times = common_times(log.path, list(clocks.values()), rate)
     if times.size * len(names) > _LONGEST:
         problem = f"{len(names)} signals at {rate:g} Hz are {times.size * len(names)} numbers"
@@ -225,9 +237,12 @@ def _resampled(
         topic = log.topic_of(name).name
         clock = clocks[topic]
         values = _finite(log.channel(name).values[clock.rows])
+        # How a signal moves is asked of the samples that there are: a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"
         new = (hold if stays else resampled)(clock.seconds, values, times)
+        # A hold and a straight line go on through any gap, so what they say there is taken out
+        # again.
         columns[name] = np.where(gaps[topic], np.nan, new)
     return columns
 
@@ -242,6 +257,8 @@ def _in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
     step = seconds[behind] - seconds[behind - 1]
     away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
+    # A step of exactly the limit passes whatever its rounding, and a time at a stamp has that
+    # sample, however wide the gap beside it is.
     return (step > longest_gap(seconds) * (1 + 1e-9)) & (away > 1e-9)
 
 
@@ -253,6 +270,8 @@ def require_output(out: Path, log: str | Path) -> None:
     """
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"{out}: expected a name ending in {', '.join(ENDINGS)}")
+    # By the file and not by the name: a link to the log, or another spelling of its path, would
+    # overwrite it just as well.
     if out.exists() and Path(log).exists() and os.path.samefile(out, log):
         raise InputError(f"{out}: is the log itself, expected another name")
 
@@ -277,6 +296,7 @@ def write_converted(out: Path, converted: Converted) -> None:
 def _write_table(out: Path, converted: Converted) -> None:
     import pyarrow as pa
 
+    # Missing cells are nulls: a NaN would stand in CSV as the word nan.
     arrays = {name: pa.array(x, mask=np.isnan(x)) for name, x in converted.columns.items()}
     units = {name: {"unit": unit} for name, unit in converted.units.items() if unit}
     fields = [pa.field(n, pa.float64(), metadata=units.get(n)) for n in arrays]
@@ -301,6 +321,8 @@ def _write_netcdf(out: Path, converted: Converted) -> None:
         }
     )
     try:
+        # SciPy's writer needs no library of HDF5. Its format with 64 bits for positions has no end
+        # at 2 GB.
         data.to_netcdf(out, engine="scipy", format="NETCDF3_64BIT")
     except (ValueError, UnicodeError) as e:
         names = ", ".join(shown(n) for n in converted.columns if "/" in n or not n.isascii())

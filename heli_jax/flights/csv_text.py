@@ -86,6 +86,7 @@ def find_header(text: str) -> tuple[int | None, int]:
         end = text.find("\n", start)
         end = len(text) if end < 0 else end
         content = text[start:end].strip()
+        # Comments may say anything, a list of names with commas too.
         if content and not content.startswith("#"):
             return start, line
         start, line = end + 1, line + 1
@@ -129,6 +130,7 @@ def require_short_lines(path: str, text: str, first_line: int) -> None:
 
 def find_delimiter(header: str, first: str) -> str:
     """The delimiter that header and first row agree on; `;` before `,`, which may be a decimal."""
+    # A tab stands in no number and in hardly any name, so it is the surest of the three.
     for delimiter in ("\t", ";", ","):
         if header.count(delimiter) == first.count(delimiter) > 0:
             return delimiter

@@ -15,10 +15,13 @@ from heli_jax.flights.log import ChannelLog, Topic, require_samples
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
 
+# The first message of a log is the format of formats: two bytes with which every message begins,
+# and its number 0x80.
 MAGIC = b"\xa3\x95\x80"
 _LARGEST = 2 * 10**9
 _HEAD = b"\xa3\x95"
 _FMT = 0x80
+# Bytes: three of the head, type and length, 4 of the name, 16 of the kinds and 64 of the columns.
 _FMT_LENGTH = 89
 # How a field is stored, and what pymavlink multiplies it with.
 FIELDS: dict[str, tuple[str, float | None]] = {
@@ -29,8 +32,10 @@ FIELDS: dict[str, tuple[str, float | None]] = {
     "L": ("<i4", 1e-7), "d": ("<f8", None), "M": ("<i1", None), "q": ("<i8", None),
     "Q": ("<u8", None),
 }  # fmt: skip
+# New firmware counts microseconds, old firmware milliseconds.
 _CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}
 _PREFIXES = {1.0: "", 1e-2: "c", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
+# Labels of ArduPilot that `heli_jax.units` does not know, in words that it does.
 _LABELS = {"degheading": "deg", "deglatitude": "deg", "deglongitude": "deg", "satellites": "1"}
 
 
@@ -73,6 +78,7 @@ def open_dataflash(path: Path) -> ChannelLog:
     for number, places in starts.items():
         form = formats[number]
         dtype = form.dtype
+        # Messages of one kind are of one length, so all of them are taken out of the bytes at once.
         at = np.asarray(places, np.int64) + 3
         # Each message's bytes become a row, whose columns are then the fields.
         rows[form.name] = raw[at[:, None] + np.arange(dtype.itemsize)].view(dtype)[:, 0]
@@ -83,6 +89,8 @@ def open_dataflash(path: Path) -> ChannelLog:
 
 def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, list[int]], int]:
     """The formats by number, where the messages of each begin, and how often there was neither."""
+    # The format of formats is stated here, since without it the first message could not be read,
+    # which states it again.
     formats = {_FMT: Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
     lengths = {_FMT: _FMT_LENGTH}
     starts: dict[int, list[int]] = {}
@@ -101,11 +109,15 @@ def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, list[int]], int]:
             if at < 0:
                 break
             continue
+        # The power goes off before the last block is written: a log seldom ends with a whole
+        # message.
         if at + length > size:
             damaged += 1
             break
         if number == _FMT and not _take_format(data[at + 3 : at + length], formats, lengths):
             damaged += 1
+        # Positions alone are gathered in this loop, and the numbers are read by NumPy afterwards: a
+        # log has millions of messages.
         starts.setdefault(number, []).append(at)
         at += length
     return formats, starts, damaged
@@ -115,11 +127,15 @@ def _take_format(body: bytes, formats: dict[int, Format], lengths: dict[int, int
     number, length = body[0], body[1]
     name, kinds, columns = (_text(part) for part in (body[2:6], body[6:22], body[22:86]))
     form = Format(name, kinds, tuple(columns.split(",")) if columns else ())
+    # The length is stated beside the kinds that give it. That both agree tells a format from bytes
+    # that look like one.
     if not form.is_valid or length != form.dtype.itemsize + 3:
         return False
     # A log has one format a number: another is damage that looks like a message.
     if number in formats:
         return formats[number] == form
+    # The rows are kept by name, so the same name under a second number would take the place of the
+    # first.
     if name in {f.name for f in formats.values()}:
         return False
     formats[number], lengths[number] = form, length
@@ -156,6 +172,8 @@ def make_log(
     units = _units(rows, numbers)
     topics = []
     for name, table in rows.items():
+        # These messages describe the log and are no samples: what they say is in units, parameters
+        # and firmware.
         if name not in ("FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG"):
             topics += _topics(formats[name], table, units.get(name, {}), scaled)
     require_samples(path, topics)
@@ -177,6 +195,8 @@ def _topics(form: Format, table: np.ndarray, units: dict[str, str], scaled: bool
     if instance is None or table[instance].dtype.kind not in "iu":
         return [_topic(form.name, form, table, units, scaled)]
     counts = np.unique(table[instance])
+    # A machine with one sensor has instance 0 alone; a name without an index is what its user
+    # expects.
     if len(counts) == 1 and not counts[0]:
         return [_topic(form.name, form, table, units, scaled)]
     return [
@@ -191,6 +211,7 @@ def _topic(
     columns, named = {}, {}
     for column, kind in zip(form.columns, form.kinds, strict=True):
         values, factor = table[column], FIELDS[kind][1]
+        # Text is no signal: a mode that is written as its name cannot be an input or an output.
         if values.dtype.kind == "S":
             continue
         if factor is not None and not scaled:
@@ -203,6 +224,7 @@ def _topic(
                 named[f"{name}.{column}{end}"] = units[column]
     # Some firmware puts the time behind the instance.
     clock = next((c for c in form.columns if c in _CLOCKS), "")
+    # Without a clock the rows have their order alone, which `clock` says by being empty.
     times = table[clock] * _CLOCKS[clock] if clock else np.arange(len(table), dtype=np.float64)
     return Topic(name, times, columns, named, clock)
 
@@ -214,6 +236,8 @@ def _units(rows: dict[str, np.ndarray], numbers: dict[int, str]) -> dict[str, di
     labels = _pairs(rows.get("UNIT"), "Id", "Label")
     factors = _pairs(rows.get("MULT"), "Id", "Mult")
     units: dict[str, dict[str, str]] = {}
+    # A unit is told in three messages: FMTU has a letter for each field of a format, UNIT says
+    # which unit the letter is, MULT what the field's number has to be multiplied with.
     for row in rows["FMTU"]:
         name = numbers.get(int(row["FmtType"]), "")
         if name not in rows:
@@ -249,6 +273,7 @@ def _pairs(table: np.ndarray | None, key: str, value: str) -> dict[str, object]:
     pairs = {}
     for row in table:
         entry = row[value]
+        # Ids are letters that are stored as signed bytes, and a damaged one may be negative.
         mark = chr(int(row[key]) & 0xFF) if table.dtype[key].kind in "iu" else _text(row[key])
         pairs[mark] = _text(entry) if isinstance(entry, bytes) else float(entry)
     return pairs
@@ -267,5 +292,6 @@ def _firmware(rows: dict[str, np.ndarray]) -> str:
     messages = rows.get("MSG")
     if messages is None or "Message" not in (messages.dtype.names or ()):
         return ""
+    # The firmware names itself when it begins to log; messages of the flight may quote anything.
     texts = [_text(text) for text in messages["Message"][:50]]
     return next((t for t in texts if t.startswith(("Ardu", "APM:", "Blimp", "Rover"))), "")

@@ -16,6 +16,7 @@ from heli_jax.regular_file import read_regular
 _LARGEST = 10**9
 _FMT_PARTS = 5
 """cells of a format before the names of the columns, the word FMT among them"""
+# The kinds of fields that hold text, of 4, 16 and 64 characters.
 _TEXT = "nNZ"
 
 
@@ -36,6 +37,8 @@ def open_dataflash_text(path: Path) -> ChannelLog:
     numbers: dict[int, str] = {}
     cells: dict[str, list[list[str]]] = {}
     damaged = 0
+    # Bytes that are no UTF-8 cost the line that they are in and not the log: a message may hold
+    # damage.
     for line in lines_of(data.decode("utf-8", "replace").replace("\r", "")):
         name, _, rest = line.partition(",")
         name = name.strip()
@@ -65,11 +68,14 @@ def _take_format(rest: str, formats: dict[str, Format], numbers: dict[int, str])
     cells = [cell.strip() for cell in rest.split(",")]
     if len(cells) < _FMT_PARTS or not cells[0].isdigit():
         return False
+    # A line is FMT, type, length, name, kinds, columns. The length is that of the binary message,
+    # which says nothing of a text.
     form = Format(cells[2], cells[3], tuple(cells[_FMT_PARTS - 1 :]))
     # Of arrays nobody has seen a text.
     if not form.is_valid or "a" in form.kinds or form.name in formats:
         return formats.get(form.name) == form
     formats[form.name] = form
+    # Cut, since a damaged cell may hold thousands of digits, which Python refuses to convert.
     numbers[int(cells[0][:9])] = form.name
     return True
 
@@ -86,8 +92,12 @@ def _columns(form: Format, lines: list[list[str]]) -> tuple[np.ndarray, int]:
                 )
             )
             good += 1
+        # A row whose cells are no numbers is left out as a whole: what else it holds is as
+        # doubtful.
         except ValueError:
             continue
+    # Whatever its letter says, a number in text may have decimals: what the binary log stores as
+    # hundredths is written as what it means.
     kinds = [FIELDS[kind][0] if kind in _TEXT else "<f8" for kind in form.kinds]
     # A mode is written as its name: a column that never holds a number is text.
     dtype = np.dtype(list(zip(form.columns, kinds, strict=True)))

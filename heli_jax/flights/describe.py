@@ -23,6 +23,8 @@ from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
+# bracket was opened that has to be closed.
 _UNIT_AT_END = re.compile(
     r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))(s|sec|ms|us|µs|ns|min)(?(open)[\])])$"
 )
@@ -156,6 +158,8 @@ def describe_flights(
     Raises:
         InputError: as `describe_log`.
     """
+    # All flights of a file are read by one pass of its reader, so `number` chooses among them and
+    # spares no time.
     log = chosen_flights(path, open_flights(path), number)
     if not isinstance(log, tuple):
         yield describe_table(log, time, unit)
@@ -170,6 +174,8 @@ def describe_flights(
 
 def _describe_channels(log: ChannelLog) -> LogInfo:
     topics = tuple(_describe_topic(topic) for topic in log.topics)
+    # A topic with a single sample, published when the firmware began, says nothing of how long the
+    # flight lasted.
     last = [float(t.times[-1]) for t in log.topics if t.clock and t.times.size > 1]
     return LogInfo(
         path=log.path,
@@ -214,6 +220,8 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         signal, guessed = _guess_time(table, surveys)
     else:
         signal, guessed = _asked_time(table, surveys, time), False
+    # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
+    # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
@@ -239,6 +247,8 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     nan = float("nan")
     if survey.values is None:
         return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan, unit)
+    # Infinite cells are not counted as missing, but the numbers are over finite ones, or a single
+    # one would make mean and spread infinite.
     n_nan = int(np.count_nonzero(np.isnan(survey.values)))
     x = survey.values[np.isfinite(survey.values)]
     numbers = (nan, nan, nan, nan)
@@ -270,6 +280,8 @@ def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, boo
         # Of a path, log.roll.time, the last part is the name.
         if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
             return _with_unit(table, surveys, name)
+    # Without a name to go by, the first column that increases all along is taken. The result names
+    # it, so that a wrong guess is seen.
     for name in numeric:
         values = _values(surveys, name)
         if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
@@ -293,6 +305,7 @@ def _likely_unit(stamps: np.ndarray | None) -> str:
     with np.errstate(all="ignore"):
         step = float(np.median(np.diff(stamps)))
         length = float(stamps[-1] - stamps[0])
+    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
     for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
         if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
             return unit
@@ -322,15 +335,20 @@ def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     with np.errstate(all="ignore"):
         seconds = stamps * scale
         steps = np.diff(seconds)
+    # A column that was named as the clock may be anything, so what follows has to hold: finite
+    # stamps that increase, by steps that are no rounding.
     problem = _clock_problem(seconds, steps)
     nan = float("nan")
     if problem:
         return TimeInfo(name, unit, nan, nan, False, nan, (), problem)
     usual = float(np.median(steps))  # the mean would count the gaps
+    # The same question as where a flight is read, so that `info` and a fit agree on what a uniform
+    # clock is.
     grid = uniform_grid(seconds - seconds[0], rounding_of(stamps) * scale)
     uneven = isinstance(grid, Uneven)
     # Stamps that are a grid but for their rounding have no gaps, however coarse it is.
     long = np.flatnonzero(steps > _GAP_STEPS * usual) if uneven else []
+    # Gaps are told one by one; they would else be the whole of the jitter.
     short = steps[steps <= _GAP_STEPS * usual]
     return TimeInfo(
         column=name,

@@ -87,6 +87,7 @@ class Flight:
         lengths = {name: x.size for name, x in (*self.inputs.items(), *self.outputs.items())}
         if not lengths:
             raise ValueError("a flight needs at least one input or output")
+        # One grid for all: the time of a sample is its number times dt, and stands nowhere else.
         if len(set(lengths.values())) > 1:
             raise ValueError(f"the signals differ in length: {lengths}")
         object.__setattr__(self, "sd", dict(self.sd))
@@ -98,6 +99,7 @@ class Flight:
         for name, sd in self.sd.items():
             if name not in self.outputs:
                 raise ValueError(f"sd is stated for {name!r}, which is no output of this flight")
+            # Residuals are divided by it.
             if not (math.isfinite(sd) and sd > 0):
                 raise ValueError(f"sd of {name!r} is {sd}, expected a positive number")
         for name, value in self.known.items():
@@ -112,6 +114,8 @@ class Flight:
                 raise ValueError(
                     f"hold of {name!r}: expected one of {', '.join(HOLDS)}, got {value!r:.60}"
                 )
+        # Every input has its hold written out, so that no reader of a flight has to know the
+        # default.
         object.__setattr__(self, "hold", {**dict.fromkeys(self.inputs, HOLDS[0]), **self.hold})
         object.__setattr__(self, "hold_reason", dict(self.hold_reason))
 

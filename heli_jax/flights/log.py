@@ -91,9 +91,11 @@ class ChannelLog:
         Raises:
             InputError: there is no such channel; with the nearest name there is.
         """
+        # A search and no index: a log has some hundred topics, and names are asked for a few times.
         for topic in self.topics:
             if name in topic.columns:
                 return topic
+        # Cut, because the search for the nearest is quadratic in the length of a name.
         known = {n[:60] for n in self.names}
         raise wrong(self.path, f"no channel {shown(name)}{nearest(name[:60], known)}")
 
@@ -104,6 +106,7 @@ class ChannelLog:
             InputError: there is no such channel, or its rows have no times.
         """
         topic = self.topic_of(name)
+        # `info` shows such rows; only who asks for times has to be told that there are none.
         if not topic.clock:
             problem = "its rows have an order and no times, so nothing can be fitted to them"
             raise wrong(self.path, problem, f"channel {shown(name)}")

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+# By the number that the format has for each type of data; 8, 10 and 11 are reserved.
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
@@ -46,6 +47,8 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
         DamagedMatFile: it cannot be read.
     """
     try:
+        # Level 5 ends its header of 128 bytes with the letters MI as a number of the machine that
+        # wrote it, so their order tells that of all bytes. Level 4 has no header.
         mark = data[126:128]
         if len(data) > 128 and mark in (b"IM", b"MI"):
             return dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
@@ -59,6 +62,7 @@ def _level_5(data: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
     while at + 8 <= len(data):
         element = _element(data, at, order)
         at = element.end
+        # A compressed piece holds one whole piece with a head of its own.
         if element.kind == _COMPRESSED:
             element = _element(_inflated(element.data), 0, order)
         if element.kind == _MATRIX:
@@ -68,6 +72,7 @@ def _level_5(data: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
 def _inflated(data: memoryview) -> memoryview:
     inflate = zlib.decompressobj()
     content = inflate.decompress(data, _MOST_BYTES)
+    # Bounded while it is unpacked: what a thousand bytes claim can be larger than the memory.
     if inflate.unconsumed_tail:
         raise DamagedMatFile(f"an array claims more than {_MOST_BYTES} bytes")
     return memoryview(content)
@@ -84,6 +89,7 @@ def _element(data: memoryview, at: int, order: str) -> _Element:
         kind, begin = word, at + 8
         # All but compressed data are padded to 8 bytes.
         end = begin + size + (0 if kind == _COMPRESSED else -size % 8)
+    # A view would silently be shorter than what was claimed.
     if begin + size > len(data):
         raise DamagedMatFile("it is cut off")
     return _Element(kind, data[begin : begin + size], end)
@@ -96,13 +102,19 @@ def _matrix(
     if not data or depth > _DEEPEST:
         return
     flags = _element(data, 0, order)
+    # The class of an array is the lowest byte; those above say whether it is complex or logical. Of
+    # a complex one the real part comes first, and is what is read.
     kind = struct.unpack_from(f"{order}I", flags.data)[0] & 0xFF
     shape, at = _numbers(data, flags.end, order)
+    # As floating point: the product of what a damaged shape claims could overflow integers, and
+    # come out small.
     if shape.size < 2 or shape.min() < 0 or np.prod(shape, dtype=float) > _MOST_VALUES:
         raise DamagedMatFile(f"an array claims the shape {shape.tolist()[:8]}")
     label = _element(data, at, order)
     name = prefix or bytes(label.data).decode("utf-8", "replace")
     if _FIRST_NUMERIC <= kind <= _LAST_NUMERIC:
+        # The numbers may be stored in a smaller type than the array has: MATLAB saves a double of
+        # whole numbers as bytes. What counts is the type that stands with them.
         values, _ = _numbers(data, label.end, order)
         if values.size != np.prod(shape):
             raise DamagedMatFile(f"an array of {values.size} values claims {np.prod(shape)}")
@@ -110,6 +122,7 @@ def _matrix(
     elif kind == _CELL:
         yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
     elif kind == _STRUCT:
+        # All names of a structure's fields are of one width, filled up with zeros.
         width, at = _numbers(data, label.end, order)
         fields = _element(data, at, order)
         if width.size != 1 or not 0 < width[0] <= 1000:
@@ -139,6 +152,7 @@ def _members(
         at = element.end
         if element.kind != _MATRIX:
             raise DamagedMatFile("a structure or cell holds something else than arrays")
+        # Members have no names of their own in the file: the path is what tells them apart.
         yield from _matrix(element.data, order, path, depth + 1)
 
 
@@ -153,6 +167,8 @@ def _numbers(data: memoryview, at: int, order: str) -> tuple[np.ndarray, int]:
 
 def _level_4(data: memoryview) -> Iterator[tuple[str, np.ndarray]]:
     at = 0
+    # The first word is a number below 5000 whose digits say how the array is stored. So its fourth
+    # byte is zero if it was written lowest byte first, and hardly otherwise.
     order = "<" if len(data) >= 4 and data[0] < 100 and not data[3] else ">"
     while at < len(data):
         kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
@@ -163,6 +179,7 @@ def _level_4(data: memoryview) -> Iterator[tuple[str, np.ndarray]]:
         if not known or min(rows, columns, length) < 0 or imaginary not in (0, 1) or what > 2:
             raise DamagedMatFile("it begins with no array")
         dtype = np.dtype(order + _LEVEL_4[precision])
+        # An imaginary part follows the real one, and is passed over.
         at = begin + count * dtype.itemsize * (1 + imaginary)
         if at > len(data) or not 0 < length < 1000:
             raise DamagedMatFile("it is cut off")

@@ -114,9 +114,12 @@ def _reader(path: Path) -> _Reader:
         return open_parquet
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
+    # What such a file begins with is the user's own text, which may look like the mark of any
+    # other.
     if ending in (".csv", ".tsv"):
         return open_csv
     marked = _by_content(head)
+    # Arrays go by their ending, since MATLAB 7.3, NetCDF 4 and HDF5 files hold the same mark.
     if marked is not None and ending not in _ARRAYS:
         return marked
     by_ending: dict[str, _Reader] = dict.fromkeys(_TEXTS, open_csv)
@@ -141,6 +144,8 @@ def _by_content(head: bytes) -> _Reader | None:
         return _one(ulog.open_ulog)
     if head.startswith(dataflash.MAGIC):
         return _one(dataflash.open_dataflash)
+    # Anywhere in the first bytes: its reader looks for the beginning of each flight, and does not
+    # mind what stands before the first.
     if blackbox_header.MARK in head:
         return open_blackbox
     if head.startswith(b"PAR1"):

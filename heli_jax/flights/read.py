@@ -63,12 +63,14 @@ def read_flight(
         TypeError: a keyword that is no field of ReadOptions.
     """
     options = dataclasses.replace(options, **keywords)
+    # Checked before the log is opened, which may take minutes.
     request = Request(str(path), time, inputs, outputs, options)
     log = open_log(path, options.number)
     if isinstance(log, ChannelLog):
         flight = read_channels(log, request)
     else:
         flight = _read_table(log, request)
+    # Last, and for every kind of log alike: an input may move in the log and not within the window.
     if options.moving_inputs:
         require_moving_inputs(flight)
     return flight
@@ -81,9 +83,13 @@ def _read_table(table: Table, request: Request) -> Flight:
         raise wrong(path, "no time is stated, expected the name of the column of time stamps")
     numbers = table.numbers(request.columns)
     clock = _clock(table, request.time, numbers[request.time.name])
+    # The window before anything else is asked of the samples: what lies outside of it may be as
+    # wrong as it likes.
     rows, notes = _rows(path, clock.elapsed, options.window)
     signals = _to_si(table, request, numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
+    # Before the grid, whose rounding is a part of a step: steps of a wrong unit would make it
+    # meaningless.
     _check_step(stamps)
     grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and options.rate is None:

@@ -72,6 +72,7 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
         raise wrong(log.path, problem + shown(request.time.name))
     options = request.options
     signals = _signals(log, request)
+    # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = _holds(request, signals)
     start, dt, samples, notes = _on_grid(log.path, options.rate, signals, holds)
     return Flight(
@@ -131,6 +132,7 @@ def topic_clock(
         raise wrong(path, "got times that are no finite numbers, expected a clock", place)
     first, last = 0, elapsed.size
     if window is not None:
+        # The bounds are inclusive whatever the rounding of the stamps.
         inside = np.flatnonzero((elapsed >= window[0] - 1e-9) & (elapsed <= window[1] + 1e-9))
         first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
     seconds = elapsed[first:last]
@@ -145,6 +147,7 @@ def topic_clock(
         fault = "stands still" if steps[back[0]] == 0 else "runs backwards"
         problem = f"the time {fault} after {seconds[back[0]]:.6g} s, expected increasing times"
         raise wrong(path, f"{problem}; give a window without it", place)
+    # The median and not the mean, which one long gap would lift above any limit.
     if np.median(steps) < SHORTEST_STEP:
         raise wrong(path, "its steps are shorter than 1 ns, expected a clock", place)
     return TopicClock(topic, seconds, slice(first, last))
@@ -179,6 +182,7 @@ def _on_grid(
 ) -> tuple[float, float, dict[_Key, np.ndarray], tuple[str, ...]]:
     """First time and step [s] of the grid, the samples (N,) on it, and notes on how they came
     there."""
+    # One for each topic, since signals of the same topic share their stamps.
     clocks = list({s.clock.topic: s.clock for s in signals.values()}.values())
     if rate is None:
         if len(clocks) > 1:
@@ -194,6 +198,7 @@ def _on_grid(
     times = common_times(path, clocks, rate)
     samples = {}
     for (key, kind), signal in signals.items():
+        # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
         stays = kind == "input" and holds[key].hold == "zero-order"
         method = hold if stays else resampled
         samples[key, kind] = method(signal.clock.seconds, signal.values, times)
@@ -210,6 +215,7 @@ def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
             problem = f"its times leave a uniform grid by {grid.drift:.2g} samples"
         else:
             problem = f"a step of {grid.step:.6g} s before {at}, usual are {grid.usual:.6g} s"
+        # Where a gap is too long to be bridged, a rate would only lead to the next error.
         bridged = np.diff(seconds).max() <= longest_gap(seconds)
         remedy = f"`rate: {1 / grid.usual:.4g}` to resample, or " if bridged else ""
         problem += f", expected a uniform grid; give {remedy}a window without such steps"
@@ -221,6 +227,7 @@ def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
     for clock in clocks:
         steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
         row = int(np.argmax(steps))
+        # A step of exactly the limit, but for its rounding, passes.
         if steps[row] > most * (1 + 1e-9):
             problem = f"a gap of {steps[row]:.6g} s at {clock.seconds[row]:.6g} s, expected none"
             problem += f" longer than {most:.3g} s; give a window without it"
@@ -230,13 +237,21 @@ def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
 def common_times(path: str, clocks: list[TopicClock], rate: float) -> np.ndarray:
     """Times (M,) [s] at the rate [Hz] at which all topics have samples before and behind.
 
+    Args:
+        path: for the message.
+        clocks: of the topics, at least one; their times count from the log's beginning.
+        rate: of the times [Hz].
+
     Raises:
         InputError: there are too few, or absurdly many.
     """
+    # Nothing is extrapolated: what a topic did before its first sample or behind its last nobody
+    # knows.
     start = max(float(clock.seconds[0]) for clock in clocks)
     end = min(float(clock.seconds[-1]) for clock in clocks)
     fastest = min(clock.usual for clock in clocks)
     count = (end - start) * rate
+    # Written so that a NaN is refused too, here and below.
     if not count >= _FEWEST - 1 - 1e-6:
         problem = f"the topics share {max(end - start, 0.0):.6g} s, at {rate:g} Hz fewer than"
         raise wrong(path, f"{problem} {_FEWEST} samples, expected more")

@@ -58,6 +58,7 @@ class Request:
         self.signals |= {(key, "output"): signal for key, signal in outputs.items()}
         if not self.signals:
             raise wrong(path, "no input or output is asked for, expected at least one")
+        # Columns first: a column with two uses makes every further sentence about it doubtful.
         self._check_columns()
         self._check_units()
         self._check_noise()
@@ -112,6 +113,7 @@ class Request:
             if sd is None:
                 continue
             use = f"{kind} {key!r}"
+            # Only what is measured has noise in the estimators; an input is taken as it is logged.
             if kind == "input":
                 problem = f"an sd is stated for {use}, expected one for outputs alone"
                 raise wrong(self.path, problem, column(signal.name))
@@ -134,6 +136,7 @@ class Request:
 
     def _check_numbers(self) -> None:
         rate, window = self.options.rate, self.options.window
+        # NaN passes no comparison, so each bound is written as what has to hold.
         if rate is not None and not (rate > 0 and math.isfinite(rate)):
             raise wrong(self.path, f"rate is {rate:g}, expected a positive number in Hz")
         if window is not None:

@@ -25,6 +25,8 @@ class Clock:
 
 def longest_gap(seconds: np.ndarray) -> float:
     """The longest step [s] between stamps (N,) [s] that may be bridged."""
+    # The larger of the two: in a slow log a few steps are longer than the time, and in a fast one
+    # the time is many steps.
     return max(_GAP_STEPS * float(np.median(np.diff(seconds))), _GAP_SECONDS)
 
 
@@ -71,6 +73,8 @@ def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     Returns:
         (M,), in the samples' unit; NaN where too much is missing.
     """
+    # Where the rate hardly goes down there is nothing to fold, and straight lines keep the samples
+    # as they are.
     if times.size < 2 or np.median(np.diff(seconds)) >= _GOES_DOWN * (times[1] - times[0]):
         return interpolate(seconds, values, times)
     return decimate(seconds, values, times)

@@ -61,6 +61,7 @@ def wrong(path: str, problem: str, *place: str) -> InputError:
 
 def shown(text: str) -> str:
     """Text from a file, quoted, cut to 40 characters."""
+    # Cut, since a damaged file may have a name as long as itself.
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
 
 

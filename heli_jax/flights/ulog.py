@@ -30,7 +30,9 @@ _TYPES = {
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
     "bool": "<i1", "char": "<i1",
 }  # fmt: skip
+# At most five digits of a length: what claims more is damage, and would be laid out field by field.
 _FIELD = re.compile(r"([A-Za-z_]\w*)(?:\[(\d{1,5})\])? ([A-Za-z_]\w*)")
+# Kinds of messages by letter. Newer firmware may add others, which are passed over by their length.
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
 
 
@@ -100,6 +102,7 @@ def open_ulog(path: Path) -> ChannelLog:
         firmware=" ".join(str(part) for part in parts if part),
         parameters=content.parameters,
         notes=tuple(notes),
+        # Behind the mark stands when the logger began, in the count of the topics' own stamps [us].
         start=struct.unpack("<Q", data[8:16])[0] * 1e-6,
     )
 
@@ -125,6 +128,8 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
         size, kind = data[at] | data[at + 1] << 8, data[at + 2]
         body, after = at + 3, at + 3 + size
         limit = min((o for o in content.appended if o > at), default=end)
+        # A length of zero or a huge one of an unknown kind is no message of newer firmware. The
+        # length is then no way on, and the next mark of the logger is.
         if kind not in _KNOWN and (not kind or not size or size > _LONGEST_MESSAGE):
             content.damaged += 1
             at = _next_sync(data, at)
@@ -136,6 +141,8 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
         if kind == 0x44:  # 'D', nearly all of them
             number = data[body] | data[body + 1] << 8 if size > 1 else -1
             topic = content.subscriptions.get(number)
+            # A message may leave out the padding at its end, so any length from that without it to
+            # that with all of it is right. Any other is damage.
             if topic is not None and topic.dtype.itemsize <= size - 2 <= topic.longest:
                 topic.data += data[body + 2 : body + 2 + topic.dtype.itemsize]
             else:
@@ -151,6 +158,7 @@ def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> 
 
 def _next_sync(data: bytes, at: int) -> int:
     """Behind the next mark that the logger writes from time to time, or the end."""
+    # The mark is itself a message, S, whose body it is; the next message begins right behind it.
     found = data.find(_SYNC, at)
     return found + len(_SYNC) if found >= 0 else len(data)
 
@@ -164,6 +172,8 @@ def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
             content.information[key] = value
         case "P":
             key, value = _key_value(body)
+            # The first value stays: the logger writes a parameter again whenever somebody changes
+            # it in flight.
             content.parameters.setdefault(key, value)
         case "A":
             _take_subscription(body, content)
@@ -172,6 +182,9 @@ def _take(path: str, kind: str, body: bytes, content: _Content) -> None:
             content.dropouts += 1
         case "B":
             flags = body[8:16]
+            # A flag that is not known may mean that the data are laid out in another way, and the
+            # format asks readers to refuse such a file. The one that is known says that data were
+            # appended.
             if len(flags) < 8 or flags[0] & ~1 or any(flags[1:]):
                 raise wrong(path, "is a ULog file of a kind that is not known, expected version 1")
             if flags[0] & 1 and len(body) >= 40:
@@ -205,16 +218,20 @@ def _take_subscription(body: bytes, content: _Content) -> None:
     name = body[3:].decode("utf-8", "ignore")
     fields: list[tuple[str, str]] = []
     _flatten("", name, content, fields, 0)
+    # With all padding, before what stands at the end is taken off: firmware writes it or not.
     longest = sum(np.dtype(kind).itemsize for _, kind in fields)
     while fields and fields[-1][0].startswith("_padding"):
         fields.pop()
     names = [field_name for field_name, _ in fields]
+    # The rows become a structured array, whose fields need names of their own.
     if "timestamp" not in names or len(set(names)) < len(names):
         raise _Damaged
     if len(content.subscriptions) + len(content.closed) >= _MOST_TOPICS:
         raise _Damaged
     before = content.subscriptions.get(number)
     if before is not None:
+        # A number that is given anew is another topic's from here on; what was gathered under it
+        # stays.
         content.closed.append(before)
     content.subscriptions[number] = _Subscription(name, instance, np.dtype(fields), longest)
 
@@ -245,6 +262,7 @@ def _topics(content: _Content) -> tuple[Topic, ...]:
     topics = []
     for (name, instance), parts in merged.items():
         rows = parts[0]
+        # A topic may be subscribed to more than once; its rows then follow each other.
         if len(parts) > 1 and all(p.dtype == rows.dtype for p in parts):
             rows = np.concatenate(parts)
         several = sum(other == name for other, _ in merged) > 1

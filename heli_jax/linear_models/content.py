@@ -19,12 +19,16 @@ _KEYS = (
     "name", "meaning", "states", "inputs", "outputs", "parameters", "A", "B", "C", "D", "E",
     "delays", "axes",
 )  # fmt: skip
+# Names become fields of NamedTuples, which take no leading underscore and no keyword, and stand in
+# expressions, whose grammar knows ASCII alone.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _TITLE = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,59}")
 _MOST = 100
 """states, inputs or outputs: dense matrices beyond take minutes to compile"""
 _TAKEN = ("seed", "sigma_w", "tau_w")
 """names that a sweep or a disturbance adds"""
+# The order of the exponents in a Dimension: the base units that `heli_jax.units` has, but for the
+# radian, since an angle counts as a plain number here.
 BASE_UNITS = ("kg", "m", "s", "A")
 PLAIN: Dimension = (0, 0, 0, 0)
 TIME: Dimension = (0, 0, 1, 0)
@@ -69,6 +73,7 @@ def content_of(given: Mapping[str, Any]) -> Content:
     Raises:
         InputError: anything in it is wrong; the sentence begins with the place within the file.
     """
+    # Unknown keys first: a misspelt key is the likeliest reason for one that is missing.
     _known(given, _KEYS, "")
     for key in ("name", "states", "inputs", "outputs", "parameters", "A"):
         if key not in given:
@@ -76,6 +81,7 @@ def content_of(given: Mapping[str, Any]) -> Content:
     name = given["name"]
     if not isinstance(name, str) or not _TITLE.fullmatch(name):
         raise InputError(f"name: expected a short name such as roll, got {name!r:.60}")
+    # Outputs are not asked for names of their own below: one with a state's name is that state.
     states, inputs, outputs = (
         {n: _signal(one, f"{key}.{n}") for n, one in _section(given, key).items()}
         for key in ("states", "inputs", "outputs")
@@ -107,6 +113,7 @@ def _section(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     section = as_mapping(given[key], key)
     if not section:
         raise InputError(f"{key}: empty, expected at least one")
+    # Parameters make no matrix larger: only what has rows and columns is bounded.
     if len(section) > _MOST and key != "parameters":
         raise InputError(f"{key}: expected at most {_MOST}, got {len(section)}")
     for name in section:
@@ -115,6 +122,8 @@ def _section(given: Mapping[str, Any], key: str) -> Mapping[str, Any]:
                 f"{key}: expected a name of letters, digits and _ that begins with a letter, got "
                 f"{name!r:.60}"
             )
+        # A sweep's axis of such a name could mean either, the model's parameter or the
+        # disturbance's.
         if name in _TAKEN:
             raise InputError(f"{key}.{name}: taken by sweeps and disturbances, expected another")
     return section
@@ -138,6 +147,7 @@ def _once(sections: Mapping[str, Mapping[str, Any]]) -> None:
 
 def _signal(given: Any, place: str) -> Signal:
     """A state, input or output: its unit, or {unit, meaning}."""
+    # A unit alone is the usual case, and a mapping for it would double the length of a file.
     given = {"unit": given} if isinstance(given, str) else as_mapping(given, place)
     _known(given, ("unit", "meaning"), place)
     si, scale, dimension = _unit(given, place)
@@ -148,9 +158,11 @@ def _quantity(given: Any, place: str) -> Quantity:
     given = as_mapping(given, place)
     _known(given, ("value", "unit", "source", "meaning", "positive"), place)
     value = given.get("value")
+    # In Python true is the number 1, so that it has to be refused by itself, here and below.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{place}.value: expected a number, got {value!r:.40}")
     si, scale, dimension = _unit(given, place)
+    # Finite in SI too: a large number in a large unit overflows only here.
     number = float(value) * scale
     if not math.isfinite(number):
         raise InputError(f"{place}.value: expected a finite number, got {value!r:.40}")
@@ -158,6 +170,7 @@ def _quantity(given: Any, place: str) -> Quantity:
     if not isinstance(positive, bool):
         raise InputError(f"{place}.positive: expected true or false, got {positive!r:.40}")
     source = _words(given, "source", place)
+    # Kept in SI, since every result is reported in SI, whatever the file was written in.
     constant = Constant(number, si, source)
     return Quantity(constant, dimension, positive, _words(given, "meaning", place))
 
@@ -178,11 +191,14 @@ def _unit(given: Mapping[str, Any], place: str) -> tuple[str, float, Dimension]:
         got = "nothing" if unit is None else f"{unit!r:.40}"
         raise InputError(f"{place}.unit: expected a unit such as rad/s or 1, got {got}")
     try:
+        # The SI unit is made of the exponents and not looked up, so that any unit of the same kind
+        # ends as the same text and can be compared by it.
         exponents = units.base_of(unit)
         si = units.as_text(exponents)
         scale = units.factor(unit, si)
     except ValueError as e:
         raise InputError(f"{place}.unit: {e}") from e
+    # An angle counts as a plain number here, so rad/s and 1/s are of one dimension.
     return si, scale, tuple(exponents.get(n, 0) for n in BASE_UNITS)
 
 
@@ -201,12 +217,15 @@ def _delays(
                 f"{place}: expected the name of a parameter, got {parameter!r:.40}"
                 f"{nearest(str(parameter), parameters)}"
             )
+        # The sign is left open: a negative delay is allowed where two clocks differ.
         if parameters[parameter].dimension != TIME:
             raise InputError(
                 f"{place}: expected a parameter in s, got {parameter} in "
                 f"{parameters[parameter].constant.unit}"
             )
         found.append((name, parameter))
+    # Only states are looked for: without a rate there is nothing to disturb, and without an angle a
+    # mode still has a name.
     return tuple(found)
 
 
@@ -245,6 +264,8 @@ def _axis(
     flybar = given.get("flybar", [])
     if not isinstance(flybar, list):
         raise InputError(f"{place}.flybar: expected a list of states, got {flybar!r:.40}")
+    # All names in one list, so that each of them is checked in the same way and told with its
+    # place.
     named = [("rate", given["rate"], states), *(("flybar", one, states) for one in flybar)]
     named += [
         (key, given[key], known)

@@ -22,6 +22,8 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
     """
     State = _record("State", content.states)
     Outputs = _record("Outputs", content.outputs)
+    # The records are made once and used for both the functions and the Model: two classes of the
+    # same fields would be different trees to JAX.
     equations = _Equations(dict(matrices), State, Outputs)
     return Model(
         content.name,
@@ -31,6 +33,7 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
         State,
         _record("Inputs", content.inputs),
         Outputs,
+        # By this simulations, sweeps and fits take the exact step unless another is asked for.
         linear=True,
         axes=content.axes,
         delays=content.delays,
@@ -41,6 +44,7 @@ def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Mod
 def _record(title: str, signals: Mapping[str, Signal]) -> type:
     """A class with one scalar a signal, in SI."""
     fields = [(n, Annotated[Scalar, one.si, one.meaning]) for n, one in signals.items()]
+    # At run time, since what the states are stands in the file; a type checker cannot know them.
     made: Any = NamedTuple(title, fields)  # type: ignore[misc]
     return made
 
@@ -50,6 +54,8 @@ def _params(content: Content) -> type:
         n: (Annotated[Scalar, q.constant.unit, q.meaning], q.constant.value)
         for n, q in content.parameters.items()
     }
+    # The values are defaults of the record, so that a script makes the Params of the file by
+    # calling it without arguments.
     return naming.extended(_Nothing, "Params", fields)
 
 
@@ -67,14 +73,31 @@ class _Equations:
         self.matrices, self.State, self.Outputs = matrices, State, Outputs
 
     def vector_field(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The derivatives of the states, per second."""
+        """The derivatives of the states, per second.
+
+        Args:
+            params: the model's Params, scalars [SI].
+            state: the State, scalars [SI].
+            inputs: the Inputs, scalars [SI].
+        """
+        # Entry by entry: most of a matrix is zero, and a dense product would compute all of it at
+        # every step.
         rates = self.rows(("A", "B"), naming.names(self.State), params, state, inputs)
+        # Without E the states' derivatives are the rows themselves, and no system has to be solved
+        # at every step.
         if self.matrices["E"]:
             return self.solved(params, rates)
         return self.State(**rates)
 
     def output(self, params: Any, state: Any, inputs: Any) -> Any:
-        """The outputs; one without a row is the state of its name."""
+        """The outputs; one without a row is the state of its name.
+
+        Args:
+            params: the model's Params, scalars [SI].
+            state: the State, scalars [SI].
+            inputs: the Inputs, scalars [SI].
+        """
+        # An output with a row is what the row says, even where a state has its name.
         stated = {entry.row for name in ("C", "D") for entry in self.matrices[name]}
         names = naming.names(self.Outputs)
         rows = self.rows(("C", "D"), (n for n in names if n in stated), params, state, inputs)
@@ -84,12 +107,21 @@ class _Equations:
         self, matrices: tuple[str, str], names: Iterable[str], params: Any, state: Any, inputs: Any
     ) -> dict[str, Any]:
         """The sums of two matrices' rows, the first times the states, the second times the
-        inputs."""
+        inputs.
+
+        Args:
+            matrices: their names, as A and B.
+            names: of the rows.
+            params: the model's Params, scalars [SI].
+            state: the State, scalars [SI].
+            inputs: the Inputs, scalars [SI].
+        """
         # Zeros made of a state have its type and its batch axis.
         zero = 0.0 * state[0]
         sums = dict.fromkeys(names, zero)
         for matrix, by in zip(matrices, (state, inputs), strict=True):
             for entry in self.matrices[matrix]:
+                # Evaluated at every call, since parameters are what a fit differentiates by.
                 term = _value(entry, params) * getattr(by, entry.column)
                 sums[entry.row] = sums[entry.row] + term
         return sums
@@ -98,6 +130,8 @@ class _Equations:
         """E^-1 times the right-hand side; E is the unit matrix in the rows that it does not
         name."""
         names = naming.names(self.State)
+        # A row that the file names is as written there, without a one on its diagonal that nobody
+        # asked for.
         stated = {entry.row for entry in self.matrices["E"]}
         zero = 0.0 * right[names[0]]
         E = {
@@ -108,6 +142,7 @@ class _Equations:
         for entry in self.matrices["E"]:
             E[entry.row, entry.column] = zero + _value(entry, params)
         matrix = jnp.stack([jnp.stack([E[i, j] for j in names]) for i in names])
+        # Solved anew for each set of parameters: a mass may be free, so the inverse cannot be kept.
         return naming.unravel(
             self.State, jnp.linalg.solve(matrix, jnp.stack([right[n] for n in names]))
         )
@@ -116,4 +151,5 @@ class _Equations:
 def _value(entry: Entry, params: Any) -> Any:
     """An entry [SI]."""
     number = evaluate(entry.node, lambda name: getattr(params, name))
+    # Entries with parameters are in SI already: their factor is one, and none is traced for them.
     return number if entry.factor == 1.0 else entry.factor * number

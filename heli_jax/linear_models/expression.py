@@ -85,6 +85,7 @@ def parse(text: str, known: Mapping[str, Any]) -> Node:
     Raises:
         ExpressionError: it is none, or names a parameter that is not known.
     """
+    # Before any token is read: the depth alone would not bound the time that a long sum takes.
     if len(text) > LONGEST:
         raise ExpressionError(f"expected at most {LONGEST} characters, got {len(text)}")
     return _Parser(text, known).whole()
@@ -108,6 +109,8 @@ class _Parser:
 
     def take(self) -> _Token:
         taken = self.now
+        # The end is never consumed, so that every rule can look at the next token without asking
+        # whether there is one.
         if taken.kind != "end":
             self.now = next(self.tokens)
         return taken
@@ -125,6 +128,7 @@ class _Parser:
         found = self.product()
         while self.now.text in ("+", "-"):
             operator = self.take().text
+            # From the left, as Python has it: a - b - c is (a - b) - c.
             found = Binary(operator, found, self.product())
         return found
 
@@ -138,10 +142,12 @@ class _Parser:
     def signed(self) -> Node:
         if self.now.text not in ("-", "+"):
             return self.power()
+        # A chain of signs calls this rule again for each, so it counts as depth like a parenthesis.
         sign = self.take()
         self.deeper(sign)
         of = self.signed()
         self.depth -= 1
+        # A plus changes nothing, and needs no node.
         return Negative(of) if sign.text == "-" else of
 
     def power(self) -> Node:
@@ -149,12 +155,16 @@ class _Parser:
         if self.now.text not in ("^", "**"):
             return base
         self.take()
+        # A whole number of one digit and no expression: a free exponent would give the entry a unit
+        # that depends on a value, and a power of a negative number is real for whole ones alone.
         negative = self.now.text in ("-", "+") and self.take().text == "-"
         token = self.take()
         if not token.text.isdigit() or len(token.text) > 1:
             raise self.refuse(
                 f"expected a whole power from -{HIGHEST} to {HIGHEST}, got {_shown(token)}", token
             )
+        # a^b^c is read from the right by some programs and from the left by others: the file has to
+        # say.
         if self.now.text in ("^", "**"):
             raise self.refuse("a power of a power, expected parentheses", self.now)
         return Power(base, -int(token.text) if negative else int(token.text))
@@ -163,6 +173,7 @@ class _Parser:
         token = self.take()
         if token.kind == "number":
             value = float(token.text)
+            # Digits cannot be wrong, but 1e999 is more than a float64 holds.
             if value == float("inf"):
                 raise self.refuse(f"expected a finite number, got {token.text:.20}", token)
             return Number(value)
@@ -207,6 +218,7 @@ def _tokens(text: str) -> Iterator[_Token]:
             )
         yield _Token(str(found.lastgroup), found.group(), at + 1)
         at = found.end()
+    # A token of its own for the end, so that a message about it has a place in the text.
     yield _Token("end", "", len(text) + 1)
 
 
@@ -228,6 +240,8 @@ def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
         case Negative(of):
             return -evaluate(of, value)
         case Power(of, exponent):
+            # The exponent is a plain integer and is never traced: JAX makes products of it, whose
+            # derivative is right for a negative value and at zero.
             return evaluate(of, value) ** exponent
         case Binary(operator, left, right):
             a, b = evaluate(left, value), evaluate(right, value)
@@ -235,6 +249,8 @@ def evaluate(node: Node, value: Callable[[str], Any]) -> Any:
                 return a + b
             if operator == "-":
                 return a - b
+            # The same code serves plain numbers when a file is checked and traced ones when it is
+            # run.
             return a * b if operator == "*" else a / b
 
 
@@ -277,6 +293,8 @@ def dimension(node: Node, of: Mapping[str, Dimension], plain: Dimension) -> Dime
                 return tuple(i + j for i, j in zip(a, b, strict=True))
             if operator == "/":
                 return tuple(i - j for i, j in zip(a, b, strict=True))
+            # A number in a sum is one without a unit: whether 2 in Lb + 2 is per second nobody
+            # could tell.
             if a != b:
                 raise ExpressionError(
                     f"{operator!r} joins terms of different kinds, expected the same unit on both "

@@ -46,6 +46,8 @@ def matrices_of(given: Mapping[str, Any], content: Content) -> dict[str, tuple[E
     """
     matrices = _Matrices(given, content).all()
     values = {n: q.constant.value for n, q in content.parameters.items()}
+    # The file's own values have to be possible too: a model that cannot be run at its defaults
+    # would fail at the first use, far from the line that is wrong.
     if problem := not_possible(content, matrices, values):
         raise InputError(problem)
     return matrices
@@ -64,6 +66,8 @@ def not_possible(
         matrices: of `matrices_of`.
         values: of all parameters, by name [SI].
     """
+    # A sentence is returned and nothing is raised, since who calls knows whether the values are the
+    # file's, a vehicle's or a configuration's, and begins the sentence with that.
     for name, quantity in content.parameters.items():
         if quantity.positive and not values[name] > 0:
             return f"{name}: expected more than zero (positive: true), got {values[name]:g}"
@@ -76,6 +80,8 @@ def not_possible(
 def _value(entry: Entry, values: Mapping[str, float]) -> float:
     try:
         number = expression.evaluate(entry.node, lambda name: float(values[name]))
+    # Python raises where NumPy gives infinity. NaN stands for both, and every entry that is not
+    # finite is refused by its place.
     except (ZeroDivisionError, OverflowError):
         return math.nan
     return entry.factor * float(number)
@@ -85,6 +91,7 @@ def _not_invertible(
     content: Content, entries: tuple[Entry, ...], values: Mapping[str, float]
 ) -> str:
     names = list(content.states)
+    # As the equations make it: the unit matrix in the rows that the file does not name.
     E = np.eye(len(names))
     for row in {entry.row for entry in entries}:
         E[names.index(row)] = 0.0
@@ -92,6 +99,8 @@ def _not_invertible(
         E[names.index(entry.row), names.index(entry.column)] = _value(entry, values)
     # Rows and columns of one size: units must not decide what is singular.
     for axis in (1, 0):
+        # A row of zeros stays one, and is found by the rank, in place of a division of zero by
+        # zero.
         E = E / np.maximum(np.max(np.abs(E), axis=axis, keepdims=True), 1e-300)
     singular = np.linalg.matrix_rank(E) < len(names)
     return "E: has no inverse with the parameters' values" if singular else ""
@@ -113,10 +122,13 @@ class _Matrices:
             for n, one in {**content.states, **content.inputs}.items()
         }
         self.outputs = {n: _Unit(o.dimension, o.scale) for n, o in content.outputs.items()}
+        # A derivative is per second whatever the file's units: only the state's own has to be taken
+        # to SI.
         self.rates = {n: _over(self.columns[n], _Unit(TIME, 1.0)) for n in content.states}
 
     def all(self) -> dict[str, tuple[Entry, ...]]:
         states, inputs, outputs = self.content.states, self.content.inputs, self.content.outputs
+        # E first: its diagonal decides in which unit its rows of A and B are.
         found = {"E": self.masses()}
         for name, rows, columns in (
             ("A", self.rates, states),
@@ -129,8 +141,19 @@ class _Matrices:
         return found
 
     def rows(self, matrix: str, known: Iterable[str], columns: Iterable[str]) -> dict[str, Any]:
-        """A matrix as it is written: by row, by column."""
+        """A matrix as it is written: by row, by column.
+
+        Args:
+            matrix: its name, as A.
+            known: names that its rows may have.
+            columns: names that its columns may have.
+
+        Raises:
+            InputError: a row or a column has another name.
+        """
         found = {}
+        # Both names are checked before any entry is read, since an entry's unit is asked of its row
+        # and column.
         kind = "output" if matrix in ("C", "D") else "state"
         for row, given in as_mapping(self.given.get(matrix, {}), matrix).items():
             if row not in known:
@@ -147,6 +170,16 @@ class _Matrices:
     def matrix(
         self, name: str, rows: Mapping[str, _Unit], columns: Iterable[str]
     ) -> tuple[Entry, ...]:
+        """All entries of a matrix but E.
+
+        Args:
+            name: of the matrix, as A.
+            rows: what each row is in, by name.
+            columns: names that its columns may have.
+
+        Raises:
+            InputError: a name or an entry is wrong.
+        """
         return tuple(
             self.entry(f"{name}.{row}.{column}", one, row, column, rows[row])
             for row, given in self.rows(name, rows, columns).items()
@@ -157,6 +190,8 @@ class _Matrices:
         """E; its diagonal gives its rows their unit."""
         states, found = self.content.states, []
         for row, given in self.rows("E", states, states).items():
+            # The diagonal before the others of its row, since it says what the whole row is in: a
+            # mass times an acceleration is a force.
             if row in given:
                 node = self.tree(f"E.{row}.{row}", given[row])
                 try:
@@ -165,6 +200,9 @@ class _Matrices:
                     raise InputError(f"E.{row}.{row}: {given[row]!r:.80}: {e}") from e
                 rate = self.rates[row].dimension
                 total = tuple(i + j for i, j in zip(rate, mass, strict=True))
+                # Bare numbers of such a row would be in a unit made of the file's and the
+                # parameter's, which no reader could be sure of. They are refused unless the
+                # diagonal is a plain number.
                 self.rates[row] = _Unit(total, self.rates[row].scale, total == rate)
             for column, one in given.items():
                 place = f"E.{row}.{column}"
@@ -173,6 +211,7 @@ class _Matrices:
         return tuple(found)
 
     def tree(self, place: str, given: Any) -> Node:
+        # In Python true is the number 1, and in a matrix it is a slip.
         if isinstance(given, bool) or not isinstance(given, int | float | str):
             raise InputError(f"{place}: expected a number or an expression, got {given!r:.40}")
         if isinstance(given, str):
@@ -194,10 +233,25 @@ class _Matrices:
         of: _Unit,
         per: _Unit | None = None,
     ) -> Entry:
+        """One entry, checked.
+
+        Args:
+            place: where it stands, as A.p.b.
+            given: a number or an expression, as the YAML has it.
+            row: name of its row.
+            column: name of its column.
+            of: what the row is in.
+            per: what the column is in; the state or the input itself unless given.
+
+        Raises:
+            InputError: it is no number or expression, or of another dimension than its place.
+        """
         node = self.tree(place, given)
         said = f"{place}: {given!r:.80}"
         over = self.columns[column] if per is None else per
         expected = _over(of, over)
+        # Numbers alone, 2*9.81 too: only what names a parameter has units that could be checked,
+        # and anything else is in those of the file.
         if not expression.parameters_of(node):
             if not of.bare:
                 raise InputError(
@@ -206,6 +260,8 @@ class _Matrices:
                 )
             return Entry(row, column, node, expected.scale, said)
         try:
+            # Parameters are in SI already, so the entry needs no factor once its dimension is
+            # right.
             found = expression.dimension(node, self.dimensions, PLAIN)
         except ExpressionError as e:
             raise InputError(f"{said}: {e}") from e
@@ -219,6 +275,8 @@ class _Matrices:
 
     def check_rows(self, states: Mapping[str, Any], outputs: Mapping[str, Signal]) -> None:
         """Every state needs its derivative, every output its equation or a state of its name."""
+        # A state without a row would stay as it begins without a word. Who means that writes an
+        # empty row.
         for name in states:
             if name not in self.given["A"] and name not in self.given.get("B", {}):
                 raise InputError(
@@ -233,6 +291,8 @@ class _Matrices:
                     f"outputs.{name}: expected a row C.{name}, or the name of a state"
                     f"{nearest(name, states)}"
                 )
+            # The dimension and not the unit: an output in degrees of a state in radians is the same
+            # number in SI.
             if states[name].dimension != output.dimension:
                 raise InputError(
                     f"outputs.{name}.unit: expected the kind of the state {name}, in "

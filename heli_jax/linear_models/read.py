@@ -43,12 +43,16 @@ class LinearModel(NamedTuple):
             InputError: an unknown name, or a value that cannot be.
         """
         where = self.path if where is None else where
+        # The file's values are a vehicle by themselves, and what is given replaces some of them.
         own = {n: q.constant for n, q in self.content.parameters.items()}
         replaced = vehicle_from_mapping(given or {}, where, self.model.Params).constants
         constants = {**own, **replaced}
         values = {n: c.value for n, c in constants.items()}
+        # Together and not one by one: whether E has an inverse depends on all of them.
         if problem := not_possible(self.content, self.matrices, values):
             raise InputError(f"{where}: {problem}")
+        # Read a second time with all values at hand, so that the Params are made in one place with
+        # the units of the record.
         entries = {n: {"value": c.value, "unit": c.unit} for n, c in constants.items()}
         params = vehicle_from_mapping(entries, where, self.model.Params).params
         return Vehicle(params, constants, where)
@@ -57,6 +61,7 @@ class LinearModel(NamedTuple):
 def shipped() -> tuple[str, ...]:
     """The names of the linear models that ship."""
     folder = resources.files("heli_jax.linear_models").joinpath("files")
+    # By the files that are there: a new one ships without a list that has to name it.
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
 
 
@@ -81,6 +86,8 @@ def linear_model(file: str | Path, folder: str | Path = ".") -> LinearModel:
     return _read(text, path)
 
 
+# By the text and not by the path: a file that was edited is another model, and two copies of one
+# are the same to `jax.jit`.
 _models: OrderedDict[str, tuple[Model, Content, dict[str, tuple[Entry, ...]]]] = OrderedDict()
 
 
@@ -93,6 +100,7 @@ def _read(text: str, path: str) -> LinearModel:
         except InputError as e:
             raise InputError(f"{path}: {e}") from e
         _models[text] = (model_of(content, matrices), content, matrices)
+        # The oldest goes: a script that writes files in a loop would else keep every model.
         if len(_models) > _REMEMBERED:
             _models.popitem(last=False)
     return LinearModel(*_models[text], path)
@@ -101,10 +109,14 @@ def _read(text: str, path: str) -> LinearModel:
 def _text(file: str | Path, folder: Path) -> tuple[str, str]:
     """What a file holds, and its name in sentences."""
     name = str(file)
+    # A shipped name goes before a file of the same name; a file is always meant by one with its
+    # ending.
     if is_shipped(name):
         own = resources.files("heli_jax.linear_models").joinpath("files", f"{name}.yaml")
         return own.read_text(encoding="utf-8"), name
     path = folder / name
+    # What has no ending of YAML was meant as a name, so the nearest name helps more than the path
+    # that was tried.
     if path.suffix not in _ENDINGS and not path.exists():
         raise InputError(f"unknown linear model {name!r:.80}{nearest(name, shipped())}")
     try:
@@ -114,6 +126,7 @@ def _text(file: str | Path, folder: Path) -> tuple[str, str]:
             raise InputError(f"{e}; did you mean the shipped {path.stem!r}?") from e
         raise
     try:
+        # Editors of Windows begin a file with a mark that would belong to the first key.
         return data.decode("utf-8-sig"), str(path)
     except UnicodeDecodeError as e:
         raise InputError(f"{path}: is not text, expected a linear model in YAML") from e

@@ -24,8 +24,11 @@ class Range(NamedTuple):
 
     def at(self, fraction: np.ndarray) -> np.ndarray:
         """The value at fractions (k,) of the way, 0 to 1; the ends are exact."""
+        # A weighted mean and no difference: that of two huge ends would overflow.
         low, high = float(self.lower), float(self.upper)
         if self.scale == "log":
+            # Both ends are negative or both positive, which was checked; the logarithm is of their
+            # size.
             sign = math.copysign(1.0, low)
             values = sign * np.exp(
                 (1.0 - fraction) * math.log(abs(low)) + fraction * math.log(abs(high))
@@ -39,6 +42,8 @@ class Range(NamedTuple):
 def digest(arrays: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of named arrays, whatever their order."""
     sha = hashlib.sha256()
+    # In order of the names, since two dictionaries with the same arrays may have been filled in
+    # another order.
     for name in sorted(arrays):
         v = np.ascontiguousarray(arrays[name])
         # Type and shape too: the bytes of two arrays may be equal where their numbers are not.

@@ -96,6 +96,8 @@ class _Sampled:
     """Points of the unit cube, mapped to the axes."""
 
     def __init__(self, axes: Mapping[str, Range], n: int, seed: int, kind: str) -> None:
+        # At once and not with the first points: a sweep may run for a while before it asks for
+        # these.
         check_axes(axes)
         for name, axis in axes.items():
             if not isinstance(axis, Range):
@@ -183,6 +185,7 @@ class _Product(_Combined):
             index = k % part.size
             k = k // part.size
             # Only the rows of the part that the slice touches: the part may be as large as a sweep.
+            # An empty slice has no least row; it still has its axes, with no values.
             low, high = (int(index.min()), int(index.max()) + 1) if index.size else (0, 0)
             rows = part.values(low, high)
             columns = {**{n: v[index - low] for n, v in rows.items()}, **columns}
@@ -195,9 +198,11 @@ class _Product(_Combined):
 class _Zipped(_Combined):
     @property
     def size(self) -> int:
+        # `zipped` has checked that all parts are of one size.
         return self.parts[0].size
 
     def values(self, start: int, stop: int) -> Columns:
+        # No axis is in two parts, so none is lost here.
         return {n: v for part in self.parts for n, v in part.values(start, stop).items()}
 
     def describe(self) -> dict[str, Any]:
@@ -225,6 +230,7 @@ def paired(axes: Mapping[str, Range | Sequence[float]]) -> Design:
     lengths = {n: v.size for n, v in columns.items()}
     if len(set(lengths.values())) > 1:
         words = ", ".join(f"{n} has {k}" for n, k in lengths.items())
+        # Told with all lengths: which of the axes is the wrong one only the user knows.
         raise ValueError(f"axes: {words} values, expected the same number in a list")
     return _Paired(columns, "list")
 
@@ -273,6 +279,7 @@ def sobol(axes: Mapping[str, Range], n: int, seed: int = 0) -> Design:
 
 def log_axes(design: Design) -> set[str]:
     """The axes that a design fills evenly in the logarithm."""
+    # Designs nest to any depth, and each axis is in one of them.
     if isinstance(design, _Combined):
         return set().union(*map(log_axes, design.parts))
     if isinstance(design, _Sampled):
@@ -285,6 +292,7 @@ def _check_parts(parts: tuple[Design, ...]) -> None:
         raise ValueError("of: no designs, expected at least one")
     seen: set[str] = set()
     for name in (n for part in parts for n in part.names):
+        # Which of two designs sets the axis would depend on their order.
         if name in seen:
             raise ValueError(f"the axis {name!r} is in two designs, expected one")
         seen.add(name)

@@ -71,6 +71,8 @@ class ElementResults(NamedTuple):
 
 def flight_numbers(job: Job, index: int) -> FlightNumbers:
     """The numbers of one of the job's flights."""
+    # All numbers are cast here, once: a single float64 among them would make JAX compute in
+    # float64.
     dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
     inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
     against = {
@@ -115,10 +117,14 @@ def design_point(
     if trim is not None and numbers.pilot is not None:
         # The gains are those for the vehicle as it is given, the flight is this one's own.
         numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=trim.state))
+    # From here on the later question wins, so that the order of these steps is the order of
+    # importance.
     status = jnp.asarray(OK)
     results: Scalars = {}
     kept: dict[str, jax.Array] = {}
     if plan.simulated:
+        # Streamed wherever that is possible: a run is then never held, and a device has room for
+        # more of them.
         if plan.streamed:
             run = _streamed(plan, numbers, params, state, inputs)
         else:
@@ -189,6 +195,7 @@ def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
         lambda v: jnp.asarray(v, jnp.result_type(float)),
         (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
     )
+    # Of the model without a disturbance: a steady flight is one in still air or steady wind.
     trim = equilibrium(whole, plain, condition, wind)
     sound = _is_trimmed(trim)
     # The states of a disturbance have no trim and keep their own beginning.
@@ -217,6 +224,8 @@ def _gained_and_offset(inputs: Any, special: Scalars) -> Any:
     changed = {}
     for name, u in naming.asdict(inputs).items():
         gain, offset = special.get(f"gain.{name}"), special.get(f"offset.{name}")
+        # The offset is not multiplied by the gain, so that neither axis changes what the other
+        # means.
         u = u if gain is None else gain * u
         changed[name] = u if offset is None else u + offset
     return type(inputs)(**changed)

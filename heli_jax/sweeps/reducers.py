@@ -162,7 +162,9 @@ REDUCERS: dict[str, Streaming] = {
     # Start, update, finish, whether it compares with the flight, unit of the result.
     "rms": Streaming(0.0, _squared, _root_mean),
     "mean": Streaming(0.0, _summed, _mean),
+    # A magnitude is never below zero, so zero is no candidate that could win.
     "peak": Streaming(0.0, lambda v, y, _: jnp.maximum(v, jnp.abs(y)), _same),
+    # Beginning at infinity, so that the first sample is taken whatever it is.
     "max": Streaming(-np.inf, lambda v, y, _: jnp.maximum(v, y), _same),
     "min": Streaming(np.inf, lambda v, y, _: jnp.minimum(v, y), _same),
     "final": Streaming(0.0, lambda v, y, _: y, _same),
@@ -194,6 +196,7 @@ def check(name: str, reduce: Reduce, outputs: tuple[str, ...], inputs: tuple[str
             needed.
     """
     where, how = f"reduce.{name}", reduce.how
+    # Here and not at the first run: a sweep of hours shall not end with a misspelt name.
     if isinstance(how, str) and how not in (*REDUCERS, *LINEAR):
         known = [*REDUCERS, *LINEAR]
         raise ValueError(f"{where}.how: unknown reducer {how!r}{nearest(how, known)}")
@@ -229,6 +232,7 @@ def _check_loop(where: str, reduce: Reduce, inputs: tuple[str, ...]) -> None:
         )
     if reduce.input is not None and not margins:
         raise ValueError(f"{where}.input: only margins take one, got {reduce.input!r}")
+    # Said and not ignored: who gives a gain believes that it acts.
     if reduce.gain != 1.0 and not margins:
         raise ValueError(f"{where}.gain: only margins take one, got {reduce.gain}")
     # A gain of zero is no loop: its margins would be infinite whatever the vehicle.

@@ -129,6 +129,7 @@ def run_sweep(
         options.say(note)
     kept = {"seed": 0, **(attributes or {}), "versions": versions(), "notes": notes}
     if out is None:
+        # The same store as on disk, so that a sweep in memory goes through the same code.
         store = stores.create(None, job, *_cut(job, options, kept), "the sweep")
         _compute(job, store, store.done(), options)
         return store.dataset().load()
@@ -140,6 +141,7 @@ def run_sweep(
         if not (options.resume and empty):
             run_directory.require_free(out, ", or --resume")
         _create(job, out, options, kept, files or {})
+    # Before the first chunk: what was computed for minutes could not be written.
     if not out.is_dir() or not stores.writable(out):
         raise InputError(f"{where}: expected a directory that can be written to")
     return _resume(job, out, options)
@@ -181,6 +183,8 @@ def _resume(job: Job, out: Path, options: Options) -> xr.Dataset:
         # A new store too is read as if it were an old one: it may have been made by a process that
         # was killed, or by one that came first.
         store = stores.reopen(out / "sweep.zarr", job, where)
+        # With the lock held, so that no other process finishes a chunk between this question and
+        # the answer.
         done = store.whole()
         _same_cut(store, job, options, where)
         # Said and not refused: to begin anew for a digit in the fifteenth place helps nobody.
@@ -208,6 +212,8 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
         split = split_there(options.client, job, **asked)
     else:
         split = split_for(job, devices=options.devices, say=options.say, **asked)
+    # Once, when the store is made: a resumed sweep shall not tell another error than the one that
+    # it began with.
     if job.precision == "float32":
         words = {**words, "float32_error": float32_error(job)}
     return split, words
@@ -247,6 +253,7 @@ def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) 
         options.progress(Progress(now, total, rate, (total - now) / rate))
 
     if options.client is not None:
+        # Here, since dask is an extra that is not installed everywhere.
         from heli_jax.sweeps.cluster import computed
 
         source: Iterable[Any] = computed(options.client, job, store.split, todo)

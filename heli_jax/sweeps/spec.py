@@ -184,6 +184,8 @@ def job(
         ValueError: an axis or a result that the model or the flights cannot have, a vehicle that
             lacks something, an unknown solver or precision, float64 while JAX has it switched off.
     """
+    # The model first: the other checks ask for its names, and a wrong one would fail in them far
+    # from its cause.
     check_model(model)
     flights = (flights,) if isinstance(flights, Flight) else tuple(flights)
     if not flights:
@@ -196,9 +198,11 @@ def job(
     _check_inputs(model, flights)
     _check_results(model, design, reduce, flights, options.trajectories)
     _check_precision(options.precision)
+    # A linear model has an exact step, so that no error of a solver stands in its results.
     solver = options.solver or ("exact" if model.linear else "rk4")
     if solver == "exact" and not model.linear:
         raise ValueError(f"solver: model {model.name!r} is not linear, expected rk4")
+    # Asked for now, so that an unknown name is refused before anything is compiled.
     solver_named(solver)
     _check_vehicle(model, params, design, flights)
     trimmed = options.trimmed
@@ -232,6 +236,7 @@ def _check_precision(precision: str) -> None:
 def _check_vehicle(model: Model, params: Any, design: Design, flights: tuple[Flight, ...]) -> None:
     """Refuse a vehicle that lacks what neither an axis nor every flight gives."""
     missing = [n for n in needed_but_missing(model, params) if n not in design.names]
+    # Every flight has to know it: one that does not would be computed with NaN.
     missing = [n for n in missing if not all(n in f.known for f in flights)]
     if missing:
         raise ValueError(f"vehicle: {', '.join(missing)} missing, model {model.name} needs it")
@@ -279,6 +284,7 @@ def _check_inputs(model: Model, flights: tuple[Flight, ...]) -> None:
                 raise ValueError(
                     f"flight {flight.name!r} has no input {name!r}, which {model.name} needs"
                 )
+        # One sample has no step, and what an input does behind it is nothing to simulate.
         if flight.n_samples < 2:
             raise ValueError(f"flight {flight.name!r}: expected at least two samples, got one")
 
@@ -355,6 +361,7 @@ def unread(job: Job) -> list[str]:
     model = job.model
     params = model.Params(**job.params)
     axes = [n for n in job.design.names if n in naming.names(model.Params)]
+    # The size of a disturbance is read by its noise alone, and only where noise is drawn.
     drawn = model.noise_intensity if "seed" in job.design.names else None
 
     def read_elsewhere(name: str) -> bool:

@@ -37,6 +37,8 @@ class Store:
     def __init__(self, group: zarr.Group, where: str) -> None:
         self.group, self.where = group, where
         attributes: dict[str, Any] = dict(group.attrs)
+        # As the store has it and not as it would be chosen today: another cut would compute other
+        # last digits.
         self.split = Split(**attributes["split"])
         self.attributes = attributes
         self._results: list[str] = list(attributes["results"])
@@ -90,6 +92,8 @@ class Store:
             for name, values in results.items():
                 if name != "status":
                     self._arrays[name][start:stop] = values
+            # Last, since it is what says that the chunk is whole. A kill before it costs the chunk
+            # and no more.
             self._arrays["status"][start:stop] = results["status"]
 
     def dataset(self) -> xr.Dataset:
@@ -120,6 +124,7 @@ def _words(where: str) -> Iterator[None]:
     try:
         yield
     except OSError as e:
+        # No room, no quota, or a file too large for the file system: for these there is a remedy.
         full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         hint = ", expected room for the rest" if full else ""
         raise InputError(
@@ -231,6 +236,7 @@ def reopen(path: Path, job: Job, where: str) -> Store:
             f"{where}: {path} is of another sweep: {changes[0]}{more}; expected the same, or "
             "another --out"
         )
+    # A variable's folder may have been taken away since the store was made.
     missing = sorted(variables(job).keys() - store.names)
     if missing:
         raise InputError(f"{where}: {path} is no whole store of a sweep, it lacks {missing[0]}")
@@ -301,4 +307,5 @@ def only_writer(directory: Path, where: str) -> Iterator[None]:
 
 def writable(directory: Path) -> bool:
     """Whether files can be made there."""
+    # Files are made in a directory by writing to it and passing through it.
     return os.access(directory, os.W_OK | os.X_OK)

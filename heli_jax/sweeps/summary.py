@@ -51,11 +51,13 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         job: what was computed.
         timing: what it took, as JSON has it.
     """
+    # The status of all elements is held, a byte each; results are read in pieces.
     status = dataset["status"].to_numpy()
     fine = status == OK
     results = {
         str(name): _quantiles(dataset[name], fine)
         for name in dataset.data_vars
+        # Quantiles over times and elements together would say nothing of any run.
         if not str(name).startswith("trajectory_")
     }
     content = {

@@ -73,6 +73,8 @@ def variables(job: Job) -> dict[str, Variable]:
     laid_out["status"] = Variable(("element",), (), "uint8", dict(_FLAGS))
     flights = (("flight", len(job.flights)),) if len(job.flights) > 1 else ()
     for name, (dims, kind, words) in _result_variables(job):
+        # A single flight makes no dimension of length one, which every plot would have to take out
+        # again.
         dims = (*flights, *dims)
         _check_name(name, laid_out)
         laid_out[name] = Variable(
@@ -110,6 +112,8 @@ def _result_variables(job: Job) -> Iterator[tuple[str, _Sized]]:
     for name, reduce in job.reduce.items():
         if reduce.how == "modes":
             n = len(naming.names(job.model.State))
+            # In two variables, since neither Zarr nor NetCDF has complex numbers that every reader
+            # knows.
             for part in ("real", "imag"):
                 words = {"units": "1/s", "long_name": f"eigenvalues, {part} part, slowest first"}
                 yield f"{name}_{part}", ((("mode", n),), "float64", words)
@@ -255,6 +259,8 @@ class Worker:
     def _impossible(self, columns: dict[str, np.ndarray]) -> np.ndarray:
         """Which elements are no machine that can be, by their parameters alone."""
         count = len(next(iter(columns.values())))
+        # A model of one's own says itself what has to be positive; what a helicopter can be is
+        # known here.
         if not of_helicopter(self.job.model.Params):
             positive = [columns[n] for n in self.job.model.positive if n in columns]
             return np.any([~(v > 0) for v in positive], axis=0) | np.zeros(count, bool)
