@@ -1,5 +1,5 @@
 # make demo   the main job on a bench log that the project makes itself; CONFIG=FILE fits yours
-# make test   all checks
+# make test   all checks; where CI=true without the slowest tests
 # make bench  the benchmarks, side by side in one run
 .PHONY: demo test bench clean
 SHELL := /bin/bash

@@ -128,6 +128,7 @@ def test_check_and_further_intervals(config, run):
     assert set(more.by_parameter["Ixx"]) == {"gaussian", "profile"}
 
 
+@pytest.mark.slow
 def test_models_are_compared(config, run):
     choice = heli_jax.compare_models(run.config, run.problem)
     assert len(choice.candidates) > 1

@@ -100,8 +100,7 @@ def sweep_job(
                 pilot,
             ),
         )
-    # It names its file already, and is a ValueError too: the next clause would put a wrong place
-    # before it.
+    # It is a ValueError too, and names its file already.
     except InputError:
         raise
     except ValueError as e:

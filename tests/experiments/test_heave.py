@@ -41,6 +41,7 @@ def test_nine_parameters_are_recovered_with_throttle(heave):
     assert a.sd < 0.02 * 6.0
 
 
+@pytest.mark.slow
 def test_without_throttle_the_pair_is_named(heave):
     result = heave["identify"](heave["records"](0.002, count=4))
     assert max(abs(e) for e in errors(heave, result).values()) < 4

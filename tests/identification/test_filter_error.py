@@ -78,6 +78,7 @@ def test_white_noise_alone_ends_as_output_error(bench30):
     assert any("output error suffices" in note for note in filtered.notes)
 
 
+@pytest.mark.slow
 def test_damping_of_stand_and_flybar_are_named_together(bench30):
     model, _, start, flight = made(bench30, 0)
     found = fit(Problem(model, start, [flight], {**FREE, "zeta": Free(0.3)}, method="filter-error"))

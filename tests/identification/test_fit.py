@@ -45,6 +45,7 @@ def test_recovers_inertias_of_random_machines(seed, rate, stand):
     assert found.metrics["roll"].vaf > 0.999
 
 
+@pytest.mark.slow
 def test_intervals_cover_on_white_noise():
     # 40 runs here; experiments/coverage.py does the 200 of the requirement.
     amplitude = amplitude_for(BENCH, 0.02, True)

@@ -71,6 +71,7 @@ def test_intervals_that_part_are_told_with_which_to_believe(white):
     assert "NUTS is right if that prior is meant" in said
 
 
+@pytest.mark.slow
 def test_a_prior_is_drawn_anew(white):
     free = {**FREE, "a": Free(5.0, prior=Prior(5.1, 0.3))}
     resting = made(free=free)

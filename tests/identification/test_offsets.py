@@ -43,6 +43,7 @@ def test_an_offset_of_the_stick_does_not_move_the_inertia(share):
     assert e.sd < 0.02 * offset
 
 
+@pytest.mark.slow
 def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
     flights, offsets = zip(
         *(flown(seed, share) for seed, share in ((1, 0.02), (2, -0.03))), strict=True

@@ -24,7 +24,10 @@ def problem(flights=1, **how):
 
 @pytest.mark.parametrize(
     ("continuity", "nuisance"),
-    [(None, Nuisance(bias=False, input_gain=True)), (0.01, Nuisance())],
+    [
+        (None, Nuisance(bias=False, input_gain=True)),
+        pytest.param(0.01, Nuisance(), marks=pytest.mark.slow),
+    ],
 )
 def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     one = problem(2, window=1.0, continuity=continuity, nuisance=nuisance)
@@ -55,6 +58,7 @@ def test_the_jacobian_by_colours_is_the_jacobian(continuity, nuisance):
     assert e.r.size == 2 * (200 + 240) + jumps + 2 + (layout.size - layout.first_nuisance)
 
 
+@pytest.mark.slow
 def test_windows_that_hang_together_are_one_run():
     plain, chained, apart = (
         fit(problem(**how)) for how in ({}, {"window": 1.0, "continuity": 1e-5}, {"window": 1.0})
@@ -75,6 +79,7 @@ def test_windows_that_hang_together_are_one_run():
     assert any("after 2 steps" in n and "tie the windows together" in n for n in stopped.notes)
 
 
+@pytest.mark.slow
 def test_a_flight_held_out_is_cut_as_well():
     one = problem(2, window=1.0)
     held = dataclasses.replace(one.flights[1], hold_out=True, name="held")

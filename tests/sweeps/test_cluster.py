@@ -24,6 +24,7 @@ def pids(client):
 # dask closes a killed worker's pipes late, and Python's collector then warns.
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing(bench30, record):
     pytest.importorskip("distributed")
     from heli_jax.sweeps.cluster import connected

@@ -98,6 +98,7 @@ def test_designs_of_a_configuration(write, tmp_path, capsys):
     assert "4 ok, 2 diverged" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_seed_and_a_function_of_ones_own(write, tmp_path):
     (tmp_path / "my_reducers.py").write_text(
         "import jax.numpy as jnp\n\ndef swing(run):\n"

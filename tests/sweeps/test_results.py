@@ -348,6 +348,7 @@ STILL = Flight(
 AHEAD = Condition(forward_speed=10.0)
 
 
+@pytest.mark.slow
 def test_helicopters_begin_in_a_trim_of_their_own(xcell):
     model, heavy = HELICOPTER, 100.0
     design = paired({"m": [float(xcell.m), 1.2 * float(xcell.m), heavy]})
