@@ -100,8 +100,7 @@ def sweep_job(
                 pilot,
             ),
         )
-    # It is a ValueError too, and names its file already.
-    except InputError:
+    except InputError:  # a ValueError too, which names its file already
         raise
     except ValueError as e:
         outside = str(e).startswith("vehicle:")  # not in the section `sweep`
