@@ -399,6 +399,8 @@ def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys)
     assert capsys.readouterr().err == "heli-jax: interrupted\n"
 
 
+# Slow machines may end the fit before the second interrupt, where the first is lost in a callback.
+@pytest.mark.slow
 def test_interrupt_leaves_nothing_behind(bench):
     out = bench.parent / "run"
     # A shell's background job ignores interrupts, and its children with it, unless told otherwise.

@@ -109,6 +109,7 @@ def flight(noise=2e-3):
 FREE = {"Ixx": Free(0.05), "If": Free(5e-4), "a": Free(4.0)}
 
 
+@pytest.mark.slow
 def test_with_the_paddle_known_if_is_determined_alone():
     shared = check(Problem(models.roll_on_stand, vehicle(BENCH), [flight()], FREE)).verdict
     assert not shared.identifiable

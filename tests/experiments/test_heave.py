@@ -29,6 +29,7 @@ def errors(heave, result):
     }
 
 
+@pytest.mark.slow
 def test_nine_parameters_are_recovered_with_throttle(heave):
     result = heave["identify"](heave["records"](0.03, count=4))
     assert result.status == "converged"
@@ -51,6 +52,7 @@ def test_without_throttle_the_pair_is_named(heave):
     )
 
 
+@pytest.mark.slow
 def test_the_extended_filter_knows_the_machine_in_gusts(heave):
     """At the truth what it has not foreseen is white and as large as it says, and no other lift
     slope makes the record as likely. The experiment has the fit."""

@@ -16,6 +16,7 @@ from tests.identification.test_filter_error import FREE, made
 INERTIAS = {name: FREE[name] for name in ("Ixx", "If")}
 
 
+@pytest.mark.slow
 def test_two_poles_are_seen(bench30):
     model, _, start, flight = made(bench30, 3, poles=2)
     problem = Problem(model, start, [flight], INERTIAS, method="filter-error")

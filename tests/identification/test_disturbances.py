@@ -132,6 +132,7 @@ def test_sizes_and_times_are_recovered_within_their_intervals(whole):
         assert estimate.sd < 0.5 * abs(true)
 
 
+@pytest.mark.slow
 def test_the_table_names_the_one_left_out(whole):
     flight, found = whole
     sets = disturbed_sets(problem(flight), MODEL, ("p", "q"))

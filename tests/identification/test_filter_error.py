@@ -234,6 +234,7 @@ def test_swapped_columns_are_told(bench30):
     assert not any("output error suffices" in n for n in found.notes)
 
 
+@pytest.mark.slow
 def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
     """Two poles: the states of the first sample have sd sigma_w and the correlation 1/sqrt(2)."""
     model, _, start, flight = made(bench30, 0, poles=2)

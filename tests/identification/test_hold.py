@@ -34,6 +34,7 @@ def test_an_unstable_aircraft_with_a_continuous_elevator(held_inputs):
     assert 1.2 < held.estimates["Mq"].value / truth["Mq"] < 1.4
 
 
+@pytest.mark.slow
 def test_a_delay_of_a_part_of_a_sample(held_inputs):
     shift = held_inputs.late_fit(0, "linear").nuisance["time_shift"]
     assert shift.value == pytest.approx(0.017, abs=2e-3)

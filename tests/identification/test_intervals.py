@@ -27,6 +27,7 @@ def white():
     return made()
 
 
+@pytest.mark.slow
 def test_on_white_noise_all_agree(white):
     bayes = importlib.util.find_spec("blackjax") is not None
     found = intervals(white, profiles=list(FREE), runs=200, draws=300 if bayes else 0)
@@ -40,6 +41,7 @@ def test_on_white_noise_all_agree(white):
         assert found.posterior.trusted
 
 
+@pytest.mark.slow
 def test_the_profile_is_the_likelihood_of_the_others_at_their_best(white):
     """A point of the profile is a fit with that parameter held."""
     found = profile(white, ["Ixx"], points=5)["Ixx"]

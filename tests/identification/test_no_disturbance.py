@@ -63,6 +63,7 @@ def test_what_has_no_effect_is_not_known():
     assert np.isinf(deviations(np.full((5, 2), np.nan))).all()
 
 
+@pytest.mark.slow
 def test_a_disturbance_has_ends():
     one = problem(1, 200)
     layout, data = layout_of(one, one.training), data_of(one, one.training)
@@ -79,6 +80,7 @@ def test_a_disturbance_has_ends():
     assert extreme_noise_notes(layout, data, z.at[at - 1].set(0.0)) == []
 
 
+@pytest.mark.slow
 def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
     # The optimiser's word is 'converged', at a point below the model without disturbance.
     model, _, start, flight = made(bench30, 1)

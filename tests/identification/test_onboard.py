@@ -70,6 +70,7 @@ def test_a_servo_and_two_delays_are_recovered():
     assert not any("lacks dynamics" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_servo_that_is_left_out_is_named():
     model = models.with_delays(ROLL.model, ["lat"])
     flight = record(1)

@@ -142,6 +142,7 @@ def problem(bench30, flights, model=None, **more):
     return Problem(model, params, flights, free, **{"method": "filter-error", **more})
 
 
+@pytest.mark.slow
 def test_flights_together_have_the_innovations_of_the_exact_filter_and_their_derivatives(bench30):
     flights = (flight(1), flight(2, 240))
     of = problem(bench30, flights)

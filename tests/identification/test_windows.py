@@ -108,6 +108,7 @@ def test_a_window_as_long_as_the_flight_is_the_flight():
         assert other.estimates[name].value == pytest.approx(found.value, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_gaps_and_a_short_last_window():
     flight = problem().flights[0]
     y = flight.outputs["roll"].copy()

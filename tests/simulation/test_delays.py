@@ -260,6 +260,7 @@ def test_delays_are_found_beside_the_parameters(run, window):
     assert found.estimates["late"].sd < 2e-3
 
 
+@pytest.mark.slow
 def test_a_shift_of_all_inputs_in_windows(run):
     u = sticks(10)
     # The thrust stays at its neutral, so that all that moves is late by 0.1 s more.

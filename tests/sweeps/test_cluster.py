@@ -80,6 +80,7 @@ def test_what_dask_says_ends_in_one_sentence(error, words):
         raise RuntimeError("another")
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(tmp_path, monkeypatch):
     """The experiment that shows it at full size, in small."""
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))

@@ -368,6 +368,7 @@ def test_helicopters_begin_in_a_trim_of_their_own(xcell):
         np.testing.assert_allclose(np.sort(np.abs(mine)), np.sort(np.abs(values)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_pilot_holds_each_element_in_its_own_trim(xcell):
     model = HELICOPTER
     pilot = attitude_hold(model, xcell, trim(model, xcell, AHEAD))

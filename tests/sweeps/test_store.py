@@ -113,6 +113,7 @@ def test_chunks_and_devices_change_no_bit(run, whole, options):
     assert equal(run(None, **options), on_disk)
 
 
+@pytest.mark.slow
 def test_several_devices_change_no_bit(tmp_path):
     """In a process of its own, since the number of devices is fixed when JAX begins."""
     import subprocess
