@@ -29,6 +29,7 @@ from kernels import compiled, pointer
 from scipy.integrate import solve_ivp
 
 from heli_jax import accumulate, load_vehicle, models, simulate, trim
+from heli_jax.dynamics.model import Model
 from heli_jax.naming import asdict, replace
 
 jax.config.update("jax_enable_x64", True)
@@ -60,14 +61,14 @@ class Run(NamedTuple):
     """the sticks of hover with steps of half a second, one stick after another; arrays (N,)"""
 
 
-def hover_and_steps() -> Run:
-    at, k = trim(MODEL, VEHICLE), np.arange(N)
+def hover_and_steps(model: Model = MODEL, stick_steps: dict[str, float] = STICK_STEPS) -> Run:
+    at, k = trim(model, VEHICLE), np.arange(N)
     sign = np.where(k // 100 % 2 == 0, 1.0, -1.0)
     steps = {
         n: jnp.asarray(float(getattr(at.inputs, n)) + size * sign * (k // 25 % 4 == i))
-        for i, (n, size) in enumerate(STICK_STEPS.items())
+        for i, (n, size) in enumerate(stick_steps.items())
     }
-    return Run(jax.tree.map(jnp.asarray, at.state), MODEL.Inputs(**steps))
+    return Run(jax.tree.map(jnp.asarray, at.state), model.Inputs(**steps))
 
 
 def compile_time(f: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
@@ -93,12 +94,12 @@ def in_turn(
 # The batch.
 
 
-def batch(run: Run) -> Callable[[Array], Array]:
+def batch(run: Run, model: Model = MODEL) -> Callable[[Array], Array]:
     """Sum of roll^2 of vehicles that differ in Ixx, in blocks, nothing else kept."""
 
     def vehicle(Ixx: Array) -> Array:
         total, _ = accumulate(
-            MODEL,
+            model,
             replace(VEHICLE, Ixx=Ixx),
             run.inputs,
             lambda total, out, _: total + out.roll**2,
@@ -114,9 +115,12 @@ def batch(run: Run) -> Callable[[Array], Array]:
     return lambda Ixx: jax.lax.map(vehicle, Ixx, batch_size=BLOCK)
 
 
-def in_c(run: Run) -> Callable[[], np.ndarray]:
-    kernel = compiled("helicopter.c")
-    vehicle = np.array([float(getattr(VEHICLE, n)) for n in IN_C])
+def in_c(
+    run: Run, source: str = "helicopter.c", constants: tuple[str, ...] = IN_C
+) -> Callable[[], np.ndarray]:
+    """The same batch in C; `constants` are the vehicle's, in the order of the source's."""
+    kernel = compiled(source)
+    vehicle = np.array([float(getattr(VEHICLE, n)) for n in constants])
     start = np.array([float(v) for v in run.start])
     sticks = np.ascontiguousarray(np.stack([np.asarray(u) for u in run.inputs], axis=1))
     cost, size = np.zeros(VEHICLES), ctypes.c_size_t

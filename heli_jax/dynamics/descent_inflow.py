@@ -19,6 +19,7 @@ and where nothing goes through the rotor (W = -1.63, autorotation) within 4 %.
 import jax
 import jax.numpy as jnp
 
+from heli_jax.dynamics.inflow import axial_velocity
 from heli_jax.naming import Scalar
 
 _STEPS = 7
@@ -77,9 +78,7 @@ def induced_velocity(V2: Scalar, W: Scalar, T0: Scalar, b: Scalar) -> Scalar:
     sign = jnp.where(T0 < 0, -1.0, 1.0).astype(jnp.result_type(T0))
     c, t = sign * W, sign * T0
     # The start of `inflow.induced_velocity`: right in climb and hover, too large in a descent.
-    q = 2.0 * c + b
-    root = jnp.sqrt(q * q + 8.0 * t) + _REST
-    axial = jnp.where(q > 0, 2.0 * t / (jnp.abs(q) + root), 0.25 * (root - q))
+    axial = axial_velocity(c, t, b)
     x = jnp.minimum(axial, t / (2.0 * jnp.sqrt(V2 + _REST**2) + b + _REST))
     low, high = 0.0 * x, t / (b + _REST)
     # The left side grows with v, but bends twice: a step that leaves the bracket halves it instead.

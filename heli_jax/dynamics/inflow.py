@@ -16,6 +16,20 @@ _REST = 1e-8
 """[m/s] of flow that is always there: the square root has a derivative even where nothing moves."""
 
 
+def axial_velocity(c: Scalar, t: Scalar, b: Scalar) -> Scalar:
+    r"""The root $v$ [m/s] of $2 v (c + v) = t - b v$, without airspeed in the plane of the rotor.
+
+    Args:
+        c: airspeed through the rotor, positive in climb [m/s].
+        t: thrust without induced velocity over rho pi R^2, zero or more [m^2/s^2].
+        b: what an induced velocity of 1 m/s takes off it, zero or more [m/s].
+    """
+    q = 2.0 * c + b
+    root = jnp.sqrt(q * q + 8.0 * t) + _REST
+    # Two forms of the same root: each subtracts nearly equal numbers where the other does not.
+    return jnp.where(q > 0, 2.0 * t / (jnp.abs(q) + root), 0.25 * (root - q))
+
+
 @jax.custom_jvp
 def induced_velocity(V2: Scalar, W: Scalar, T0: Scalar, b: Scalar) -> Scalar:
     r"""The root $v_i$ [m/s] of $2 v_i \sqrt{V^2 + (W + v_i)^2} = T_0 - b v_i$.
@@ -37,10 +51,7 @@ def induced_velocity(V2: Scalar, W: Scalar, T0: Scalar, b: Scalar) -> Scalar:
     c, t = sign * W, sign * T0
     # The root lies between 0 and that of V = 0, where the equation is quadratic, and below that of
     # W + v = 0, where it is linear.
-    q = 2.0 * c + b
-    root = jnp.sqrt(q * q + 8.0 * t) + _REST
-    # Two forms of the same root: each subtracts nearly equal numbers where the other does not.
-    axial = jnp.where(q > 0, 2.0 * t / (jnp.abs(q) + root), 0.25 * (root - q))
+    axial = axial_velocity(c, t, b)
     V2 = V2 + _REST**2
     x = jnp.minimum(axial, t / (2.0 * jnp.sqrt(V2) + b))
     # A fixed number of steps, not a loop until convergence: a batch of vehicles takes the same
