@@ -70,6 +70,12 @@ def test_corrections_switch_on_and_off(load):
     assert configuration.resolved(some)["corrections"] == {"tail": True, "drag": False}
 
 
+def test_a_baseline_that_is_switched_off_stays_off(load):
+    # An absent key would switch it on again.
+    assert configuration.resolved(load(rls=None))["rls"] is None
+    assert "rls" in configuration.resolved(load())
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

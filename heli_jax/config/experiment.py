@@ -296,6 +296,9 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     config, path = experiment.config, experiment.path
     # Without what is None: an absent key means the same, and stays right where a default changes.
     content = config.model_dump(mode="json", exclude_none=True)
+    # But the one key whose absence means something else.
+    if config.rls is None:
+        content["rls"] = None
     # A shipped model keeps its name, which means the same on any machine.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}

@@ -97,6 +97,8 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         correlation=disturbed.correlation if poles == 2 or model.correlation else None,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
+        # The pushes are given in a trim, at zero, as positions are.
+        steady_flight=model.steady_flight,
         delays=model.delays,
         delay_lines=model.delay_lines,
         positive=model.positive,

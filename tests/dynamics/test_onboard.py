@@ -344,3 +344,8 @@ def test_an_accelerometer_in_a_body_that_turns():
     omega = np.array([0.5, -1.5, 2.0])
     expected = force + np.cross(turning, at) + np.cross(omega, np.cross(omega, at))
     np.testing.assert_allclose([y.ax, y.ay, y.az], expected, rtol=1e-12)
+
+
+def test_a_helicopter_with_servos_and_gusts_can_be_trimmed():
+    servos = models.with_servos(models.helicopter("consistent"), ["x_roll"])
+    assert with_disturbance(servos, "dphi").steady_flight == servos.steady_flight

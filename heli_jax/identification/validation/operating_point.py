@@ -203,6 +203,7 @@ def _undisturbed(model: Model) -> Model:
         model.Inputs,
         model.Outputs,
         limits=None if limits is None else lambda p, s, u: limits(p, _extended(model, s), u),
+        steady_flight=model.steady_flight,
     )
 
 
