@@ -17,7 +17,7 @@ from heli_jax.config import (
     read_flights,
     signals,
 )
-from heli_jax.dynamics.model import Model, needed_but_missing, zeros
+from heli_jax.dynamics.model import Model, needed_but_missing, require_linear, zeros
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
@@ -72,6 +72,7 @@ def generate(experiment: Experiment) -> Simulated:
     rng = np.random.default_rng(settings.seed)
     n = round(settings.duration * settings.rate)
     drawn = experiment.config.disturbance
+    disturbed(experiment)  # names before numbers: of a state that is none no sigma_w is needed
     if drawn is not None and None in drawn.parameters.values():
         needed = " and ".join(drawn.parameters)
         raise InputError(f"{experiment.path}: disturbance: simulate needs its {needed}")
@@ -170,6 +171,10 @@ def _run(
             f"{experiment.path}: vehicle: {', '.join(missing)} missing, model "
             f"{experiment.model.name} needs {'it' if len(missing) == 1 else 'them'}"
         )
+    try:
+        require_linear(experiment.model, experiment.vehicle.params)
+    except ValueError as e:
+        raise InputError(f"{experiment.path}: {e}") from e
     model, params = disturbed(experiment)
     start, pilot, ends = None, None, {}
     if is_full_nonlinear(experiment.model):

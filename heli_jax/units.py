@@ -211,6 +211,15 @@ def base_of(unit: str) -> dict[str, int]:
     return {si: round(kind[name]) for name, si in _BASE.items() if kind.get(name)}
 
 
+def is_unit(unit: str) -> bool:
+    """Whether a text is a unit of any kind."""
+    try:
+        _parse(unit)
+    except ValueError:
+        return False
+    return True
+
+
 def as_text(exponents: Mapping[str, int]) -> str:
     """The SI unit with these exponents of kg, m, s, rad and A: `kg m^2/s^2`."""
 

@@ -280,6 +280,9 @@ def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
     try:
         scale = units.factor(unit, si) if si is not None else 1.0
     except ValueError as e:
+        # The file's own unit is right, and that of the model is not: no change of the file helps.
+        if si is not None and units.is_unit(unit) and not units.is_unit(si):
+            raise InputError(f"{place}: its unit in the model's Params: {e}") from e
         raise InputError(f"{place}: {e}") from e
     # An integer past 1e308 cannot become a float: OverflowError would be the message.
     value = float(entry) * scale if abs(entry) < 1e300 else math.inf

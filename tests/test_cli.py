@@ -460,6 +460,21 @@ rolling = Model("rolling", field, lambda q, x, u: Outputs(p=x.p), Params, State,
 """
 
 
+def test_a_model_that_is_not_linear_is_not_simulated_as_if_it_were(tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "bent_model.py").write_text(MODEL.replace("q.Lp * x.p", "q.Lp * x.p**2"))
+    config = {
+        "model": "bent_model:rolling",
+        "vehicle": {"Lp": -1.0, "Lda": 1.0},
+        "simulate": {"duration": 2, "rate": 50, "inputs": {}},
+    }
+    path = tmp_path / "bent.yaml"
+    path.write_text(yaml.safe_dump(config))
+    assert main(["simulate", str(path), "--out", str(tmp_path / "bent.csv")]) == 2
+    assert "says linear=True, but its vector field" in capsys.readouterr().err
+    assert not (tmp_path / "bent.csv").exists()
+
+
 def test_a_model_of_ones_own(tmp_path, capsys):
     (tmp_path / "own_roll_model.py").write_text(MODEL)
     rng = np.random.default_rng(0)

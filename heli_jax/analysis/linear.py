@@ -136,8 +136,13 @@ def eigenmodes(
 
 def _motions(model: Model) -> dict[str, str]:
     """The motion that each state belongs to."""
-    motions = dict(_MOTIONS)
-    for axis in axes_of(model):
+    motions, axes = dict(_MOTIONS), axes_of(model)
+    # Along the axes of the body where the rates are about these; alone, w may be anything.
+    if any(axis.rate in ("p", "q", "r") for axis in axes):
+        motions |= {"u": "surge", "v": "sway", "w": "heave"}
+    if any(axis.name == "heave" for axis in axes):
+        motions["nu"] = "inflow"
+    for axis in axes:
         motions |= {n: axis.name for n in (axis.angle, axis.rate) if n is not None}
         motions |= dict.fromkeys(axis.flybar, f"flybar {axis.name}")
         motions |= dict.fromkeys(axis.tilt, f"{axis.name} flapping")

@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from heli_jax import naming
 from heli_jax.config.experiment import Experiment
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free
 
@@ -28,6 +29,14 @@ def first_guesses(
     """
     config, path = experiment.config.fit, experiment.path
     assert config is not None
+    # Before its start is asked for: of what the model does not have there is none.
+    known = naming.names(experiment.model.Params)
+    for name in free:
+        if name not in known:
+            raise InputError(
+                f"{path}: fit.free: model {experiment.model.name} has no parameter {name!r}"
+                f"{nearest(name, known)}"
+            )
     # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
     if config.start.method == "given":
         missing = [n for n, f in free.items() if math.isnan(f.start)]

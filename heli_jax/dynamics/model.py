@@ -15,6 +15,9 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.naming import Record
 
+_LINEAR = 1e-6
+"""relative misfit above which a model is not linear: rounding leaves less"""
+
 
 class Axis(NamedTuple):
     """An axis that a machine turns about, by the names of what a model has of it."""
@@ -267,6 +270,24 @@ def linear_misfit(model: Model, params: Record) -> float:
         size = np.max(np.abs(summed)) + np.max(np.abs(parts))
         # The sum of the parts is compared, so an offset (gravity, say) shows as well as a curve.
         return float(np.max(np.abs(summed - parts)) / max(size, 1e-300))
+
+
+def require_linear(model: Model, params: Record) -> None:
+    """Refuse a model that says it is linear and is not: it would be discretised exactly, and be
+    wrong without any sign of it.
+
+    Args:
+        model: any.
+        params: the model's Params, SI, concrete.
+
+    Raises:
+        ValueError: its vector field or output is not linear in state and inputs there.
+    """
+    if model.linear and linear_misfit(model, params) > _LINEAR:
+        raise ValueError(
+            f"model {model.name} says linear=True, but its vector field or output is not linear in "
+            "state and inputs with these parameters; expected linear=False"
+        )
 
 
 def field_and_output(

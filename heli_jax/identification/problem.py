@@ -12,7 +12,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.disturbance import disturbances_of
-from heli_jax.dynamics.model import Model, linear_misfit, needed_but_missing
+from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
@@ -48,8 +48,6 @@ _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
 _PER_PARAMETER = 3
 """samples of a flight for each free parameter, at least"""
-_LINEAR = 1e-6
-"""relative misfit above which a model is not linear: rounding leaves less"""
 
 MAX_TIME_SHIFT = 0.5
 """Bound on an estimated time shift to either side [s]."""
@@ -351,13 +349,7 @@ def _check_model(problem: Problem) -> None:
             )
     if not problem.model.linear:
         _check_start(problem, params)
-    # At the start values: a model that says linear and is not would be discretised exactly, and be
-    # wrong without any sign of it.
-    if problem.model.linear and linear_misfit(problem.model, params) > _LINEAR:
-        raise ValueError(
-            f"model {problem.model.name} says linear=True, but its vector field or output is not "
-            "linear in state and inputs at the start values"
-        )
+    require_linear(problem.model, params)
 
 
 def _check_start(problem: Problem, params: Any) -> None:

@@ -188,7 +188,7 @@ class Fit:
     def interval(self) -> str:
         """What to call the intervals."""
         if self.coloured:
-            return "95 % (coloured residuals)"
+            return "95 % (autocorrelated residuals)"
         return "95 % (too narrow)" if self.overconfident else "95 % interval"
 
     @property

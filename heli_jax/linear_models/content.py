@@ -258,15 +258,17 @@ def _axis(
 ) -> Axis:
     place = f"axes.{name}"
     given = as_mapping(given, place)
-    _known(given, ("rate", "angle", "stick", "flybar"), place)
+    _known(given, ("rate", "angle", "stick", "flybar", "flapping"), place)
     if "rate" not in given:
         raise InputError(f"{place}.rate: missing, expected a state")
-    flybar = given.get("flybar", [])
-    if not isinstance(flybar, list):
-        raise InputError(f"{place}.flybar: expected a list of states, got {flybar!r:.40}")
     # All names in one list, so that each of them is checked in the same way and told with its
     # place.
-    named = [("rate", given["rate"], states), *(("flybar", one, states) for one in flybar)]
+    named = [("rate", given["rate"], states)]
+    for key in ("flybar", "flapping"):
+        several = given.get(key, [])
+        if not isinstance(several, list):
+            raise InputError(f"{place}.{key}: expected a list of states, got {several!r:.40}")
+        named += [(key, one, states) for one in several]
     named += [
         (key, given[key], known)
         for key, known in (("angle", states), ("stick", inputs))
@@ -281,5 +283,6 @@ def _axis(
         given["rate"],
         given.get("angle"),
         stick=given.get("stick"),
-        flybar=tuple(flybar),
+        flybar=tuple(given.get("flybar", [])),
+        tilt=tuple(given.get("flapping", [])),
     )

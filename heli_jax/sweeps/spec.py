@@ -10,7 +10,7 @@ from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot
 from heli_jax.analysis.trim import Condition, is_full_nonlinear
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads
+from heli_jax.dynamics.model import Model, needed_but_missing, plain, reads, require_linear
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.simulation.options import SimulationOptions
@@ -205,6 +205,7 @@ def job(
     # Asked for now, so that an unknown name is refused before anything is compiled.
     solver_named(solver)
     _check_vehicle(model, params, design, flights)
+    require_linear(model, params)
     trimmed = options.trimmed
     if trimmed is not None and not is_full_nonlinear(trimmed.of or model):
         raise ValueError(

@@ -268,6 +268,10 @@ def test_a_configuration_without_starts_is_fitted(config, capsys):
 def test_wrong_starts_are_said_in_a_sentence(config):
     for override, words in (
         ({"fit.start": "given"}, r"fit\.free\.Lp\.start: missing, expected a number"),
+        (
+            {"fit.free": {"Lpp": {}}},
+            r"fit\.free: model aileron has no parameter 'Lpp'; did you mean 'Lp'",
+        ),
         ({"fit.start": "guess"}, r"fit\.start\.method.*'guess'"),
         ({"fit.start": {"method": "given", "stepwise": True}}, "stepwise: expected method"),
         ({"fit.start.f_remove": 30}, "f_remove: expected at most f_enter"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.signal
 
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
 from heli_jax.dynamics.disturbance import with_disturbance
@@ -193,3 +194,28 @@ def test_headings_on_either_side_of_south_are_one_heading(xcell):
     outputs = {"dx": np.full(N, -8.0), "dy": np.zeros(N), "yaw": psi}
     at = operating_point(models.helicopter("consistent"), xcell, STILL, outputs, DT)
     assert at.words == "the trim at 8 m/s ahead"
+
+
+def test_what_the_windows_sidelobes_bring_is_no_response():
+    """A slow stick and a slower answer: at high frequencies there are sidelobes alone."""
+    rng, n, dt = np.random.default_rng(3), 4000, 0.01
+    sos = scipy.signal.butter(8, 2.2, fs=1 / dt, output="sos")
+    u = scipy.signal.sosfiltfilt(sos, rng.standard_normal(n))
+    y = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
+    found = frequency.empirical(u, y, dt, 0.5)
+    exact = np.abs(0.1 / (1.0 - 0.9 * np.exp(-1j * found.omega * dt)))
+    assert found.omega[-1] < 40.0  # rad/s, of 314
+    np.testing.assert_allclose(np.abs(found.H), exact, rtol=0.15)
+
+
+def test_sidelobes_are_those_of_a_line_between_two_bins():
+    n, at = 256, 20.5
+    window = np.hanning(n + 1)[:-1]
+    phases = np.linspace(0, np.pi, 16, endpoint=False)[:, None]
+    tone = window * np.cos(2 * np.pi * at * np.arange(n) / n + phases)
+    power = np.mean(np.abs(np.fft.rfft(tone)) ** 2, axis=0)
+    line = np.zeros(n // 2 + 1)
+    line[20] = (n / 4) ** 2
+    far = np.arange(30, 110)
+    ratio = frequency.leakage(line)[far] / power[far]
+    assert np.all((ratio > 0.3) & (ratio < 3.0))

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from heli_jax import naming, units
-from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.linear import eigenmodes, linearize
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model, shipped
@@ -295,3 +295,11 @@ def test_si_units_are_made_of_any():
 def test_the_files_are_in_the_package():
     home = Path(__file__).parents[2] / "heli_jax" / "linear_models" / "files"
     assert {p.stem for p in home.iterdir()} == set(shipped())
+
+
+def test_the_modes_of_the_r50_have_the_fields_names():
+    published = linear_model("r50-hover")
+    found = {m.name: m.eigenvalue for m in eigenmodes(published.model, published.vehicle().params)}
+    # The hover oscillation, the regressing rotor and bar of CMU-RI-TR-00-03.
+    assert found["phugoid with roll"] == pytest.approx(0.3061 + 0.0937j, abs=1e-4)
+    assert {"roll flapping with flybar roll", "pitch flapping with flybar pitch"} <= set(found)

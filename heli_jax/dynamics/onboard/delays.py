@@ -98,7 +98,7 @@ def _with_input_delays(model: Model, parameters: tuple[tuple[str, str], ...]) ->
         fields[parameter] = (quantity.annotation, math.nan)
     return dataclasses.replace(
         model,
-        name=f"{model.name}+late",
+        name=f"{model.name}+delays",
         Params=naming.extended(model.Params, f"{model.Params.__name__}Late", fields),
         delays=(*model.delays, *parameters),
         # What is said of free flight is said of the machine with its delay: without this, margins
@@ -134,7 +134,7 @@ def _with_output_delays(model: Model, late: tuple[tuple[str, str], ...], order: 
     # from several starts where one of these is free.
     device = _LateOutputs(model, dict(late), order)
     return device.made(
-        "late-outputs",
+        "output-delays",
         lambda bare: _with_output_delays(bare, late, order),
         delay_lines=(*model.delay_lines, *late),
     )
@@ -219,7 +219,7 @@ def with_delay_line(model: Model, name: str, order: int = ORDER) -> Model:
     # twice.
     rest = tuple((n, parameter) for n, parameter in model.delays if n != name)
     return device.made(
-        "line",
+        "delay-line",
         lambda bare: with_delay_line(bare, name, order),
         delays=rest,
         # A log can be read ahead, for a stick that it has late; a line has the past alone.

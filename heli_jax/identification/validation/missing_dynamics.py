@@ -64,9 +64,9 @@ def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
         if known is None or one.share > known.share:
             found[output, name] = one
     return [
-        f"{name} still explains {one.share:.0%} of the residual of {output}, most of it "
+        f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
         f"{one.lag:.2g} s after it moved: the model lacks dynamics between the two, which its "
-        "estimates then stand for. Is there a servo, a rate loop or a filter (onboard)?"
+        "estimates then stand for. Is a servo, a rate loop or a filter missing (onboard)?"
         for (output, name), one in found.items()
     ]
 
