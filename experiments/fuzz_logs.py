@@ -5,7 +5,8 @@ Every attempt has to end in a flight or in one sentence, within ten seconds. Run
     python experiments/fuzz_logs.py ../shared/data/ulog/sample_log_small.ulg --count 500
 
 It prints how many ended how, the slowest, and the process's largest memory; exit code 1 where one
-ended in a traceback or hung.
+ended in a traceback or hung, or the memory went beyond 1 GB. A long run is made of pieces by
+`--seed` and `--seconds`.
 """
 
 import argparse
@@ -29,6 +30,8 @@ from heli_jax.flights.describe import describe_flights
 
 LONGEST = 10
 """s, for one attempt"""
+MOST = 1000
+"""MB, for all of them"""
 
 
 class Hung(Exception):
@@ -36,11 +39,11 @@ class Hung(Exception):
 
 
 def damaged(data: bytes, count: int, seed: int = 0) -> Iterator[tuple[str, bytes]]:
-    """What was done to the bytes, and the result: `count` truncations, then `count` flips."""
+    """What was done to the bytes, and the result: `count` truncations and as many flips."""
     rng = np.random.default_rng(seed)
+    # In turns, so that a run that is ended early has had both.
     for size in rng.integers(0, len(data), count).tolist():
         yield f"cut at {size}", data[:size]
-    for _ in range(count):
         # A few bytes at a time: a single one mostly hits samples, which nobody can tell.
         flipped = bytearray(data)
         places = rng.integers(0, len(data), int(rng.integers(1, 9))).tolist()
@@ -92,13 +95,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Damage logs and read them.")
     parser.add_argument("logs", nargs="+", type=Path)
     parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=0, help="of where the damage is")
+    parser.add_argument("--seconds", type=float, default=1e9, help="no attempt begins later")
     options = parser.parse_args()
-    failed = False
+    failed, began_all = False, time.monotonic()
     for log in options.logs:
         counts, slowest = collections.Counter(), (0.0, "")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / log.name
-            for words, data in damaged(log.read_bytes(), options.count):
+            for words, data in damaged(log.read_bytes(), options.count, options.seed):
+                if time.monotonic() - began_all > options.seconds:
+                    break
                 path.write_bytes(data)
                 began = time.monotonic()
                 try:
@@ -109,6 +116,7 @@ def main() -> int:
                     print(f"{log.name}, {words}: {type(e).__name__}: {e}"[:400])
                 slowest = max(slowest, (time.monotonic() - began, words))
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        failed |= memory > MOST
         words = ", ".join(f"{n} {what}" for what, n in sorted(counts.items()))
         print(f"{log.name}: {words}; slowest {slowest[0]:.2f} s, {memory:.0f} MB at most")
     return int(failed)

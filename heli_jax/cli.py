@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import interrupts, run_directory
+from heli_jax import interrupts, reading_progress, run_directory
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         options.interrupts = seen
         try:
-            return options.run(options)
+            with reading_progress.on_terminal():
+                return options.run(options)
         except KeyboardInterrupt:
             _say(seen.words())
             return INTERRUPTED
