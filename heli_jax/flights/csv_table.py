@@ -64,7 +64,6 @@ def open_csv(path: Path) -> "CsvTable":
     """
     where = str(path)
     data = read_regular(path, "a log in CSV", _LARGEST)
-    # Meanwhile in a thread of its own: it takes as long as all the rest.
     digest = Digest(data)
     check_text(where, data)
     head = find_header(data)
@@ -114,7 +113,9 @@ class CsvTable:
         """
         self._require(names)
         with progress.reading(self.path, self.size):
-            return self._numbers(names)
+            numbers = self._numbers(names)
+        self._digest.begin()
+        return numbers
 
     def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]

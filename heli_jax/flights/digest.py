@@ -1,10 +1,9 @@
-"""The fingerprint of a file, computed while the file is read."""
+"""The fingerprint of a file, computed beside other work."""
 
 import hashlib
-import os
 import threading
 from collections.abc import Iterator
-from typing import BinaryIO
+from pathlib import Path
 
 _PIECE = 1 << 20
 _AT_ONCE = 1 << 22
@@ -12,28 +11,28 @@ _AT_ONCE = 1 << 22
 
 
 class Digest:
-    """SHA-256 of a file in a thread of its own: of a large one it takes as long as reading it."""
+    """SHA-256 of a file in a thread of its own: of a large one it takes as long as reading it.
 
-    def __init__(self, source: bytes | BinaryIO) -> None:
-        """Begin.
+    It begins when it is told to, or asked for: pyarrow reads with all cores there are.
+    """
+
+    def __init__(self, source: bytes | Path) -> None:
+        """Note what to read.
 
         Args:
-            source: all bytes of the file, or the open file, of which the position stays.
+            source: all bytes of the file, or where it is.
         """
         self._hash = hashlib.sha256()
         self._thread: threading.Thread | None = None
         self._failure: OSError | None = None
-        if isinstance(source, bytes):
-            size, pieces = len(source), _pieces_of(source)
-        else:
-            # A descriptor of its own: the caller closes the file before this has come to its end.
-            descriptor = os.dup(source.fileno())
-            size, pieces = os.fstat(descriptor).st_size, _pieces_read(descriptor)
-        if size < _AT_ONCE:
-            self._run(pieces)
-            return
-        self._thread = threading.Thread(target=self._run, args=(pieces,), daemon=True)
-        self._thread.start()
+        self._is_small = isinstance(source, bytes) and len(source) < _AT_ONCE
+        self._pieces = _pieces_of(source) if isinstance(source, bytes) else _pieces_read(source)
+
+    def begin(self) -> None:
+        """Begin, if it has not, where that is worth a thread."""
+        if self._thread is None and not self._is_small:
+            self._thread = threading.Thread(target=self._run, daemon=True)
+            self._thread.start()
 
     def hex(self) -> str:
         """The fingerprint, once it is there.
@@ -41,15 +40,18 @@ class Digest:
         Raises:
             OSError: the file could not be read to its end.
         """
-        if self._thread is not None:
+        self.begin()
+        if self._thread is None:
+            self._run()
+        else:
             self._thread.join()
         if self._failure is not None:
             raise self._failure
         return self._hash.hexdigest()
 
-    def _run(self, pieces: Iterator[bytes | memoryview]) -> None:
+    def _run(self) -> None:
         try:
-            for piece in pieces:
+            for piece in self._pieces:
                 self._hash.update(piece)
         except OSError as e:
             self._failure = e
@@ -61,12 +63,7 @@ def _pieces_of(data: bytes) -> Iterator[memoryview]:
         yield view[at : at + _PIECE]
 
 
-def _pieces_read(descriptor: int) -> Iterator[bytes]:
-    at = 0
-    try:
-        # At places of its own: the position is shared with the descriptor it was made of.
-        while piece := os.pread(descriptor, _PIECE, at):
+def _pieces_read(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
             yield piece
-            at += len(piece)
-    finally:
-        os.close(descriptor)

@@ -55,8 +55,7 @@ def open_parquet(path: Path) -> "ParquetTable":
         texts = [f.name for f in schema if _is_text(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
-        digest = Digest(opened)
-    return ParquetTable(str(path), size, digest, file)
+    return ParquetTable(str(path), size, Digest(path), file)
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:
@@ -106,7 +105,9 @@ class ParquetTable:
             if not _is_number(kind):
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         data = self._read(sorted(set(names)))
-        return {name: _floats(data.column(name)) for name in names}
+        numbers = {name: _floats(data.column(name)) for name in names}
+        self._digest.begin()
+        return numbers
 
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text."""
