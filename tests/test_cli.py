@@ -454,6 +454,21 @@ def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
     assert [path.name for path in tmp_path.iterdir()] == (["done.csv"] if done else [])
 
 
+def test_an_interrupt_while_the_command_is_imported(tmp_path):
+    """heli_jax/__main__.py listens before it imports anything."""
+    (tmp_path / "argparse.py").write_text("import signal; signal.raise_signal(signal.SIGINT)\n")
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from heli_jax.__main__ import main; sys.exit(main())"
+    )
+    # The folder is the first place that modules are looked for in.
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "--help"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (ended.returncode, ended.stdout) == (130, "")
+    assert ended.stderr == "heli-jax: interrupted; nothing was written\n"
+
+
 def test_interrupts_after_the_end_are_nothing(tmp_path):
     """Python takes a second to take itself down, in which an interrupt would show a traceback."""
     script = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)\n"
