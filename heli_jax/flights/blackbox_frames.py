@@ -16,8 +16,10 @@ from heli_jax.flights.blackbox_header import FrameLayout
 
 LONGEST_FRAME = 256
 """bytes, as firmware's own tools have it: what goes on for longer is damage"""
-_CELLS_AT_ONCE = 1 << 22
-_LONGEST_PIECE = 1 << 18
+_CELLS_AT_ONCE = 1 << 25
+"""numbers of 32 bits that a piece may hold, were each of its bytes a frame"""
+_LONGEST_PIECE = 1 << 20
+"""bytes: what is shorter costs more in calls of NumPy than in decoding"""
 _EVENT = ord("E")
 _END_OF_LOG = b"End of log\0"
 
