@@ -93,6 +93,11 @@ class Interrupts:
 def as_program() -> Iterator[Interrupts]:
     """Interrupts end the process, as long as the command runs; afterwards, while Python takes
     itself down, they are ignored."""
+    # Elsewhere a signal cannot be heard through a pipe.
+    if os.name != "posix":
+        with as_function() as interrupts:
+            yield interrupts
+        return
     interrupts = Interrupts()
     if not _are_pythons_own():
         yield interrupts
