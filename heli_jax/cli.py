@@ -3,23 +3,21 @@
 import argparse
 import contextlib
 import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import run_directory
+from heli_jax import interrupts, reading_progress, run_directory
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
     from heli_jax.identification.result import Fit
 
-# 2 is what argparse ends with, 130 what a shell reports of a program ended by SIGINT (128 + 2).
-DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 4, 130
+# 2 is what argparse ends with.
+DONE, WRONG_INPUT, NOT_DETERMINED, NOT_CONVERGED = 0, 2, 3, 4
+INTERRUPTED = interrupts.INTERRUPTED
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,12 +33,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done; 2 wrong input; 3 the data cannot determine what was asked; 4 the optimiser did not
     converge, or the model explains less than the mean of what was measured; 130 interrupted.
     """
-    options = _parser().parse_args(arguments)
-    with _interrupts() as seen:
+    # With arguments of their own tests and programs call it, which an interrupt must not end.
+    with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
+        options = _parser().parse_args(arguments)
+        options.interrupts = seen
         try:
-            return options.run(options)
+            with reading_progress.on_terminal():
+                return options.run(options)
         except KeyboardInterrupt:
-            _say("interrupted; nothing was written")
+            _say(seen.words())
             return INTERRUPTED
         except BrokenPipeError:
             # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return DONE
         except Exception as e:
             # Whatever it says: an interrupt of which a library has made an error of its own.
-            if seen:
+            if seen.seen:
                 _say("interrupted")
                 return INTERRUPTED
             # Everything else is a fault of ours, and its traceback is what a report of it needs.
@@ -57,28 +58,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             _say(" ".join(str(e).split()))
             return WRONG_INPUT
-
-
-@contextlib.contextmanager
-def _interrupts() -> Iterator[list[int]]:
-    """The interrupts that came, also those that a library on the way makes another error of."""
-    seen: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
-    # Python sets handlers in its main thread alone; elsewhere signal.signal raises.
-    ours = threading.current_thread() is threading.main_thread()
-    if not ours or before is not signal.default_int_handler:
-        yield seen  # another's, or interrupts are ignored
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        seen.append(number)
-        signal.default_int_handler(number, frame)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield seen
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -312,25 +291,27 @@ def _sweep(options: argparse.Namespace) -> int:
     from heli_jax import output, workflow
 
     experiment = workflow.load_config(config, options.set)
-    # Not by `main` like other commands': here there is something to go on with.
-    try:
-        with output.sweep_progress() as progress, _client(options, config) as client:
-            workflow.run_sweep(
-                experiment,
-                out,
-                figures=not options.no_figures,
-                resume=options.resume,
-                # Of GPUs there are as many as there are, so --devices takes the first of them.
-                devices=jax.local_devices()[: options.devices],
-                client=client,
-                memory=_cache() / "lanes.json",
-                progress=progress,
-                say=_say,
-            )
-    except KeyboardInterrupt:
+
+    def interrupted() -> str:
         kept = f"what is finished is kept: --out {out} --resume goes on"
-        _say(f"interrupted; {kept if out.exists() else 'nothing was written'}")
-        return INTERRUPTED
+        return f"interrupted; {kept if out.exists() else 'nothing was written'}"
+
+    options.interrupts.words = interrupted
+    # Processes of a cluster have to be told.
+    options.interrupts.unwinds = bool(options.workers or options.scheduler)
+    with output.sweep_progress() as progress, _client(options, config) as client:
+        workflow.run_sweep(
+            experiment,
+            out,
+            figures=not options.no_figures,
+            resume=options.resume,
+            # Of GPUs there are as many as there are, so --devices takes the first of them.
+            devices=jax.local_devices()[: options.devices],
+            client=client,
+            memory=_cache() / "lanes.json",
+            progress=progress,
+            say=_say,
+        )
     output.print_sweep(out)
     return DONE
 

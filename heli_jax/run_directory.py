@@ -1,16 +1,19 @@
 """Directories and files that appear whole or not at all."""
 
+import contextlib
 import os
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
 from heli_jax.errors import InputError
 from heli_jax.regular_file import in_the_way
+
+# Noted before they are made, so that there is no moment at which an interrupt would leave one.
+_unfinished: set[Path] = set()
+_finished: list[Path] = []
 
 
 def default_directory(config: Path) -> Path:
@@ -40,19 +43,24 @@ def require_free(path: Path, otherwise: str = "") -> None:
         )
 
 
-@contextmanager
+@contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A temporary directory beside `path`, renamed to it at the end, removed where that fails."""
     # Beside it and not in /tmp: a rename is atomic within one file system only.
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.absolute().parent))
+    temporary = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
+    _unfinished.add(temporary)
     try:
+        temporary.mkdir(mode=0o700)
         yield temporary
-        temporary.chmod(0o755)  # mkdtemp makes it for its owner alone
+        temporary.chmod(0o755)  # until now for its owner alone
         os.rename(temporary, path)
+        _finished.append(path)
     except BaseException:  # an interrupt too
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+    finally:
+        _unfinished.discard(temporary)
 
 
 def require_place(path: Path, where: str) -> None:
@@ -66,7 +74,7 @@ def require_place(path: Path, where: str) -> None:
         raise InputError(f"{where}: is {obstacle}, expected a new name or that of a regular file")
 
 
-@contextmanager
+@contextlib.contextmanager
 def whole_file(path: Path, where: str) -> Iterator[Path]:
     """A place beside `path` to write to, which becomes `path` at the end.
 
@@ -76,13 +84,30 @@ def whole_file(path: Path, where: str) -> Iterator[Path]:
     require_place(path, where)
     # With the ending of the file itself, by which writers choose the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    temporary = temporary.absolute()
+    _unfinished.add(temporary)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Made here, so that a pipe or a link that has the name already is not written to.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         temporary.replace(path)
+        _finished.append(path)
     except OSError as e:
         raise InputError(f"{where}: cannot be written ({e.strerror or e})") from e
     finally:
         temporary.unlink(missing_ok=True)
+        _unfinished.discard(temporary)
+
+
+def remove_unfinished() -> None:
+    """Remove what is being written, before the process ends without unwinding."""
+    for temporary in tuple(_unfinished):
+        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def written() -> tuple[Path, ...]:
+    """What this process has written as a whole."""
+    return tuple(_finished)

@@ -4,7 +4,7 @@ import json
 import signal
 import subprocess
 import sys
-import time
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -399,30 +399,96 @@ def test_an_interrupt_is_one_whatever_a_library_makes_of_it(monkeypatch, capsys)
     assert capsys.readouterr().err == "heli-jax: interrupted\n"
 
 
-# Slow machines may end the fit before the second interrupt, where the first is lost in a callback.
+# Each interrupts itself at a moment at which an exception would be lost, printed or late.
+MOMENTS = {
+    "a finaliser": """
+        class Finalised:
+            def __del__(self):
+                signal.raise_signal(signal.SIGINT)
+        Finalised()
+        time.sleep(60)
+    """,
+    "compiled code": """
+        threading.Timer(0.1, signal.raise_signal, [signal.SIGINT]).start()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
+    """,
+    "writing": """
+        with run_directory.whole(pathlib.Path("run")) as folder:
+            (folder / "half").write_text("half")
+            with run_directory.whole_file(pathlib.Path("out.csv"), "out.csv") as part:
+                part.write_text("half")
+                for _ in range(3):
+                    signal.raise_signal(signal.SIGINT)
+    """,
+    "after the work": """
+        with run_directory.whole_file(pathlib.Path("done.csv"), "done.csv") as part:
+            part.write_text("whole")
+        signal.raise_signal(signal.SIGINT)
+    """,
+}
+
+
+def as_program(script, arguments, folder):
+    """A process that runs `main` as the command does, with interrupts as a shell leaves them."""
+    head = (
+        "import hashlib, pathlib, signal, sys, threading, time\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from heli_jax import cli, run_directory\n"
+    )
+    command = [sys.executable, "-c", f"{head}{script}\nsys.exit(cli.main())", *map(str, arguments)]
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_an_interrupt_ends_a_command_at_any_moment(tmp_path, moment):
+    body = textwrap.indent(textwrap.dedent(MOMENTS[moment]), "    ")
+    script = f"def busy(options):\n{body}\ncli._info = busy"
+    process = as_program(script, ["info", "log.csv"], tmp_path)
+    out, err = process.communicate(timeout=30)
+    done = moment == "after the work"
+    words = "wrote done.csv" if done else "nothing was written"
+    assert (out, err) == ("", f"heli-jax: interrupted; {words}\n")
+    assert process.returncode == 130
+    assert [path.name for path in tmp_path.iterdir()] == (["done.csv"] if done else [])
+
+
+def test_an_interrupt_while_the_command_is_imported(tmp_path):
+    """heli_jax/__main__.py listens before it imports anything."""
+    (tmp_path / "argparse.py").write_text("import signal; signal.raise_signal(signal.SIGINT)\n")
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from heli_jax.__main__ import main; sys.exit(main())"
+    )
+    # The folder is the first place that modules are looked for in.
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "--help"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (ended.returncode, ended.stdout) == (130, "")
+    assert ended.stderr == "heli-jax: interrupted; nothing was written\n"
+
+
+def test_interrupts_after_the_end_are_nothing(tmp_path):
+    """Python takes a second to take itself down, in which an interrupt would show a traceback."""
+    script = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)\n"
+    process = as_program(f"{script}cli._info = lambda options: 0", ["info", "log.csv"], tmp_path)
+    assert process.communicate(timeout=30) == ("", "")
+    assert process.returncode == 0
+
+
+# The moments above are those at which it could go wrong; this one waits for the imports of a fit.
 @pytest.mark.slow
 def test_interrupt_leaves_nothing_behind(bench):
     out = bench.parent / "run"
-    # A shell's background job ignores interrupts, and its children with it, unless told otherwise.
-    program = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from heli_jax.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", program, "fit", str(bench), "--out", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    process = as_program("", ["fit", bench, "--out", out, "--set", "fit.starts=2000"], bench.parent)
     assert process.stderr is not None
-    process.stderr.readline()  # it is at work
-    time.sleep(0.5)
-    err = ""
-    for _ in range(20):  # one that comes while a callback runs is lost, as Python documents
+    first = process.stderr.readline()  # it is at work
+    for _ in range(3):
         process.send_signal(signal.SIGINT)
-        try:
-            _, err = process.communicate(timeout=5)
-            break
-        except subprocess.TimeoutExpired:
-            continue
-    assert process.returncode == 130
-    assert "interrupted" in err
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130, first
+    assert err.splitlines()[-1] == "heli-jax: interrupted; nothing was written"
     assert "Traceback" not in err
     assert not out.exists()
     assert not list(bench.parent.glob(".run*"))

@@ -85,6 +85,8 @@ class SensorsConfig(_Strict):
     """What the log's sensors do (`with_sensors`)."""
 
     imu: StrictBool = False
+    angular_acceleration: StrictBool = False
+    airspeed: StrictBool = False
     lowpass: Names = []
     delay: NamesOrPairs = []
     order: Order = ORDER

@@ -1,5 +1,6 @@
 """Disturbances as part of the model: random pushes on derivatives, each with a memory."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
@@ -68,7 +69,24 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
         ValueError: the model has no such axis or state, it cannot be pushed or is named twice, or
             `poles` is neither 1 nor 2.
     """
-    return _with_disturbances(model, (on,) if isinstance(on, str) else tuple(on), poles)
+    on = (on,) if isinstance(on, str) else tuple(on)
+    if model.within is not None:
+        inner, around = model.within
+        # An accelerometer feels the push too, so it is put on what the accelerometer is made of.
+        # What only devices behind the sensors have (a low-pass) is pushed from outside.
+        if set(on) <= {*disturbable(inner), *naming.names(inner.State)}:
+            return _starting_as(model, around(_with_disturbances(inner, on, poles)))
+    return _with_disturbances(model, on, poles)
+
+
+@functools.cache
+def _starting_as(model: Model, disturbed: Model) -> Model:
+    """The disturbed model, begun where the model is: an initial state may have been set on it."""
+
+    def start(p: Record) -> Record:
+        return naming.replace(disturbed.initial_state(p), **naming.asdict(model.initial_state(p)))
+
+    return dataclasses.replace(disturbed, start=start)
 
 
 # Cached: a model is static to jit, and a second one of the same kind would be compiled again.

@@ -109,6 +109,9 @@ class Model(eqx.Module):
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
     """of a machine on a stand, the same machine in free flight"""
+    within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
+    """of a model with sensors that show derivatives (`with_motion_sensors`), the model within, and
+    what puts its devices around another one"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())

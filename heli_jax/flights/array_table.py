@@ -106,6 +106,8 @@ def open_mat(path: Path) -> ArrayTable:
         whole = mat_file.read_arrays(data)
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
+    except mat_file.LargeMatFile as e:
+        raise wrong(str(path), str(e)) from e
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     arrays = {n: part for name, array in whole.items() for n, part in _vectors(name, array)}
@@ -186,14 +188,19 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
     def read() -> tuple[dict[str, np.ndarray], dict[str, str]]:
         arrays: dict[str, np.ndarray] = {}
         units: dict[str, str] = {}
-        cells = 0
+        cells, claimed = 0, 0
 
         # Any: h5py's classes cannot be named where it is not installed.
         def visit(name: str, item: Any) -> None:
-            nonlocal cells
+            nonlocal cells, claimed
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim <= 2:
                 cells += int(item.size or 0)  # an empty dataset has none
                 _require_few_cells(path, cells)
+                claimed += int(item.size or 0) * item.dtype.itemsize
+                try:
+                    mat_file.require_few_bytes(claimed, len(data))
+                except mat_file.LargeMatFile as e:
+                    raise wrong(str(path), str(e)) from e
                 # A structure's path is as `open_mat` gives it for older versions, so that a
                 # configuration does not depend on the version in which a file was saved.
                 dotted = name.replace("/", ".") if kind == "mat 7.3" else name

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights import progress
 from heli_jax.flights.blackbox_frames import Frames, find_frames
 from heli_jax.flights.blackbox_header import HOME, MARK, FrameLayout, Header, read_header
 from heli_jax.flights.blackbox_predictors import MainFrames, main_frames, other_frames
@@ -43,6 +44,7 @@ def open_blackbox(path: Path) -> tuple[ChannelLog, ...]:
     flights: list[ChannelLog] = []
     problems: list[InputError] = []
     for i, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)], strict=True)):
+        progress.advance(start)
         try:
             log = _flight(str(path), data[start:end], sha256, len(data), (i + 1, len(starts)))
         except InputError as e:

@@ -1,8 +1,9 @@
 """How a blackbox packs the fields of a frame into bytes, undone for many frames at once.
 
 Every decoder takes the bytes of the log (B,) uint8 and the positions (M,) where M groups of fields
-begin, and returns their values, int64 (M, k), and the positions (M,) behind them. A position beyond
-the end reads the last byte: the caller compares the positions behind with the size.
+begin, and returns their values, int32 (M, k), and the positions (M,) behind them. Numbers without a
+sign are the same bits: half the memory, which is what decoding waits for. A position beyond the end
+reads the last byte: the caller compares the positions behind with the size.
 
 Source: the field encodings as documented in 'Blackbox logging internals' of Cleanflight, data
 version 2.
@@ -23,36 +24,60 @@ LARGEST_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
 
 def unsigned_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
     """Numbers of seven bits a byte, the lowest first; the top bit says that more follow."""
-    # The sum makes a new array: the caller still needs the positions at which the groups begin.
-    byte = _bytes(data, at)
-    values, at = byte & 127, at + 1
-    more = np.flatnonzero(byte & 128)
-    # Only the numbers that go on are looked at again. Most end with their first byte, since what is
-    # logged are small differences from a prediction.
-    for shift in (7, 14, 21, 28):
-        if not more.size:
-            break
-        byte = _bytes(data, at[more])
-        values[more] |= (byte & 127) << shift
-        at[more] += 1
-        more = more[(byte & 128) != 0]
-    # 32 bits end with the fifth byte: a number that goes on is damage, which the firmware's own
-    # tools read as zero.
-    values[more] = 0
-    # Five groups of seven bits are 35, of which a number of the firmware has the lowest 32.
-    return (values & 0xFFFFFFFF)[:, None], at
+    return _variable(data, at, _SEVEN_BITS)
 
 
 def signed_vb(data: np.ndarray, at: np.ndarray) -> Decoded:
     """Zigzag: 0, -1, 1, -2, ... stand as 0, 1, 2, 3, ..."""
-    values, at = unsigned_vb(data, at)
-    return (values >> 1) ^ -(values & 1), at
+    return _variable(data, at, _ZIGZAG)
+
+
+def _variable(data: np.ndarray, at: np.ndarray, of_one_byte: np.ndarray) -> Decoded:
+    """Numbers of a variable length; `of_one_byte` are those of a single byte, by the byte."""
+    first = data.take(at, mode="clip")
+    # Most end with their first byte, since what is logged are small differences from a prediction:
+    # a table has these, and only the numbers that go on are looked at again.
+    values = of_one_byte.take(first)
+    # The sum makes a new array: the caller still needs the positions at which the groups begin.
+    after = at + 1
+    long = np.flatnonzero(first & 128)
+    if long.size:
+        numbers, after[long] = _long_numbers(data, at[long])
+        values[long] = _unfolded(numbers) if of_one_byte is _ZIGZAG else numbers.view(np.int32)
+    return values[:, None], after
+
+
+def _long_numbers(data: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (M,) uint32 of two bytes and more, and the positions behind them."""
+    values, at = _bytes(data, at) & 127, at + 1
+    more = np.arange(at.size)
+    for shift in (7, 14, 21, 28):
+        byte = _bytes(data, at[more])
+        # Five groups of seven bits are 35, of which a number of the firmware has the lowest 32: the
+        # others are shifted out.
+        values[more] |= (byte & 127) << shift
+        at[more] += 1
+        more = more[(byte & 128) != 0]
+        if not more.size:
+            break
+    # 32 bits end with the fifth byte: a number that goes on is damage, which the firmware's own
+    # tools read as zero.
+    values[more] = 0
+    return values, at
+
+
+def _unfolded(numbers: np.ndarray) -> np.ndarray:
+    return ((numbers >> 1) ^ -(numbers & 1)).view(np.int32)
+
+
+_SEVEN_BITS = (np.arange(256, dtype=np.uint32) & 127).view(np.int32)
+_ZIGZAG = _unfolded(np.arange(256, dtype=np.uint32) & 127)
 
 
 def negative_14_bit(data: np.ndarray, at: np.ndarray) -> Decoded:
     """The negative of a number of 14 bits, as a falling battery voltage is kept."""
     values, at = unsigned_vb(data, at)
-    return -_signed(values, 14), at
+    return -_signed(values.view(np.uint32), 14), at
 
 
 def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
@@ -67,7 +92,7 @@ def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
     if count == 1:
         return signed_vb(data, at)
     tag, at = _bytes(data, at), at + 1
-    values = np.zeros((at.size, count), np.int64)
+    values = np.zeros((at.size, count), np.int32)
     for k in range(count):
         present = np.flatnonzero((tag >> k) & 1)
         if present.size:
@@ -79,7 +104,7 @@ def tag8_8svb(data: np.ndarray, at: np.ndarray, count: int) -> Decoded:
 def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
     """Four fields of 0, 4, 8 or 16 bits in a row of nibbles, as two bits each of a byte say."""
     tag, start = _bytes(data, at), at + 1
-    values = np.zeros((at.size, 4), np.int64)
+    values = np.zeros((at.size, 4), np.int32)
     nibble = np.zeros(at.size, np.int64)
     for k in range(4):
         size = (tag >> (2 * k)) & 3
@@ -91,7 +116,8 @@ def tag8_4s16(data: np.ndarray, at: np.ndarray) -> Decoded:
             # A field may begin in the middle of a byte: three bytes always hold it.
             first = start[i] + (nibble[i] >> 1)
             three = _joined(data, first, 3)
-            values[i, k] = _signed(three >> (24 - 4 * (nibble[i] & 1) - bits), bits)
+            shift = (24 - 4 * (nibble[i] & 1) - bits).astype(np.uint32)
+            values[i, k] = _signed(three >> shift, bits)
             nibble[i] += bits // 4
     # The next field begins with a whole byte: half a byte that is left over stays empty.
     return values, start + ((nibble + 1) >> 1)
@@ -117,10 +143,10 @@ def _three(
     data: np.ndarray, at: np.ndarray, layouts: tuple[tuple[tuple[int, int], ...], ...]
 ) -> Decoded:
     lead = _bytes(data, at)
-    values = np.zeros((at.size, 3), np.int64)
+    values = np.zeros((at.size, 3), np.int32)
     kind = lead >> 6
     # Of kind 3 only the first byte is sure; the lengths that stand in it are added field by field.
-    after = at + 1 + np.where(kind < 3, kind, 0)
+    after = at + 1 + np.where(kind < 3, kind, 0).astype(np.int64)
     for code, layout in enumerate(layouts):
         i = np.flatnonzero(kind == code)
         if i.size:
@@ -142,7 +168,7 @@ def _whole_bytes(
         for code in range(4):
             j = i[size == code]
             if j.size:
-                number = np.zeros(j.size, np.int64)
+                number = np.zeros(j.size, np.uint32)
                 for n in range(code + 1):
                     number |= _bytes(data, after[j] + n) << (8 * n)
                 values[j, k] = _signed(number, 8 * (code + 1))
@@ -150,9 +176,9 @@ def _whole_bytes(
 
 
 def _bytes(data: np.ndarray, at: np.ndarray) -> np.ndarray:
-    # Clipped, because most positions are guesses that may lie beyond the end of the file. Eight
+    # Clipped, because most positions are guesses that may lie beyond the end of the file. Four
     # bytes wide, because shifted bytes of uint8 would overflow.
-    return data.take(at, mode="clip").astype(np.int64)
+    return data.take(at, mode="clip").astype(np.uint32)
 
 
 def _joined(data: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
@@ -168,12 +194,12 @@ def _signed(number: np.ndarray, bits: int) -> np.ndarray:
     # Half the range is added before the mask and taken off behind it. That needs no branch, so that
     # it does for whole arrays what a comparison does for one number.
     half = 1 << (bits - 1)
-    return ((number + half) & ((1 << bits) - 1)) - half
+    return (((number + half) & ((1 << bits) - 1)) - half).view(np.int32)
 
 
 def _nothing(data: np.ndarray, at: np.ndarray) -> Decoded:
     # Such a field takes no byte of the frame: its prediction is its value.
-    return np.zeros((at.size, 1), np.int64), at
+    return np.zeros((at.size, 1), np.int32), at
 
 
 _ALONE: dict[int, Callable[[np.ndarray, np.ndarray], Decoded]] = {
@@ -197,7 +223,7 @@ def decode(data: np.ndarray, at: np.ndarray, encodings: tuple[int, ...]) -> Deco
         at: positions (M,) of the frames' first fields.
         encodings: of the F fields, each one of `KNOWN`.
     """
-    values = np.empty((at.size, len(encodings)), np.int64)
+    values = np.empty((at.size, len(encodings)), np.int32)
     field = 0
     while field < len(encodings):
         encoding = encodings[field]

@@ -16,8 +16,10 @@ from heli_jax.flights.blackbox_header import FrameLayout
 
 LONGEST_FRAME = 256
 """bytes, as firmware's own tools have it: what goes on for longer is damage"""
-_CELLS_AT_ONCE = 1 << 22
-_LONGEST_PIECE = 1 << 18
+_CELLS_AT_ONCE = 1 << 25
+"""numbers of 32 bits that a piece may hold, were each of its bytes a frame"""
+_LONGEST_PIECE = 1 << 20
+"""bytes: what is shorter costs more in calls of NumPy than in decoding"""
 _EVENT = ord("E")
 _END_OF_LOG = b"End of log\0"
 
@@ -30,7 +32,7 @@ _ADJUSTMENT, _RESUME, _CUSTOM, _END = 13, 14, (100, 101), 255
 class Frames:
     """The frames of one flight, by kind in the order of the file.
 
-    `rows` (M, F) int64 by letter are the numbers as written, before any prediction; `starts` (M,)
+    `rows` (M, F) int32 by letter are the numbers as written, before any prediction; `starts` (M,)
     where each frame begins [bytes]. `damage` (D,) are the places where something was no frame,
     `resumes` where the firmware says that it went on after a pause, `end` says that it closed the
     log.
@@ -71,7 +73,7 @@ class _Walk:
         self.is_letter = np.zeros(256, bool)
         self.is_letter[[*map(ord, layouts), _EVENT]] = True
         # A piece is as long as the numbers of all its candidates fit in memory: any byte may be
-        # one, each with as many int64 as the widest frame has fields.
+        # one, each with as many numbers as the widest frame has fields.
         widest = max(len(layout.names) for layout in layouts.values())
         self.piece = max(1024, min(_LONGEST_PIECE, _CELLS_AT_ONCE // widest))
         self.frames = Frames({}, {})
@@ -82,7 +84,7 @@ class _Walk:
         while self.at < self.size and not self.frames.end:
             self._walk_piece(self.at, min(self.at + self.piece, self.size))
         for letter, layout in self.layouts.items():
-            none = np.zeros((0, len(layout.names)), np.int64)
+            none = np.zeros((0, len(layout.names)), np.int32)
             pieces = self.kept[letter]
             self.frames.rows[letter] = np.concatenate([none, *(p.values for p in pieces)])
             self.frames.starts[letter] = np.concatenate(
@@ -93,17 +95,16 @@ class _Walk:
     def _walk_piece(self, first: int, last: int) -> None:
         """Walk from `self.at` to the first frame that begins at `last` or behind it."""
         candidates = {letter: self._candidates(letter, first, last) for letter in self.layouts}
-        # One array serves all kinds of frames, since a byte is the letter of one kind at most. No
-        # frame ends at zero, so zero says that there is none.
-        ends = np.zeros(last - first, np.int64)
+        # One table serves all kinds of frames, since a byte is the letter of one kind at most.
+        # Python's own, whose single elements are read several times as fast as those of an array,
+        # and the walk does nothing else.
+        next_end: dict[int, int] = {}
         for each in candidates.values():
-            ends[each.starts - first] = each.ends
-        begins = first + np.flatnonzero(ends)
-        # A list, since Python reads single elements of it several times as fast as those of an
-        # array, and the walk does nothing else.
-        next_end, visited = ends.tolist(), []
+            next_end |= zip(each.starts.tolist(), each.ends.tolist(), strict=True)
+        begins: np.ndarray | None = None
+        visited: list[int] = []
         while self.at < last and not self.frames.end:
-            end = next_end[self.at - first]
+            end = next_end.get(self.at, 0)
             if end:
                 visited.append(self.at)
             # Events are decoded one by one on the way: they are rare, and each type has another
@@ -116,12 +117,16 @@ class _Walk:
             self._note_damage()
             # On at the next candidate and not at the next letter: a letter that stands in numbers
             # by chance seldom leads to another one.
+            if begins is None:
+                begins = np.sort(np.fromiter(next_end, np.int64, len(next_end)))
             i = int(np.searchsorted(begins, self.at, side="right"))
             self.at = int(begins[i]) if i < begins.size else last
         # A letter within another frame's numbers is a candidate too. Only those that the walk came
         # upon from the end of a frame are frames.
+        is_frame = np.zeros(last - first, bool)
+        is_frame[np.asarray(visited, np.int64) - first] = True
         for letter, each in candidates.items():
-            i = np.flatnonzero(np.isin(each.starts, visited, assume_unique=True))
+            i = np.flatnonzero(is_frame[each.starts - first])
             self.kept[letter].append(_Candidates(each.starts[i], each.ends[i], each.values[i]))
 
     def _candidates(self, letter: str, first: int, last: int) -> _Candidates:

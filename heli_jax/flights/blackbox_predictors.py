@@ -4,7 +4,8 @@ An I frame stands alone; each P frame holds differences from what the frames bef
 So a run is an I frame with the P frames up to the next, and runs do not depend on each other: the
 k-th frames of all runs are computed at once.
 
-All arithmetic is that of the firmware: 32 bits that overflow silently, division towards zero.
+All arithmetic is that of the firmware: 32 bits that overflow silently, division towards zero. A
+field without a sign has the same bits.
 """
 
 from dataclasses import dataclass
@@ -38,9 +39,13 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
     # file, so the two kinds are merged by their positions.
     starts = np.concatenate([frames.starts["I"], frames.starts["P"]])
     order = np.argsort(starts, kind="stable")
-    is_first = (np.arange(starts.size) < frames.starts["I"].size)[order]
-    starts = starts[order]
-    values = np.concatenate([frames.rows["I"], frames.rows["P"]])[order]
+    place = np.empty_like(order)
+    place[order] = np.arange(order.size)
+    count = frames.starts["I"].size
+    starts, is_first = starts[order], (order < count)
+    # Each kind straight to its places: a copy of all numbers less.
+    values = np.empty((starts.size, len(layout.names)), np.int32)
+    values[place[:count]], values[place[count:]] = frames.rows["I"], frames.rows["P"]
     first, length = _runs(starts, is_first, np.asarray(frames.damage, np.int64))
     _predict_first(values, first, layout, head)
     for k in range(1, int(length.max(initial=0))):
@@ -51,8 +56,12 @@ def main_frames(frames: Frames, head: Header) -> MainFrames:
         before = values[rows - 1]
         earlier = values[rows - 2] if k > 1 else before
         values[rows] = _predicted(values[rows], before, earlier, head)
-    keep, times = _plausible(values[:, layout.names.index("time")], first, length, frames, starts)
-    return MainFrames(values[keep].astype(np.int32), times, starts[keep], starts.size - keep.size)
+    stamps = values[:, layout.names.index("time")].view(np.uint32).astype(np.int64)
+    keep, times = _plausible(stamps, first, length, frames, starts)
+    dropped = starts.size - keep.size
+    if not dropped:
+        return MainFrames(values, times, starts, 0)
+    return MainFrames(values[keep], times, starts[keep], dropped)
 
 
 def _runs(
@@ -78,11 +87,10 @@ def _predict_first(values: np.ndarray, rows: np.ndarray, layout: FrameLayout, he
     for column, predictor in enumerate(layout.predictors):
         constant = _constant(predictor, head)
         if constant:
-            values[rows, column] += constant
+            values[rows, column] += np.int64(constant).astype(np.int32)
     # Behind the constants: the first motor is itself a difference from one, and has to be whole
     # before the others are made of it.
     _add_motor(values, rows, layout.predictors, layout)
-    values[rows] = _wrapped(values[rows], layout)
 
 
 def _constant(predictor: int, head: Header) -> int:
@@ -119,16 +127,27 @@ def _predicted(
     mean = np.flatnonzero(predictors == header.AVERAGE)
     rows[:, previous] += before[:, previous]
     rows[:, line] += 2 * before[:, line] - earlier[:, line]
-    both = before[:, mean] + earlier[:, mean]
+    both = _as_numbers(before, layout, mean) + _as_numbers(earlier, layout, mean)
     # Division in C goes towards zero, NumPy's towards minus infinity: odd negative sums would be
     # off by one, and each frame would hand the error on to the next.
-    rows[:, mean] += np.sign(both) * (np.abs(both) // 2)
+    rows[:, mean] += (np.sign(both) * (np.abs(both) // 2)).astype(np.int32)
     for column in np.flatnonzero(predictors == header.INCREMENT):
-        rows[:, column] += _next_iteration(before[:, column], head)
+        iteration = before[:, column].view(np.uint32).astype(np.int64)
+        rows[:, column] += _next_iteration(iteration, head).astype(np.int32)
     for column, predictor in enumerate(layout.predictors):
-        rows[:, column] += _constant(predictor, head)
+        constant = _constant(predictor, head)
+        if constant:
+            rows[:, column] += np.int64(constant).astype(np.int32)
     _add_motor(rows, np.arange(len(rows)), layout.predictors, layout)
-    return _wrapped(rows, layout)
+    return rows
+
+
+def _as_numbers(values: np.ndarray, layout: FrameLayout, columns: np.ndarray) -> np.ndarray:
+    """Some columns (R, K) as int64, in which those without a sign are positive."""
+    numbers = values[:, columns].astype(np.int64)
+    positive = ~np.asarray(layout.signed)[columns]
+    numbers[:, positive] &= 0xFFFFFFFF
+    return numbers
 
 
 def _next_iteration(before: np.ndarray, head: Header) -> np.ndarray:
@@ -219,7 +238,7 @@ def other_frames(
         main: the frames of the control loop, of which the last one's time may be a prediction.
         home: by G frame, the home position (M, 2) in the log's unit; None where it has none.
     """
-    layout, values = head.layouts[letter], frames.rows[letter].copy()
+    layout, values = head.layouts[letter], frames.rows[letter].astype(np.int64)
     coordinate = 0
     last = np.searchsorted(main.starts, frames.starts[letter]) - 1
     for column, predictor in enumerate(layout.predictors):

@@ -4,7 +4,6 @@ pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes
 takes the fast way, and `Body.records` walks the text again to say where an error is.
 """
 
-import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,17 +11,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from heli_jax.flights import progress
+from heli_jax.flights.csv_arrow import floats, likely_numbers, number_columns, text_columns
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
-    decode,
+    check_text,
     find_delimiter,
     find_header,
+    first_row,
     header_names,
     is_of_blanks,
     require_short_lines,
     tabs_for_blanks,
+    with_line_feeds,
 )
+from heli_jax.flights.digest import Digest
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -31,7 +35,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.regular_file import read_regular
+from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
 # flights made in Python need not wait for.
@@ -44,8 +48,10 @@ _NUMBER = re.compile(
     r"|[+-]?(?:nan|inf|infinity)",
     re.IGNORECASE,
 )
-_LARGEST = 10**9
-"""bytes: a log in text is read as a whole, and takes about ten times its size meanwhile"""
+_LARGEST = 16 * 10**9
+"""bytes: the file is held in memory, and the columns that are asked for"""
+_LARGEST_TEXT = 2 * 10**9
+"""bytes of cells that are looked at as text, in which they take many times as much"""
 _CELLS_AT_ONCE = 1 << 16
 
 
@@ -56,34 +62,32 @@ def open_csv(path: Path) -> "CsvTable":
         InputError: it is no UTF-8 text, or holds no header or no rows.
         OSError: it cannot be read.
     """
-    data = read_regular(path, "a log in CSV (convert larger ones to Parquet)", _LARGEST)
-    text = decode(str(path), data)
-    start, line = find_header(text)
-    if start is None:
-        raise wrong(str(path), "holds no header, expected names of columns and rows of numbers")
-    # Found, not split: a list of all lines takes many times the text's memory.
-    end = text.find("\n", start)
-    end = len(text) if end < 0 else end
-    body = text[end + 1 :]
-    if not body.strip():
-        raise wrong(str(path), "holds a header alone, expected rows of numbers", f"line {line}")
-    header = text[start:end]
+    where = str(path)
+    data = read_regular(path, "a log in CSV", _LARGEST)
+    digest = Digest(data)
+    check_text(where, data)
+    head = find_header(data)
+    if head is None:
+        raise wrong(where, "holds no header, expected names of columns and rows of numbers")
+    header, line = head.text, f"line {head.number}"
+    first = first_row(data, head.after)
+    if first is None:
+        raise wrong(where, "holds a header alone, expected rows of numbers", line)
     if len(header) > LONGEST_HEADER:
-        raise wrong(str(path), "is longer than a line of a log can be", f"line {line}")
-    require_short_lines(str(path), body, line + 1)
-    first = body.lstrip("\n").split("\n", 1)[0]
+        raise wrong(where, "is longer than a line of a log can be", line)
+    require_short_lines(where, data, head.after, head.number + 1)
     delimiter = find_delimiter(header, first)
+    rows = memoryview(data)[head.after :]
     if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
-        header, body, delimiter = tabs_for_blanks(header), tabs_for_blanks(body), "\t"
+        text = with_line_feeds(str(rows, "utf-8"))
+        header, delimiter = tabs_for_blanks(header), "\t"
+        rows = memoryview(tabs_for_blanks(text).encode())
     # Counted before the names are parsed, so that a line of commas makes no million names.
-    require_few_columns(str(path), header.count(delimiter) + 1, f"line {line}")
-    names = header_names(str(path), header, delimiter, line)
-    return CsvTable(
-        size=len(data),
-        sha256=hashlib.sha256(data).hexdigest(),
-        names=names,
-        body=Body(str(path), body, delimiter, line + 1),
-    )
+    require_few_columns(where, header.count(delimiter) + 1, line)
+    names = header_names(where, header, delimiter, head.number)
+    has_quotes = data.find(b'"', head.after) >= 0
+    body = Body(where, rows, delimiter, head.number + 1, has_quotes)
+    return CsvTable(len(data), digest, names, body)
 
 
 class CsvTable:
@@ -91,9 +95,14 @@ class CsvTable:
 
     format = "csv"
 
-    def __init__(self, *, size: int, sha256: str, names: tuple[str, ...], body: Body) -> None:
-        self.path, self.size, self.sha256, self.names = body.path, size, sha256, names
-        self._body = body
+    def __init__(self, size: int, digest: Digest, names: tuple[str, ...], body: Body) -> None:
+        self.path, self.size, self.names = body.path, size, names
+        self._digest, self._body = digest, body
+
+    @property
+    def sha256(self) -> str:
+        """Of the file."""
+        return self._digest.hex()
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -103,7 +112,16 @@ class CsvTable:
                 the header, a cell is no number.
         """
         self._require(names)
+        with progress.reading(self.path, self.size):
+            numbers = self._numbers(names)
+        self._digest.begin()
+        return numbers
+
+    def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]
+        numbers = number_columns(self._body, len(self.names), indices)
+        if numbers is not None:
+            return {n: numbers[i].values for n, i in zip(names, indices, strict=True)}
         try:
             texts = _decimal_points(self._texts(indices), self._body.delimiter)
         except _TwoDecimalSigns as e:
@@ -119,16 +137,28 @@ class CsvTable:
 
     def survey(self) -> list[Survey]:
         """Every column, in the file's order."""
-        result = []
-        for name, text in zip(self.names, self._texts(range(len(self.names))), strict=True):
-            try:
-                values = _floats(_decimal_points([text], self._body.delimiter)[0])
-            # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
-            except _TwoDecimalSigns:
-                values = 0
-            filled = len(text) - _filled(text).null_count
-            result.append(Survey(name, None if isinstance(values, int) else values, filled))
-        return result
+        with progress.reading(self.path, self.size):
+            return self._survey()
+
+    def _survey(self) -> list[Survey]:
+        width = len(self.names)
+        likely = likely_numbers(self._body, width)
+        plain = number_columns(self._body, width, likely) or {}
+        rest = [i for i in range(width) if i not in plain]
+        found = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
+        if rest:
+            texts = zip(rest, self._texts(rest), strict=True)
+            found |= {i: self._surveyed(self.names[i], text) for i, text in texts}
+        return [found[i] for i in range(width)]
+
+    def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
+        try:
+            values = _floats(_decimal_points([text], self._body.delimiter)[0])
+        # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
+        except _TwoDecimalSigns:
+            values = 0
+        filled = len(text) - _filled(text).null_count
+        return Survey(name, None if isinstance(values, int) else values, filled)
 
     def place(self, row: int) -> str:
         """`line 12`, counted from the top of the file, comments and blank lines included."""
@@ -172,50 +202,20 @@ class CsvTable:
 
     def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """The cells of some columns as pyarrow string arrays (N,)."""
-        # pyarrow takes a line break within quotes for one within a cell or for the end of a row, by
-        # an option; either way the lines that it counts are not those of the file.
-        texts = None if '"' in self._body.text else self._texts_by_pyarrow(indices)
+        size = len(self._body.data)
+        if size > _LARGEST_TEXT:
+            problem = (
+                "has quotes, a row of other than the header's number of cells, or a cell that is "
+                f"no plain number, which is looked at in files of at most "
+                f"{size_words(_LARGEST_TEXT)}, got {size_words(size)}"
+            )
+            raise wrong(self.path, problem)
+        texts = text_columns(self._body, len(self.names), indices)
         if texts is None:
             texts = self._texts_row_by_row(indices)
         if texts and not len(texts[0]):
             raise wrong(self.path, "holds a header alone, expected rows of numbers")
         return texts
-
-    def _texts_by_pyarrow(self, indices: Sequence[int]) -> list["pa.ChunkedArray"] | None:
-        """As `_texts`; None where pyarrow finds anything wrong."""
-        import pyarrow as pa
-        from pyarrow import csv as arrow_csv
-
-        # By number, since two columns may have one name. As text, since pyarrow's own guess
-        # knows no decimal comma, and gives up a column of numbers for one bad cell.
-        names = [str(i) for i in range(len(self.names))]
-        columns = [names[i] for i in indices]
-        ragged: list[Any] = []
-
-        # Called for each row with other than the header's number of cells: so for blank lines too,
-        # which are no error. That there is any other is enough: `Body.records` finds its line.
-        def skip(row: Any) -> str:
-            if not self._body.is_blank(row.text):
-                ragged.append(row)
-            return "skip"
-
-        try:
-            table = arrow_csv.read_csv(
-                pa.BufferReader(self._body.text.encode()),
-                read_options=arrow_csv.ReadOptions(column_names=names),
-                parse_options=arrow_csv.ParseOptions(
-                    delimiter=self._body.delimiter,
-                    quote_char=False,
-                    double_quote=False,
-                    invalid_row_handler=skip,
-                ),
-                convert_options=arrow_csv.ConvertOptions(
-                    column_types=dict.fromkeys(columns, pa.string()), include_columns=columns
-                ),
-            )
-        except pa.ArrowException:  # such as a line longer than a block
-            return None
-        return None if ragged else [table.column(name) for name in columns]
 
     def _texts_row_by_row(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """As `_texts`; cells are packed as they come: as objects of Python they take many times
@@ -309,21 +309,7 @@ def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
         numbers = filled.cast(pa.float64())
     except pa.ArrowInvalid:  # it does not say which row
         return _floats_one_by_one(filled)
-    # As buffers, since to_numpy imports pandas too.
-    values = _buffer(numbers, np.float64)
-    return np.where(
-        _buffer(_compute().is_valid(numbers).cast(pa.uint8()), np.uint8), values, np.nan
-    )
-
-
-def _buffer(numbers: "pa.ChunkedArray", kind: type) -> np.ndarray:
-    """The numbers (N,), without regard to which are null."""
-    pieces = [
-        np.frombuffer(chunk.buffers()[1], kind, len(chunk), chunk.offset * np.dtype(kind).itemsize)
-        for chunk in numbers.chunks
-        if len(chunk)
-    ]
-    return np.concatenate([np.zeros(0, kind), *pieces])
+    return floats(numbers)
 
 
 def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:

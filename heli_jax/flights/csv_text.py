@@ -1,20 +1,32 @@
 """The text of a delimited log: its encoding, header, delimiter and rows."""
 
+import codecs
 import csv
+import functools
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from heli_jax.flights.table import wrong
 
 
-class Body(NamedTuple):
-    """The text below the header."""
+@dataclass(frozen=True, eq=False)
+class Body:
+    """The bytes below the header; they are text in UTF-8."""
 
     path: str
-    text: str
+    data: memoryview
     delimiter: str
     first_line: int
     """its number in the file, from 1: comments and blank lines above count"""
+    has_quotes: bool
+
+    @functools.cached_property
+    def text(self) -> str:
+        """The same as text with `\\n` between lines: made only where something is wrong with the
+        numbers, or cells are quoted."""
+        return with_line_feeds(str(self.data, "utf-8"))
 
     def is_blank(self, line: str) -> bool:
         """Whether a line holds no cell; one of delimiters alone is a row of empty cells."""
@@ -27,7 +39,7 @@ class Body(NamedTuple):
             InputError: a quotation mark that closes nothing or is never closed.
         """
         # Without quotes a split is all that is needed, and several times as fast as csv.reader.
-        if '"' not in self.text:
+        if not self.has_quotes:
             for number, line in enumerate(lines_of(self.text), self.first_line):
                 if not self.is_blank(line):
                     yield number, line.split(self.delimiter)
@@ -46,24 +58,38 @@ class Body(NamedTuple):
             raise wrong(self.path, problem, f"line {start}") from e
 
 
-def decode(path: str, data: bytes) -> str:
-    """The text of a file with `\\n` between its lines.
+def check_text(path: str, data: bytes) -> None:
+    """Refuse bytes that are no text in UTF-8.
 
     Raises:
-        InputError: it is no text in UTF-8.
+        InputError: naming the line.
     """
     # Spreadsheets save "Unicode text" like this; its null bytes would else be called binary data.
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise wrong(path, "is text in UTF-16, expected UTF-8")
-    if b"\x00" in data:  # valid in UTF-8, and in no log
-        line = data.count(b"\n", 0, data.index(b"\x00")) + 1
+    null = data.find(b"\x00")
+    if null >= 0:  # valid in UTF-8, and in no log
+        line = data.count(b"\n", 0, null) + 1
         raise wrong(path, "got binary data, expected text", f"line {line}")
-    try:
-        text = data.decode("utf-8-sig")  # Excel's byte order mark would belong to the first name
-    except UnicodeDecodeError as e:
-        line = data.count(b"\n", 0, e.start) + 1
-        problem = f"got the byte 0x{data[e.start]:02x}, expected text in UTF-8"
-        raise wrong(path, problem, f"line {line}") from e
+    if data.isascii():
+        return
+    decoder, done = codecs.getincrementaldecoder("utf-8")(), 0
+    # A block at a time: the text of all is not needed, and takes up to four times the bytes.
+    while done < len(data):
+        block = data[done : done + _BLOCK]
+        pending = len(decoder.getstate()[0])
+        try:
+            decoder.decode(block, final=done + _BLOCK >= len(data))
+        except UnicodeDecodeError as e:
+            at = done - pending + e.start
+            line = data.count(b"\n", 0, at) + 1
+            problem = f"got the byte 0x{data[at]:02x}, expected text in UTF-8"
+            raise wrong(path, problem, f"line {line}") from e
+        done += _BLOCK
+
+
+def with_line_feeds(text: str) -> str:
+    """Text with `\\n` between its lines, whatever stood there."""
     # Not splitlines: it breaks at form feeds and Unicode separators as well, which no spreadsheet
     # and no pyarrow takes for the end of a row.
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
@@ -72,25 +98,56 @@ def decode(path: str, data: bytes) -> str:
 LONGEST_HEADER = 1_000_000
 """characters"""
 _LONGEST_LINE = 10_000_000
-"""characters of a row, in which a cell may hold a text"""
+"""bytes of a row, in which a cell may hold a text"""
 _LONGEST_PREAMBLE = 1_000_000
-"""characters of blank lines and comments before the header"""
+"""bytes of blank lines and comments before the header"""
 _BLOCK = 1 << 20
+_SOMETHING = re.compile(rb"[^ \t\n\r\v\f]")
 
 
-def find_header(text: str) -> tuple[int | None, int]:
-    """Where the first line that is neither blank nor a comment starts, and its number; None where
-    there is none within the first 1 MB."""
-    start, line = 0, 1
-    while start < min(len(text), _LONGEST_PREAMBLE):
-        end = text.find("\n", start)
-        end = len(text) if end < 0 else end
-        content = text[start:end].strip()
+class Line(NamedTuple):
+    """A line of a file: its text, its number from 1, and where the next begins [bytes]."""
+
+    text: str
+    number: int
+    after: int
+
+
+def find_header(data: bytes) -> Line | None:
+    """The first line that is neither blank nor a comment; None where there is none within the
+    first 1 MB."""
+    # Excel's byte order mark would belong to the first name.
+    start, number = 3 if data.startswith(codecs.BOM_UTF8) else 0, 1
+    while start < min(len(data), _LONGEST_PREAMBLE):
+        end, after = _line_end(data, start)
+        # Cut: what is refused for its length need not be decoded as a whole.
+        content = data[start : min(end, start + 4 * LONGEST_HEADER + 4)].decode("utf-8", "ignore")
         # Comments may say anything, a list of names with commas too.
-        if content and not content.startswith("#"):
-            return start, line
-        start, line = end + 1, line + 1
-    return None, line
+        if content.strip() and not content.strip().startswith("#"):
+            return Line(content, number, after)
+        start, number = after, number + 1
+    return None
+
+
+def first_row(data: bytes, at: int) -> str | None:
+    """The first line from `at` on with anything in it; None where nothing follows."""
+    found = _SOMETHING.search(data, at)
+    if found is None:
+        return None
+    begin = max(data.rfind(b"\n", at, found.start()), data.rfind(b"\r", at, found.start()), at - 1)
+    end, _ = _line_end(data, found.start())
+    return data[begin + 1 : min(end, begin + _LONGEST_LINE)].decode("utf-8", "ignore")
+
+
+def _line_end(data: bytes, start: int) -> tuple[int, int]:
+    """Where a line ends, and where the next begins."""
+    end = data.find(b"\n", start)
+    end = len(data) if end < 0 else end
+    # A carriage return ends a line too, alone or with the line feed behind it.
+    feed = data.find(b"\r", start, end)
+    if feed < 0:
+        return end, end + 1
+    return feed, feed + 2 if data[feed + 1 : feed + 2] == b"\n" else feed + 1
 
 
 def lines_of(text: str) -> Iterator[str]:
@@ -106,24 +163,28 @@ def lines_of(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def require_short_lines(path: str, text: str, first_line: int) -> None:
+def require_short_lines(path: str, data: bytes, start: int, first_line: int) -> None:
     """Refuse a line longer than any of a log: its cells alone would fill the memory.
 
     Args:
         path: for the message.
-        text: lines, ended by `\\n`.
+        data: the bytes of the file.
+        start: where the rows begin.
         first_line: the number of the first in the file.
 
     Raises:
         InputError: naming the line.
     """
-    start = 0
-    while len(text) - start > _LONGEST_LINE:
+    begin = start
+    while len(data) - start > _LONGEST_LINE:
         # Backwards from the limit: where any line ends within it, all up to there are short, so a
         # file of 1 GB takes a hundred searches and not one a line.
-        end = text.rfind("\n", start, start + _LONGEST_LINE + 1)
+        limit = start + _LONGEST_LINE + 1
+        end = data.rfind(b"\n", start, limit)
         if end < 0:
-            line = first_line + text.count("\n", 0, start)
+            end = data.rfind(b"\r", start, limit)
+        if end < 0:
+            line = first_line + with_line_feeds(data[begin:start].decode("latin-1")).count("\n")
             raise wrong(path, "is longer than a line of a log can be", f"line {line}")
         start = end + 1
 

@@ -5,12 +5,14 @@ names are those of pymavlink's DFReader, which is not used: a message that claim
 never lets it end, and it reads one message at a time.
 """
 
-import hashlib
+import array
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from heli_jax.flights import progress
+from heli_jax.flights.digest import Digest
 from heli_jax.flights.log import ChannelLog, Topic, require_samples
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
@@ -23,6 +25,7 @@ _HEAD = b"\xa3\x95"
 _FMT = 0x80
 # Bytes: three of the head, type and length, 4 of the name, 16 of the kinds and 64 of the columns.
 _FMT_LENGTH = 89
+_ROWS_AT_ONCE = 1 << 13
 # How a field is stored, and what pymavlink multiplies it with.
 FIELDS: dict[str, tuple[str, float | None]] = {
     "a": ("(32,)<i2", None), "b": ("<i1", None), "B": ("<u1", None), "g": ("<f2", None),
@@ -79,23 +82,35 @@ def open_dataflash(path: Path) -> ChannelLog:
         form = formats[number]
         dtype = form.dtype
         # Messages of one kind are of one length, so all of them are taken out of the bytes at once.
-        at = np.asarray(places, np.int64) + 3
         # Each message's bytes become a row, whose columns are then the fields.
-        rows[form.name] = raw[at[:, None] + np.arange(dtype.itemsize)].view(dtype)[:, 0]
+        rows[form.name] = _gathered(raw, np.frombuffer(places, np.int64) + 3, dtype)
     by_name = {form.name: form for form in formats.values()}
     names = {number: form.name for number, form in formats.items()}
     return make_log(str(path), data, rows, by_name, names, damaged)
 
 
-def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, list[int]], int]:
+def _gathered(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """The rows (N,) whose bytes begin at `at` (N,)."""
+    rows = np.empty((at.size, dtype.itemsize), np.uint8)
+    within = np.arange(dtype.itemsize)
+    # A block at a time: an index of eight bytes for each byte takes more than the log.
+    for i in range(0, at.size, _ROWS_AT_ONCE):
+        rows[i : i + _ROWS_AT_ONCE] = raw[at[i : i + _ROWS_AT_ONCE, None] + within]
+    return rows.view(dtype)[:, 0]
+
+
+def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, array.array], int]:
     """The formats by number, where the messages of each begin, and how often there was neither."""
     # The format of formats is stated here, since without it the first message could not be read,
     # which states it again.
     formats = {_FMT: Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
     lengths = {_FMT: _FMT_LENGTH}
-    starts: dict[int, list[int]] = {}
-    at, damaged, size = 0, 0, len(data)
+    starts: dict[int, array.array] = {}
+    at, damaged, size, told = 0, 0, len(data), 0
     while at + 3 <= size:
+        if at >= told:
+            progress.advance(at)
+            told = at + progress.STEP
         number = data[at + 2]
         length = lengths.get(number, 0)
         if data[at] != 0xA3 or data[at + 1] != 0x95 or not length:
@@ -118,7 +133,10 @@ def _walk(data: bytes) -> tuple[dict[int, Format], dict[int, list[int]], int]:
             damaged += 1
         # Positions alone are gathered in this loop, and the numbers are read by NumPy afterwards: a
         # log has millions of messages.
-        starts.setdefault(number, []).append(at)
+        places = starts.get(number)
+        if places is None:
+            places = starts[number] = array.array("q")
+        places.append(at)
         at += length
     return formats, starts, damaged
 
@@ -181,7 +199,7 @@ def make_log(
         path=path,
         format="dataflash",
         size=len(data),
-        sha256=hashlib.sha256(data).hexdigest(),
+        sha256=Digest(data).hex(),
         topics=tuple(topics),
         firmware=_firmware(rows),
         parameters=_parameters(rows),

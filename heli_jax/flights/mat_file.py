@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.regular_file import size_words
+
 # By the number that the format has for each type of data; 8, 10 and 11 are reserved.
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
@@ -19,8 +21,12 @@ _NUMBERS = {
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 6, 15
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
-_MOST_BYTES = 3 * 10**9
-"""of one array, which a few compressed bytes can claim"""
+_MOST_BYTES = 2 * 10**9
+"""of all arrays once they are unpacked"""
+_MOST_SMALL = 250 * 10**6
+_DENSEST = 200
+"""bytes that one compressed byte of a log may stand for, where they are more than `_MOST_SMALL`: a
+signal that stands still packs by a thousand, numbers of sensors by less than ten"""
 _MOST_VALUES = 3 * 10**8
 _DEEPEST = 8
 """structures within structures"""
@@ -30,6 +36,10 @@ _MOST_ELEMENTS = 100
 
 class DamagedMatFile(Exception):
     """The file is no MATLAB file, or not whole; in words what is wrong."""
+
+
+class LargeMatFile(Exception):
+    """The file holds more than a log does, or than its bytes can; in words how much."""
 
 
 class _Element(NamedTuple):
@@ -45,6 +55,7 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
 
     Raises:
         DamagedMatFile: it cannot be read.
+        LargeMatFile: its arrays would fill the memory.
     """
     try:
         # Level 5 ends its header of 128 bytes with the letters MI as a number of the machine that
@@ -58,24 +69,50 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _level_5(data: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
-    at = 128
+    at, unpacked = 128, 0
     while at + 8 <= len(data):
         element = _element(data, at, order)
         at = element.end
         # A compressed piece holds one whole piece with a head of its own.
         if element.kind == _COMPRESSED:
-            element = _element(_inflated(element.data), 0, order)
+            claimed = _claimed(element.data, order)
+            unpacked += claimed
+            require_few_bytes(unpacked, len(data))
+            # Stopped where it claims to end: what is behind is not looked at by any reader.
+            content = zlib.decompressobj().decompress(element.data, claimed)
+            element = _element(memoryview(content), 0, order)
         if element.kind == _MATRIX:
             yield from _matrix(element.data, order, "", 0)
 
 
-def _inflated(data: memoryview) -> memoryview:
-    inflate = zlib.decompressobj()
-    content = inflate.decompress(data, _MOST_BYTES)
-    # Bounded while it is unpacked: what a thousand bytes claim can be larger than the memory.
-    if inflate.unconsumed_tail:
-        raise DamagedMatFile(f"an array claims more than {_MOST_BYTES} bytes")
-    return memoryview(content)
+def _claimed(data: memoryview, order: str) -> int:
+    """The bytes of a compressed piece, as its head says, which is all that is unpacked for it."""
+    head = zlib.decompressobj().decompress(data, 8)
+    if len(head) < 8:
+        raise DamagedMatFile("it is cut off")
+    word, size = struct.unpack(f"{order}2I", head)
+    # A small piece is all in its head.
+    return 8 if word >> 16 else 8 + size
+
+
+def require_few_bytes(claimed: int, size: int) -> None:
+    """Refuse arrays that would fill the memory, before they are unpacked.
+
+    Args:
+        claimed: bytes of all arrays so far.
+        size: of the file [bytes].
+
+    Raises:
+        LargeMatFile: saying how much.
+    """
+    if claimed > _MOST_BYTES:
+        words = f"{size_words(_MOST_BYTES)}, got {size_words(claimed)} or more"
+        raise LargeMatFile(f"expected arrays of at most {words}: save fewer, or at a lower rate")
+    if claimed > max(_MOST_SMALL, _DENSEST * size):
+        raise LargeMatFile(
+            f"its arrays claim {size_words(claimed)} or more in a file of {size_words(size)}, "
+            "which no numbers of a flight do"
+        )
 
 
 def _element(data: memoryview, at: int, order: str) -> _Element:

@@ -4,7 +4,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from heli_jax.flights import array_table, blackbox_header, dataflash, dataflash_text, ulog
+from heli_jax.flights import (
+    array_table,
+    blackbox_header,
+    dataflash,
+    dataflash_text,
+    progress,
+    ulog,
+)
 from heli_jax.flights.blackbox import open_blackbox
 from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.log import ChannelLog
@@ -96,9 +103,12 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
     path = Path(path)
     try:
         # Any size here: each reader has a limit of its own.
-        if not require_regular(path, "a log", sys.maxsize):
+        size = require_regular(path, "a log", sys.maxsize)
+        if not size:
             raise wrong(str(path), "is empty, expected a log")
-        return _reader(path)(path)
+        reader = _reader(path)
+        with progress.reading(path, size):
+            return reader(path)
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
 

@@ -1,6 +1,5 @@
 """Logs in Apache Parquet."""
 
-import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
+from heli_jax.flights.digest import Digest
 from heli_jax.flights.table import Survey, column, require_columns, require_few_columns, wrong
 from heli_jax.regular_file import open_regular, size_words
 
@@ -55,15 +55,7 @@ def open_parquet(path: Path) -> "ParquetTable":
         texts = [f.name for f in schema if _is_text(f.type)]
         if texts:
             file = pq.ParquetFile(path, read_dictionary=texts)
-        sha256 = _sha256(opened)
-    return ParquetTable(str(path), size, sha256, file)
-
-
-def _sha256(file: BinaryIO) -> str:
-    digest = hashlib.sha256()
-    while piece := file.read(1 << 20):  # never the whole file: it may be larger than the memory
-        digest.update(piece)
-    return digest.hexdigest()
+    return ParquetTable(str(path), size, Digest(path), file)
 
 
 def _check_end(path: str, file: BinaryIO, size: int) -> None:
@@ -86,11 +78,19 @@ class ParquetTable:
 
     format = "parquet"
 
-    def __init__(self, path: str, size: int, sha256: str, file: "pq.ParquetFile") -> None:
-        self.path, self.size, self.sha256 = path, size, sha256
-        self._file = file
+    def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
+        self.path, self.size = path, size
+        self._digest, self._file = digest, file
         self._schema = file.schema_arrow
         self.names: tuple[str, ...] = tuple(self._schema.names)
+
+    @property
+    def sha256(self) -> str:
+        """Of the file: a log's columns are read in less time."""
+        try:
+            return self._digest.hex()
+        except OSError as e:
+            raise wrong(self.path, f"cannot be read ({e.strerror or type(e).__name__})") from e
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a value is null.
@@ -105,7 +105,9 @@ class ParquetTable:
             if not _is_number(kind):
                 raise wrong(self.path, f"holds {kind}, expected numbers", column(name))
         data = self._read(sorted(set(names)))
-        return {name: _floats(data.column(name)) for name in names}
+        numbers = {name: _floats(data.column(name)) for name in names}
+        self._digest.begin()
+        return numbers
 
     def survey(self) -> list[Survey]:
         """Every column; what is not a number counts as text."""

@@ -28,8 +28,12 @@ class Table(Protocol):
     path: str
     format: str
     size: int
-    sha256: str
     names: tuple[str, ...]
+
+    @property
+    def sha256(self) -> str:
+        """Of the whole file; of a large one it is waited for."""
+        ...
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from heli_jax.flights import progress
 from heli_jax.flights.log import ChannelLog, Topic, require_samples
 from heli_jax.flights.table import wrong
 from heli_jax.regular_file import read_regular
@@ -124,7 +125,11 @@ def _read_messages(path: str, data: bytes, content: _Content) -> None:
 
 
 def _read_part(path: str, data: bytes, at: int, end: int, content: _Content) -> int:
+    told = at
     while at + 3 <= end:
+        if at >= told:
+            progress.advance(at)
+            told = at + progress.STEP
         size, kind = data[at] | data[at + 1] << 8, data[at + 2]
         body, after = at + 3, at + 3 + size
         limit = min((o for o in content.appended if o > at), default=end)

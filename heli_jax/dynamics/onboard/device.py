@@ -189,10 +189,21 @@ class Device(abc.ABC):
             "steady_flight": steady,
             "without_stand": None if bare is None else again(bare),
             "positive": (*model.positive, *positive),
+            "within": _around(model.within, again),
         }
         # What is not named here stays as it is. `initial_sd` and `correlation` go by names of
         # states, so they hold for a State that has grown; axes and delays name what is still there.
         return dataclasses.replace(model, **{**fields, **changes})
+
+
+def _around(
+    within: tuple[Model, Callable[[Model], Model]] | None, again: Callable[[Model], Model]
+) -> tuple[Model, Callable[[Model], Model]] | None:
+    """`Model.within` of a model that gets one more device around it."""
+    if within is None:
+        return None
+    model, before = within
+    return model, lambda other: again(before(other))
 
 
 def _check_new(model: Model, parts: Parts) -> None:

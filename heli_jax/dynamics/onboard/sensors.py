@@ -10,7 +10,7 @@ from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, zeros
 from heli_jax.dynamics.onboard.delays import ORDER, Late, with_delays
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, require
-from heli_jax.dynamics.onboard.specific_force import motion_of, specific_force
+from heli_jax.dynamics.onboard.motion_sensors import with_motion_sensors
 from heli_jax.naming import Record
 
 
@@ -20,13 +20,15 @@ def with_sensors(
     delay: Late = (),
     *,
     imu: bool = False,
+    angular_acceleration: bool = False,
+    airspeed: bool = False,
     order: int = ORDER,
 ) -> Model:
-    r"""The model as its sensors see it: an accelerometer, then low-passes, then delays.
+    r"""The model as its sensors see it: what they show of the motion, then low-passes, then delays.
 
     An accelerometer adds the outputs `ax`, `ay`, `az` [m/s^2] along the body (forward, right,
     down): the specific force at (`x_imu`, `y_imu`, `z_imu`) [m] from the centre of gravity, new
-    parameters (`heli_jax.dynamics.onboard.specific_force`). A low-pass is first order,
+    parameters (`heli_jax.dynamics.onboard.motion_sensors`). A low-pass is first order,
     `tau_lowpass_OUTPUT` [s] with the state `OUTPUT_lowpass`. Delays are those of `with_delays`.
 
     Args:
@@ -34,6 +36,9 @@ def with_sensors(
         lowpass: outputs that are low-passed, `ax` and its like among them.
         delay: outputs that are late, by names or by name the parameter.
         imu: whether there is an accelerometer.
+        angular_acceleration: whether `pdot`, `qdot`, `rdot` [rad/s^2] are outputs.
+        airspeed: whether `airspeed` and `u_air`, `v_air`, `w_air` [m/s] are outputs, at (`x_air`,
+            `y_air`, `z_air`) [m] from the centre of gravity.
         order: states of each delay's line.
 
     Raises:
@@ -41,12 +46,13 @@ def with_sensors(
             taken.
     """
     check_model(model)
-    if not (imu or lowpass or delay):
-        raise ValueError("expected imu, lowpass or delay, got none")
+    motion = {"imu": imu, "angular_acceleration": angular_acceleration, "airspeed": airspeed}
+    if not (any(motion.values()) or lowpass or delay):
+        raise ValueError(f"expected {', '.join(motion)}, lowpass or delay, got none")
     # In the order of the signal's way to the log, so that a low-pass can be on what the IMU shows.
     # The delay comes last since its line follows slow signals best: behind the low-pass it errs
     # least.
-    model = _with_imu(model) if imu else model
+    model = with_motion_sensors(model, **motion) if any(motion.values()) else model
     model = _with_lowpass(model, tuple(lowpass)) if lowpass else model
     return with_delays(model, outputs=delay, order=order) if delay else model
 
@@ -105,49 +111,3 @@ class _LowPass(Device):
         # Zero in its place would show as a start-up transient of the filter, which a logger that
         # runs before the record begins has long behind it.
         return {f"{n}_lowpass": getattr(y, n) for n in self.on}
-
-
-@functools.cache
-def _with_imu(model: Model) -> Model:
-    return _Imu(model).made("imu", _with_imu)
-
-
-class _Imu(Device):
-    """Accelerometers somewhere in the body."""
-
-    def __init__(self, model: Model) -> None:
-        self.motion = motion_of(model)
-        ahead = {"x": "ahead of", "y": "to the right of", "z": "below"}
-        params = {
-            f"{axis}_imu": Quantity("m", f"IMU {where} the centre of gravity", 0.0)
-            for axis, where in ahead.items()
-        }
-        words = {"ax": "forward", "ay": "to the right", "az": "down"}
-        outputs = {
-            n: Quantity("m/s^2", f"specific force {words[n]} at the IMU")
-            for n in self.motion.outputs
-        }
-        # Its place has zero as default, the centre of gravity, where the levers vanish: the one
-        # position that needs no measurement. Nothing else here has a default.
-        super().__init__(model, Parts(params, {}, outputs))
-
-    def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
-        """None: an accelerometer has no states.
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
-        return {}
-
-    def output(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's outputs and the specific force beside them [m/s^2].
-
-        Args:
-            p: the Params of the whole model, SI.
-            s: its State, with the states added here.
-            u: its Inputs, as they come from outside.
-        """
-        y = naming.asdict(self.measured(p, s, u))
-        return self.Outputs(**y, **specific_force(self.model, self.motion, p, s, u))

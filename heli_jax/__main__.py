@@ -1,0 +1,29 @@
+"""The command heli-jax from its first moment, in which Ctrl-C finds nothing imported yet."""
+
+import os
+import signal
+from types import FrameType
+
+
+def main() -> int:
+    """Run one command as a program; returns the exit code (`heli_jax.cli`)."""
+    before = signal.getsignal(signal.SIGINT)
+    ours = before is signal.default_int_handler
+    if ours:
+        signal.signal(signal.SIGINT, _end)
+    from heli_jax import cli
+
+    # From here on the command line listens itself.
+    if ours:
+        signal.signal(signal.SIGINT, before)
+    return cli.main()
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    # Not `heli_jax.interrupts`, which would have to be imported first.
+    os.write(2, b"heli-jax: interrupted; nothing was written\n")
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,132 @@
+"""What large files need: a fingerprint beside the reading, a bar, and no memory that is claimed."""
+
+import hashlib
+import io
+import struct
+import sys
+import time
+import zlib
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import scipy.io
+
+from heli_jax import reading_progress
+from heli_jax.errors import InputError
+from heli_jax.flights import progress
+from heli_jax.flights.digest import Digest
+from heli_jax.flights.open_log import open_log, open_table
+from tests.flights import log_writers as writers
+
+
+@pytest.mark.parametrize("size", [0, 10, 5_000_001])
+def test_the_fingerprint_is_that_of_hashlib(tmp_path, size):
+    data = np.random.default_rng(0).bytes(size)
+    path = tmp_path / "log"
+    path.write_bytes(data)
+    expected = hashlib.sha256(data).hexdigest()
+    assert Digest(data).hex() == expected
+    digest = Digest(path)
+    digest.begin()
+    assert digest.hex() == expected
+
+
+def test_a_tables_fingerprint_is_the_files(tmp_path):
+    table = pa.table(
+        {"t": np.arange(300_000.0), "x": np.random.default_rng(0).normal(size=300_000)}
+    )
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    pyarrow.csv.write_csv(table, tmp_path / "log.csv")
+    pyarrow.parquet.write_table(table, tmp_path / "log.parquet")
+    for name in ("log.csv", "log.parquet"):
+        opened = open_table(tmp_path / name)
+        assert opened.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+        np.testing.assert_array_equal(opened.numbers(["x"])["x"], table.column("x").to_numpy())
+
+
+def compressed(size, content):
+    """A MATLAB file with one compressed piece that claims `size` bytes."""
+    whole = io.BytesIO()
+    scipy.io.savemat(whole, {"t": np.arange(3.0)}, do_compression=True)
+    piece = zlib.compress(struct.pack("<2I", 14, size) + content)
+    return whole.getvalue()[:128] + struct.pack("<2I", 15, len(piece)) + piece
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (3_000_000_000, "expected arrays of at most 2 GB, got 3 GB or more"),
+        (400_000_000, "claim 400 MB or more in a file of"),
+        (1_000_000, "is no whole MATLAB file: it is cut off"),
+    ],
+)
+def test_arrays_are_refused_before_they_are_unpacked(tmp_path, size, words):
+    path = tmp_path / "log.mat"
+    path.write_bytes(compressed(size, bytes(1000)))
+    with pytest.raises(InputError, match=words):
+        open_log(path)
+
+
+def test_columns_that_are_not_plain_are_found_among_those_that_are(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{i},{i / 8},{'AUTO' if i % 2 else ''},+{i}\r\n" for i in range(20))
+    path.write_bytes(b"\xef\xbb\xbft,x,mode,y\r\n" + rows.encode())
+    t, x, mode, y = open_table(path).survey()
+    assert t.name == "t"
+    np.testing.assert_array_equal(x.values, np.arange(20) / 8)
+    assert (mode.values, mode.n_filled) == (None, 10)
+    np.testing.assert_array_equal(y.values, np.arange(20.0))
+    german = tmp_path / "german.csv"
+    german.write_text("t;x\n" + "".join(f"{i};{i},25\n" for i in range(20)))
+    np.testing.assert_array_equal(open_table(german).numbers(["x"])["x"], np.arange(20) + 0.25)
+
+
+class Heard:
+    def __init__(self):
+        self.calls = []
+
+    def begin(self, path, size):
+        self.calls.append(("begin", path, size))
+
+    def advance(self, done):
+        self.calls.append(("advance", done))
+
+    def end(self):
+        self.calls.append(("end",))
+
+
+def test_an_observer_hears_of_a_file(tmp_path):
+    messages = {"ATT": (129, "Qc", "TimeUS,Roll")}
+    data = writers.dataflash(messages, [("ATT", (1000 * i, i)) for i in range(50)])
+    path = tmp_path / "log.bin"
+    path.write_bytes(data)
+    heard = Heard()
+    with progress.observed_by(heard):
+        open_log(path)
+        with pytest.raises(InputError):
+            open_log(tmp_path / "none.bin")
+    open_log(path)
+    assert heard.calls == [("begin", str(path), len(data)), ("advance", 0), ("end",)]
+
+
+def test_a_bar_is_for_terminals_and_for_what_takes_long(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
+    monkeypatch.setattr(reading_progress, "_AFTER", 0.05)
+    monkeypatch.setenv("TERM", "xterm")
+    with reading_progress.on_terminal(), progress.reading("logs/a\x1b[2Jflight.bin", 10**8):
+        progress.advance(5 * 10**7)
+        time.sleep(0.4)
+    assert "reading a?[2Jflight.bin (100 MB)" in shown.getvalue()
+    piped = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", piped)
+    with reading_progress.on_terminal(), progress.reading("flight.bin", 10**8):
+        time.sleep(0.1)
+    assert not piped.getvalue()
