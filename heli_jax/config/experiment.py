@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.measurement import with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
@@ -86,6 +87,8 @@ def _started(config: Config, path: Path, model: Model) -> Model:
     # The devices first: their states can be named in the initial state as those of the bare model
     # are.
     model = with_onboard(model, config.onboard, path)
+    # Behind all of them, since it is what the autopilot did to what its sensors had.
+    model = with_measurement(model, config.flights, path)
     if not config.initial_state:
         return model
     for name in config.initial_state:

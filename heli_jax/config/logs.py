@@ -6,7 +6,9 @@ from typing import Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.measurement import filter_cautions
 from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
+from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
@@ -68,7 +70,9 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    return _with_notes(flight, _unstated_units(model, f.signals))
+    flight = with_notches(flight, f.notch, f"{where}.notch")
+    cautions = (*filter_cautions(flight.source, f), *vibration_notes(experiment, flight, f, where))
+    return _with_notes(flight, _unstated_units(model, f.signals), cautions)
 
 
 def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
@@ -86,11 +90,12 @@ def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
+def _with_notes(flight: Flight, notes: tuple[str, ...], cautions: tuple[str, ...]) -> Flight:
     # A flight that a script made has no source, and nobody who would read a note on it.
-    if not notes or flight.source is None:
+    if not (notes or cautions) or flight.source is None:
         return flight
-    source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
+    notes = (*flight.source.notes, *notes)
+    source = dataclasses.replace(flight.source, notes=notes, cautions=cautions)
     return dataclasses.replace(flight, source=source)
 
 

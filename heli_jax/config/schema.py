@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
 from heli_jax.config.disturbance_section import DisturbanceConfig
-from heli_jax.config.onboard import OnboardConfig
+from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -65,6 +65,11 @@ class OutputConfig(_Strict):
     signal: str
     unit: str | None = None
     sd: Positive | None = None
+    filter: Filters | None = None
+    """what the autopilot filtered it with: from log, or one or several of {kind, hz, ...}
+    (docs/onboard.md); none: nothing is known of it"""
+    delay: Delay = 0.0
+    """by how much it is logged late [s]"""
 
 
 class SignalsConfig(_Strict):
@@ -89,6 +94,10 @@ class FlightConfig(_Strict):
     # parameter was bent to.
     hold_out: bool = False
     known: dict[str, Finite] = {}
+    notch: Notches = []
+    """frequencies [Hz] that are taken out of inputs and outputs alike"""
+    vibration: VibrationConfig | None = None
+    """the rotor's speed, by which lines of vibration are named"""
 
 
 class PriorConfig(_Strict):

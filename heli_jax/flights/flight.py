@@ -1,6 +1,7 @@
 """What a flight is, whichever log it came from."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,11 +32,20 @@ class Signal:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did."""
+    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did.
+
+    `firmware` and `parameters` are those of the autopilot that wrote the log; `rates` the usual
+    rates of outputs in an autopilot's log [Hz]; `cautions` are sentences on what biases a fit to
+    the log as it is used, which every fit repeats.
+    """
 
     path: str
     sha256: str
     notes: tuple[str, ...] = ()
+    firmware: str = ""
+    parameters: Mapping[str, str | int | float] = field(default_factory=dict)
+    rates: Mapping[str, float] = field(default_factory=dict)
+    cautions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,7 +84,14 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
         known=request.known,
         hold_out=options.hold_out,
         name=options.name,
-        source=Source(log.path, log.sha256, (*log.notes, *_missing(request, signals), *notes)),
+        source=Source(
+            log.path,
+            log.sha256,
+            (*log.notes, *_missing(request, signals), *notes),
+            log.firmware,
+            log.parameters,
+            {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"},
+        ),
         hold={key: decision.hold for key, decision in holds.items()},
         hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
     )
