@@ -94,12 +94,12 @@ def test_the_log_is_the_filtered_motion_sample_by_sample():
 
 
 def test_fixed_steps_follow_a_fast_filter():
-    model = with_filters(models.roll, {"dphi": [Filter("pt1", 300.0)]})
+    model = with_filters(models.roll, {"roll_rate": [Filter("pt1", 300.0)]})
     assert model.fastest == 2 * math.pi * 300
     # RK4 with the four steps that do without a filter would diverge: 0.02 / 4 * 1885 > 2.8.
     assert substeps_for(0.02) == 4
     assert 0.02 / substeps_for(0.02, model.fastest) * model.fastest <= 1.4
-    assert with_filters(model, {}, {"phi": 0.003}).fastest == model.fastest
+    assert with_filters(model, {}, {"roll": 0.003}).fastest == model.fastest
 
 
 def test_what_does_nothing_adds_nothing():
