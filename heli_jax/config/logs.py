@@ -70,7 +70,7 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    flight = with_notches(flight, f.notch, f"{where}.notch")
+    flight = with_notches(flight, f.notch or (), f"{where}.notch")
     cautions = (*filter_cautions(flight.source, f), *vibration_notes(experiment, flight, f, where))
     return _with_notes(flight, _unstated_units(model, f.signals), cautions)
 

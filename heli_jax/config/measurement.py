@@ -71,7 +71,7 @@ def _channel(flight: FlightConfig, i: int, name: str, output: OutputConfig, path
                 "{kind: biquad, hz: 30}"
             )
         filters += logged.filters
-    return tuple(filters), output.delay
+    return tuple(filters), output.delay or 0.0
 
 
 def _version(log: str) -> tuple[int, int]:

@@ -68,7 +68,7 @@ class OutputConfig(_Strict):
     filter: Filters | None = None
     """what the autopilot filtered it with: from log, or one or several of {kind, hz, ...}
     (docs/onboard.md); none: nothing is known of it"""
-    delay: Delay = 0.0
+    delay: Delay | None = None
     """by how much it is logged late [s]"""
 
 
@@ -94,7 +94,7 @@ class FlightConfig(_Strict):
     # parameter was bent to.
     hold_out: bool = False
     known: dict[str, Finite] = {}
-    notch: Notches = []
+    notch: Notches | None = None
     """frequencies [Hz] that are taken out of inputs and outputs alike"""
     vibration: VibrationConfig | None = None
     """the rotor's speed, by which lines of vibration are named"""
