@@ -85,7 +85,7 @@ def motion() -> tuple[np.ndarray, np.ndarray]:
 def stamps(rate: float, rng: np.random.Generator) -> np.ndarray:
     """When a sensor is logged [s]: with jitter, and some samples lost."""
     n = int((LENGTH - 0.5) * rate)
-    times = 0.25 + (np.arange(n) + rng.uniform(-JITTER, JITTER, n) / 2) / rate
+    times = 0.25 + (np.arange(n) + rng.uniform(-JITTER, JITTER, n)) / rate
     kept = rng.random(n) > LOST
     kept[[0, -1]] = True
     return times[kept]

@@ -11,6 +11,7 @@ from heli_jax.config.logs import read_flights
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.errors import InputError
 from heli_jax.flights.vibration import folded, lines, notched
+from heli_jax.identification.fit import cautions
 from heli_jax.linear_models.read import linear_model
 from heli_jax.models import with_filters
 
@@ -184,3 +185,9 @@ def test_notches_on_both_sides_bias_nothing(load, tmp_path):
         load(shaken | {"notch": 24.2})
     with pytest.raises(InputError, match=r"vibration\.unit"):
         read_flights(load(flight() | {"vibration": {"rotor": 24.2, "unit": "kg"}}))
+
+
+def test_a_fit_repeats_the_cautions_once(load):
+    problem = configuration.problem(load(flight(), flight()))
+    (said,) = cautions(problem)
+    assert said.startswith("flight 1: p was low-passed at 20 Hz")
