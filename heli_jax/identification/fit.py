@@ -82,7 +82,7 @@ def check(problem: Problem) -> Check:
     verdict = verdict_of(problem, guess.layout, guess.e)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
-    notes = (*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd))
+    notes = [*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd)]
     notes += feedback_notes(problem, feedback_of(problem))
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
