@@ -99,9 +99,10 @@ def log_text(times: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> 
         truth: v, phi, p (N, 3).
         rng: of noise, jitter and losses.
     """
-    b, a = scipy.signal.butter(2, CUTOFF, fs=1 / STEP)  # bilinear and prewarped, as in firmware
+    # Bilinear and prewarped, as in firmware.
+    sos = scipy.signal.butter(2, CUTOFF, fs=1 / STEP, output="sos")
     noisy = truth[:, 2] + SD["gyro"] * rng.standard_normal(times.size)
-    gyro = scipy.signal.lfilter(b, a, noisy)
+    gyro = np.asarray(scipy.signal.sosfilt(sos, noisy))
 
     def taken(signal: np.ndarray, at: np.ndarray, late: float, sd: float = 0.0) -> np.ndarray:
         """A signal's samples (M,) at stamps, late, with noise.

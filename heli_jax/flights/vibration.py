@@ -81,7 +81,9 @@ def lines(
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
     """Which harmonic of the rotor a line is, and this harmonic's own frequency; zeros for none."""
-    for k in range(1, _HIGHEST + 1) if rotor_hz else ():
+    if rotor_hz is None:
+        return 0, 0.0
+    for k in range(1, _HIGHEST + 1):
         own = k * rotor_hz
         # A governor keeps the speed to a percent or two.
         there = own < 0.5 * rate or k <= _HIGHEST_FOLDED

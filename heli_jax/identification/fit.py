@@ -170,11 +170,8 @@ def fit(
 
 def cautions(problem: Problem) -> tuple[str, ...]:
     """What the logs say of their signals that biases a fit to them; once where flights agree."""
-    said = {
-        caution: label
-        for label, flight in reversed(
-            tuple(zip(labels(problem.flights), problem.flights, strict=True))
-        )
-        for caution in (flight.source.cautions if flight.source else ())
-    }
-    return tuple(f"{label}: {caution}" for caution, label in reversed(said.items()))
+    flights, said = tuple(problem.flights), {}
+    for label, flight in zip(labels(flights), flights, strict=True):
+        for caution in flight.source.cautions if flight.source else ():
+            said.setdefault(caution, label)
+    return tuple(f"{label}: {caution}" for caution, label in said.items())
