@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,10 @@ def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) 
     """
     channels: dict[str, tuple[_Channel, int]] = {}
     for i, flight in enumerate(flights):
-        for name, output in flight.signals.outputs.items():
+        for part, name, output in _outputs(flight):
             if name not in naming.names(model.Outputs):
                 continue  # refused where the log is read, with the names that there are
-            channel = _channel(flight, i, name, output, path)
+            channel = _channel(part, i, name, output, path)
             first, at = channels.setdefault(name, (channel, i))
             # One model serves all flights, so that one program does.
             if first != channel:
@@ -55,18 +55,26 @@ def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) 
         raise InputError(f"{path}: flights.signals.outputs: {e}") from e
 
 
-def _channel(flight: FlightConfig, i: int, name: str, output: OutputConfig, path: Path) -> _Channel:
+def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
+    """The outputs of a flight with the section that names their log, which has `log`, `flight` and
+    `signals`: the flight itself, or a further log of it."""
+    for part in (flight, *getattr(flight, "also", ())):
+        for name, output in part.signals.outputs.items():
+            yield part, name, output
+
+
+def _channel(part: Any, i: int, name: str, output: OutputConfig, path: Path) -> _Channel:
     """The filters and the delay of one output."""
     filters: list[Filter] = []
     for config in output.filter or ():
         if config.kind != FROM_LOG:
             filters.append(config.filter)
             continue
-        log = str((path.parent / flight.log).absolute())
-        logged = logged_filters(*_settings(log, flight.flight, _version(log)), output.signal)
+        log = str((path.parent / part.log).absolute())
+        logged = logged_filters(*_settings(log, part.flight, _version(log)), output.signal)
         if logged is None:
             raise InputError(
-                f"{path}: flights[{i}].signals.outputs.{name}.filter: {flight.log} does not say "
+                f"{path}: flights[{i}].signals.outputs.{name}.filter: {part.log} does not say "
                 f"how {output.signal} was filtered, expected a filter such as "
                 "{kind: biquad, hz: 30}"
             )
