@@ -21,18 +21,25 @@ from heli_jax.flights.grid import (
     rounding_of,
     uniform_grid,
 )
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.onto_grid import (
+    FEWEST,
+    MOST_UPSAMPLING,
+    Key,
+    at_times,
+    decided_holds,
+    even_expected,
+    flight_of,
+    long_gap,
+    missing_notes,
+)
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import read_channels
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
-from heli_jax.flights.table import Table, column, shown, wrong
+from heli_jax.flights.resample import new_clock
+from heli_jax.flights.table import Table, column, wrong
 
-_FEWEST = 8
-"""samples in a run"""
-_MOST_UPSAMPLING = 100
-"""times the log's rate: more is a slip, and fills the memory with straight lines"""
 _DEFAULT = ReadOptions()
 
 
@@ -95,21 +102,12 @@ def _read_table(table: Table, request: Request) -> Flight:
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
     # Before any resampling, which moves an input at more samples than the log shows it to.
-    holds = _holds(request, signals)
+    holds = decided_holds(request, signals)
     dt, samples, more = _on_grid(stamps, options.rate, signals, grid, holds)
-    return Flight(
-        dt=dt,
-        inputs=request.of_kind("input", samples),
-        outputs=request.of_kind("output", samples),
-        t0=float(clock.stamps[rows.start] * clock.scale),
-        sd=request.noise(),
-        known=request.known,
-        hold_out=options.hold_out,
-        name=options.name,
-        source=Source(table.path, table.sha256, (*notes, *_missing(request, signals), *more)),
-        hold={key: decision.hold for key, decision in holds.items()},
-        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
-    )
+    notes = (*notes, *missing_notes(request, signals), *more)
+    source = Source(table.path, table.sha256, notes)
+    t0 = float(clock.stamps[rows.start] * clock.scale)
+    return flight_of(request, samples, dt, t0, holds, source)
 
 
 def require_moving_inputs(flight: Flight) -> None:
@@ -200,13 +198,13 @@ def _rows(
         # The bounds are inclusive whatever the rounding of the stamps.
         first = int(np.searchsorted(elapsed, start - 1e-3 * step, side="left"))
         last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
-    if last - first < _FEWEST:
+    if last - first < FEWEST:
         count = max(last - first, 0)
-        raise wrong(path, f"{where} holds {count} samples, expected at least {_FEWEST}")
+        raise wrong(path, f"{where} holds {count} samples, expected at least {FEWEST}")
     return slice(first, last), notes
 
 
-_Samples = dict[tuple[str, str], np.ndarray]
+_Samples = dict[Key, np.ndarray]
 
 
 def _to_si(
@@ -227,27 +225,6 @@ def _to_si(
     return samples
 
 
-def _holds(request: Request, signals: _Samples) -> dict[str, Decision]:
-    """What each input does between samples: as stated, or by what the log itself shows."""
-    holds = {}
-    for (key, kind), signal in request.signals.items():
-        if kind == "input":
-            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
-            holds[key] = decide(signals[key, kind]) if signal.hold == "auto" else stated
-    return holds
-
-
-def _missing(request: Request, signals: _Samples) -> list[str]:
-    """A note for every output with missing samples."""
-    notes = []
-    for (key, kind), values in signals.items():
-        count = int(np.isnan(values).sum())
-        if count:
-            name = request.signals[key, kind].name
-            notes.append(f"{count} of {values.size} samples of {shown(name)} are missing")
-    return notes
-
-
 def _check_step(stamps: _Stamps) -> None:
     """Refuse steps that no clock resolves: the time's unit is wrong."""
     usual = float(np.median(np.diff(stamps.seconds)))
@@ -262,11 +239,7 @@ def _uneven(stamps: _Stamps, uneven: Uneven) -> InputError:
         problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
     else:
         problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
-    remedy = f"give `rate: {1 / uneven.usual:.4g}` to resample, or a window"
-    # Where a gap is too long to be bridged, a rate would only lead to the next error.
-    if np.diff(stamps.seconds).max() > longest_gap(stamps.seconds):
-        remedy = "give a window"
-    expected = f"expected a uniform grid; {remedy} without such steps"
+    expected = even_expected(stamps.seconds, uneven.usual)
     return stamps.wrong(f"{problem}, {expected}", uneven.row)
 
 
@@ -296,27 +269,26 @@ def _on_grid(
     samples = {}
     for (key, kind), x in signals.items():
         stays = kind == "input" and holds[key].hold == "zero-order"
-        samples[key, kind] = (hold if stays else resampled)(seconds, x, clock.times)
+        samples[key, kind] = at_times(stays, seconds, x, clock.times)
     return clock.dt, samples, notes + clock.notes
 
 
 def _check_rate(stamps: _Stamps, rate: float) -> None:
     """Refuse gaps that nothing should bridge, and rates that make no sense for the log."""
     seconds, path = stamps.seconds, stamps.table.path
-    steps = np.diff(seconds)
-    row, most = int(np.argmax(steps)), longest_gap(seconds)
-    if steps[row] > most * (1 + 1e-9):  # a step of exactly the limit, but for its rounding, passes
+    gap = long_gap(seconds)
+    if gap is not None:
         raise stamps.wrong(
-            f"a gap of {steps[row]:.6g} s, {seconds[row]:.6g} s after the first sample,"
-            f" expected none longer than {most:.3g} s; give a window without it",
-            row + 1,
+            f"a gap of {gap.step:.6g} s, {seconds[gap.row]:.6g} s after the first sample,"
+            f" expected none longer than {gap.most:.3g} s; give a window without it",
+            gap.row + 1,
         )
-    usual = float(np.median(steps))
+    usual = float(np.median(np.diff(seconds)))
     count = (seconds[-1] - seconds[0]) * rate
-    if not count >= _FEWEST - 1 - 1e-6:
-        problem = f"a rate of {rate:g} Hz leaves fewer than {_FEWEST} samples, expected more"
+    if not count >= FEWEST - 1 - 1e-6:
+        problem = f"a rate of {rate:g} Hz leaves fewer than {FEWEST} samples, expected more"
         raise wrong(path, problem)
     # The product can overflow where the rate alone is finite.
-    if not (rate * usual <= _MOST_UPSAMPLING and math.isfinite(count)):
+    if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
-        raise wrong(path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")

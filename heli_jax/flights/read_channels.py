@@ -9,22 +9,25 @@ import numpy as np
 from heli_jax import units
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.onto_grid import (
+    FEWEST,
+    MOST_UPSAMPLING,
+    Key,
+    at_times,
+    decided_holds,
+    even_expected,
+    flight_of,
+    long_gap,
+    missing_notes,
+)
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
+from heli_jax.flights.resample import new_clock
 from heli_jax.flights.table import shown, wrong
-
-_FEWEST = 8
-"""samples of a topic"""
-_MOST_UPSAMPLING = 100
-"""times the fastest topic's rate: more is a slip, and fills the memory with straight lines"""
 
 _MOST_GAPS = 20
 """times the samples that there are"""
-
-_Key = tuple[str, str]
-"""a model's name, and `input` or `output`"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +76,15 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
     options = request.options
     signals = _signals(log, request)
     # Before any resampling, which moves an input at more samples than the log shows it to.
-    holds = _holds(request, signals)
+    values = {key: signal.values for key, signal in signals.items()}
+    holds = decided_holds(request, values)
     start, dt, samples, notes = _on_grid(log.path, options.rate, signals, holds)
-    return Flight(
-        dt=dt,
-        inputs=request.of_kind("input", samples),
-        outputs=request.of_kind("output", samples),
-        t0=log.first_time + start,
-        sd=request.noise(),
-        known=request.known,
-        hold_out=options.hold_out,
-        name=options.name,
-        source=Source(log.path, log.sha256, (*log.notes, *_missing(request, signals), *notes)),
-        hold={key: decision.hold for key, decision in holds.items()},
-        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
-    )
+    notes = (*log.notes, *missing_notes(request, values), *notes)
+    source = Source(log.path, log.sha256, notes)
+    return flight_of(request, samples, dt, log.first_time + start, holds, source)
 
 
-def _signals(log: ChannelLog, request: Request) -> dict[_Key, _Signal]:
+def _signals(log: ChannelLog, request: Request) -> dict[Key, _Signal]:
     """The signals in SI inside the window, each on the clock of its topic."""
     clocks: dict[str, TopicClock] = {}
     signals = {}
@@ -136,10 +130,10 @@ def topic_clock(
         inside = np.flatnonzero((elapsed >= window[0] - 1e-9) & (elapsed <= window[1] + 1e-9))
         first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
     seconds = elapsed[first:last]
-    if seconds.size < _FEWEST:
+    if seconds.size < FEWEST:
         where = "" if window is None else f" from {window[0]:g} s to {window[1]:g} s"
         span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
-        problem = f"holds {seconds.size} samples{where}, expected at least {_FEWEST}{span}"
+        problem = f"holds {seconds.size} samples{where}, expected at least {FEWEST}{span}"
         raise wrong(path, problem, place)
     steps = np.diff(seconds)
     back = np.flatnonzero(steps <= 0)
@@ -153,33 +147,12 @@ def topic_clock(
     return TopicClock(topic, seconds, slice(first, last))
 
 
-def _holds(request: Request, signals: Mapping[_Key, _Signal]) -> dict[str, Decision]:
-    """What each input does between samples: as stated, or by what its own samples show."""
-    holds = {}
-    for (key, kind), signal in request.signals.items():
-        if kind == "input":
-            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
-            holds[key] = decide(signals[key, kind].values) if signal.hold == "auto" else stated
-    return holds
-
-
-def _missing(request: Request, signals: Mapping[_Key, _Signal]) -> list[str]:
-    """A note for every output with missing samples."""
-    notes = []
-    for key, signal in signals.items():
-        count = int(np.isnan(signal.values).sum())
-        if count:
-            name = shown(request.signals[key].name)
-            notes.append(f"{count} of {signal.values.size} samples of {name} are missing")
-    return notes
-
-
 def _on_grid(
     path: str,
     rate: float | None,
-    signals: Mapping[_Key, _Signal],
+    signals: Mapping[Key, _Signal],
     holds: Mapping[str, Decision],
-) -> tuple[float, float, dict[_Key, np.ndarray], tuple[str, ...]]:
+) -> tuple[float, float, dict[Key, np.ndarray], tuple[str, ...]]:
     """First time and step [s] of the grid, the samples (N,) on it, and notes on how they came
     there."""
     # One for each topic, since signals of the same topic share their stamps.
@@ -198,10 +171,8 @@ def _on_grid(
     times = common_times(path, clocks, rate)
     samples = {}
     for (key, kind), signal in signals.items():
-        # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
         stays = kind == "input" and holds[key].hold == "zero-order"
-        method = hold if stays else resampled
-        samples[key, kind] = method(signal.clock.seconds, signal.values, times)
+        samples[key, kind] = at_times(stays, signal.clock.seconds, signal.values, times)
     return float(times[0]), 1.0 / rate, samples, notes
 
 
@@ -215,22 +186,17 @@ def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
             problem = f"its times leave a uniform grid by {grid.drift:.2g} samples"
         else:
             problem = f"a step of {grid.step:.6g} s before {at}, usual are {grid.usual:.6g} s"
-        # Where a gap is too long to be bridged, a rate would only lead to the next error.
-        bridged = np.diff(seconds).max() <= longest_gap(seconds)
-        remedy = f"`rate: {1 / grid.usual:.4g}` to resample, or " if bridged else ""
-        problem += f", expected a uniform grid; give {remedy}a window without such steps"
+        problem += f", {even_expected(seconds, grid.usual)}"
         raise wrong(path, problem, f"topic {shown(clock.topic)}")
     return grid.dt, grid.notes
 
 
 def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
     for clock in clocks:
-        steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
-        row = int(np.argmax(steps))
-        # A step of exactly the limit, but for its rounding, passes.
-        if steps[row] > most * (1 + 1e-9):
-            problem = f"a gap of {steps[row]:.6g} s at {clock.seconds[row]:.6g} s, expected none"
-            problem += f" longer than {most:.3g} s; give a window without it"
+        gap = long_gap(clock.seconds)
+        if gap is not None:
+            problem = f"a gap of {gap.step:.6g} s at {clock.seconds[gap.row]:.6g} s, expected none"
+            problem += f" longer than {gap.most:.3g} s; give a window without it"
             raise wrong(path, problem, f"topic {shown(clock.topic)}")
 
 
@@ -252,12 +218,12 @@ def common_times(path: str, clocks: list[TopicClock], rate: float) -> np.ndarray
     fastest = min(clock.usual for clock in clocks)
     count = (end - start) * rate
     # Written so that a NaN is refused too, here and below.
-    if not count >= _FEWEST - 1 - 1e-6:
+    if not count >= FEWEST - 1 - 1e-6:
         problem = f"the topics share {max(end - start, 0.0):.6g} s, at {rate:g} Hz fewer than"
-        raise wrong(path, f"{problem} {_FEWEST} samples, expected more")
-    if not (rate * fastest <= _MOST_UPSAMPLING and math.isfinite(count)):
+        raise wrong(path, f"{problem} {FEWEST} samples, expected more")
+    if not (rate * fastest <= MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for topics of at most {1 / fastest:.4g} Hz"
-        raise wrong(path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")
     # One wrong stamp at the end of a damaged log would otherwise fill the memory.
     most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
     if count > most:
