@@ -10,8 +10,11 @@ import numpy as np
 
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, longest_gap, resampled
+from heli_jax.flights.resample import hold, in_gaps, longest_gap, resampled
+from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
+from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
 Key = tuple[str, str]
@@ -44,7 +47,9 @@ def even_expected(seconds: np.ndarray, usual: float) -> str:
     # Where a gap is too long to be bridged, a rate would only lead to the next error.
     bridged = long_gap(seconds) is None
     remedy = f"`rate: {1 / usual:.4g}` to resample, or " if bridged else ""
-    return f"expected a uniform grid; give {remedy}a window without such steps"
+    # The parts beside it may well be uniform.
+    split = "" if bridged else " or `gaps: split`"
+    return f"expected a uniform grid; give {remedy}a window without such steps{split}"
 
 
 def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
@@ -68,17 +73,49 @@ def missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[st
     return notes
 
 
-def at_times(stays: bool, seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """A signal's samples (M,) at other times.
+def measured_once(
+    request: Request, values: Mapping[Key, np.ndarray]
+) -> tuple[dict[Key, np.ndarray], list[str]]:
+    """The signals (N,), repeated values of slow outputs taken as missing, and notes."""
+    outputs = request.of_kind("output", values)
+    stated = {name: request.signals[name, "output"].repeats for name in outputs}
+    made, notes = repeats_removed(outputs, stated)
+    return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
+
+
+def at_times(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+    times: np.ndarray,
+) -> tuple[dict[Key, np.ndarray], list[str]]:
+    """The signals' samples (M,) on a grid, and notes.
+
+    Inputs follow their hold. Outputs are interpolated, or low-pass filtered where the rate goes
+    down; those that are slower than the grid stand at the instants nearest to their own.
 
     Args:
-        stays: whether it is an input that stays until its next sample.
-        seconds: stamps (N,) [s], increasing.
-        values: samples (N,).
-        times: (M,) [s], evenly spaced.
+        request: names them.
+        signals: by key, SI, each on its own clock.
+        holds: by input.
+        times: of the grid (M,) [s].
     """
-    # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
-    return (hold if stays else resampled)(seconds, values, times)
+    samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    for (key, kind), signal in signals.items():
+        if kind == "input":
+            # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
+            method = hold if holds[key].hold == "zero-order" else resampled
+            samples[key, kind] = method(*signal, times)
+        elif is_slower(signal, rate):
+            placed = at_nearest(signal, times)
+            samples[key, kind] = placed.samples
+            notes.append(slower_note(shown(request.signals[key, kind].name), placed, signal, rate))
+        else:
+            own = own_clock(signal)
+            # Missing rows are no longer there to say where too much is missing.
+            gaps = in_gaps(own.seconds, times) if own is not signal else False
+            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
+    return samples, notes
 
 
 def flight_of(

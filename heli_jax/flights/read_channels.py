@@ -1,8 +1,8 @@
 """From the channels of an autopilot's log to a `Flight`: each signal from its own clock."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from heli_jax.flights.onto_grid import (
     even_expected,
     flight_of,
     long_gap,
+    measured_once,
     missing_notes,
 )
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
+from heli_jax.flights.slower import Timed, is_slower
 from heli_jax.flights.table import shown, wrong
 
 _MOST_GAPS = 20
@@ -49,18 +51,24 @@ class TopicClock:
 
 
 @dataclass(frozen=True, eq=False)
-class _Signal:
-    """Samples (N,) in SI on a clock."""
+class ClockedSignal:
+    """Samples (N,) in SI on the clock of a topic."""
 
     clock: TopicClock
     values: np.ndarray
+
+    @property
+    def timed(self) -> Timed:
+        """The stamps and the samples."""
+        return Timed(self.clock.seconds, self.values)
 
 
 def read_channels(log: ChannelLog, request: Request) -> Flight:
     """The flight of an autopilot's log.
 
     Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
-    their hold, outputs on straight lines.
+    their hold, outputs on straight lines where they are as fast as it; what is slower is missing
+    between its samples.
 
     Args:
         log: what was opened.
@@ -70,21 +78,36 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
         InputError: a channel is missing or holds no numbers, a clock is none, the window lies
             outside the log, a rate is needed or makes no sense.
     """
-    if request.time is not None:
-        problem = "its topics have clocks of their own, expected no time to be stated, got "
-        raise wrong(log.path, problem + shown(request.time.name))
-    options = request.options
-    signals = _signals(log, request)
+    source = Source(log.path, log.sha256, log.notes)
+    return flight_of_signals(signals_of(log, request), request, source, log.first_time)
+
+
+def flight_of_signals(
+    signals: Mapping[Key, ClockedSignal], request: Request, source: Source, first_time: float
+) -> Flight:
+    """The flight of signals with clocks of their own.
+
+    Args:
+        signals: by key, in SI inside the window.
+        request: what was asked for.
+        source: where they came from, with notes on it so far.
+        first_time: from which the clocks count [s], in the log's own count.
+
+    Raises:
+        InputError: a rate is needed or makes no sense, or a clock has a gap.
+    """
     # Before any resampling, which moves an input at more samples than the log shows it to.
     values = {key: signal.values for key, signal in signals.items()}
     holds = decided_holds(request, values)
-    start, dt, samples, notes = _on_grid(log.path, options.rate, signals, holds)
-    notes = (*log.notes, *missing_notes(request, values), *notes)
-    source = Source(log.path, log.sha256, notes)
-    return flight_of(request, samples, dt, log.first_time + start, holds, source)
+    values, repeated = measured_once(request, values)
+    signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
+    start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
+    notes = (*source.notes, *repeated, *missing_notes(request, values), *notes)
+    source = replace(source, notes=notes)
+    return flight_of(request, samples, dt, first_time + start, holds, source)
 
 
-def _signals(log: ChannelLog, request: Request) -> dict[Key, _Signal]:
+def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
     """The signals in SI inside the window, each on the clock of its topic."""
     clocks: dict[str, TopicClock] = {}
     signals = {}
@@ -103,7 +126,7 @@ def _signals(log: ChannelLog, request: Request) -> dict[Key, _Signal]:
             at = f"channel {shown(signal.name)}"
             problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"
             raise wrong(log.path, f"{problem}, expected a finite number", at)
-        signals[key, kind] = _Signal(clock, values)
+        signals[key, kind] = ClockedSignal(clock, values)
     return signals
 
 
@@ -149,14 +172,14 @@ def topic_clock(
 
 def _on_grid(
     path: str,
-    rate: float | None,
-    signals: Mapping[Key, _Signal],
+    request: Request,
+    signals: Mapping[Key, ClockedSignal],
     holds: Mapping[str, Decision],
 ) -> tuple[float, float, dict[Key, np.ndarray], tuple[str, ...]]:
     """First time and step [s] of the grid, the samples (N,) on it, and notes on how they came
     there."""
-    # One for each topic, since signals of the same topic share their stamps.
-    clocks = list({s.clock.topic: s.clock for s in signals.values()}.values())
+    rate = request.options.rate
+    clocks = clocks_of(signals.values())
     if rate is None:
         if len(clocks) > 1:
             slowest = min(1 / clock.usual for clock in clocks)
@@ -166,14 +189,28 @@ def _on_grid(
         dt, notes = _uniform(path, clocks[0])
         samples = {key: signal.values for key, signal in signals.items()}
         return float(clocks[0].seconds[0]), dt, samples, notes
-    notes = tuple(f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes)
+    clocks = on_all_the_time(signals, rate)
+    notes = [f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes]
     _require_no_gaps(path, clocks)
     times = common_times(path, clocks, rate)
-    samples = {}
-    for (key, kind), signal in signals.items():
-        stays = kind == "input" and holds[key].hold == "zero-order"
-        samples[key, kind] = at_times(stays, signal.clock.seconds, signal.values, times)
-    return float(times[0]), 1.0 / rate, samples, notes
+    timed = {key: signal.timed for key, signal in signals.items()}
+    samples, more = at_times(request, timed, holds, times)
+    return float(times[0]), 1.0 / rate, samples, (*notes, *more)
+
+
+def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
+    """One for each topic, since signals of the same topic share their stamps."""
+    return list({s.clock.topic: s.clock for s in signals}.values())
+
+
+def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
+    """The clocks whose samples the flight needs throughout: of the inputs, and of outputs that are
+    not slower than the `rate` [Hz]; what is slower is missing most of the time anyway."""
+    needed = [s for (_, kind), s in signals.items() if kind == "input"]
+    needed += [
+        s for (_, kind), s in signals.items() if kind == "output" and not is_slower(s.timed, rate)
+    ]
+    return clocks_of(needed or signals.values())
 
 
 def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
@@ -196,7 +233,8 @@ def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
         gap = long_gap(clock.seconds)
         if gap is not None:
             problem = f"a gap of {gap.step:.6g} s at {clock.seconds[gap.row]:.6g} s, expected none"
-            problem += f" longer than {gap.most:.3g} s; give a window without it"
+            problem += f" longer than {gap.most:.3g} s; give a window without it, or"
+            problem += " `gaps: split`"
             raise wrong(path, problem, f"topic {shown(clock.topic)}")
 
 
