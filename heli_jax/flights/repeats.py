@@ -51,7 +51,7 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
     Where a value stays for longer than the `usual` number of samples it was measured again, and
     every so many are kept.
     """
-    begins = np.flatnonzero(np.r_[True, np.diff(values) != 0.0])
+    begins = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     ends = np.r_[begins[1:], values.size]
     since = np.arange(values.size) - np.repeat(begins, ends - begins)
     left = np.repeat(ends, ends - begins) - np.arange(values.size)
@@ -101,11 +101,11 @@ def repeats_removed(
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lengths (r,) of the complete runs of equal values, and sizes (r + 1,) of the jumps."""
     seen = values[~np.isnan(values)]
-    moves = np.diff(seen)
-    at = np.flatnonzero(moves)
-    return np.diff(at), np.abs(moves[at])
+    at = np.flatnonzero(seen[1:] != seen[:-1])
+    with np.errstate(over="ignore"):  # of huge values infinite jumps: no less regular
+        return np.diff(at), np.abs(seen[at + 1] - seen[at])
 
 
 def _moves(values: np.ndarray) -> bool:
     seen = values[~np.isnan(values)]
-    return seen.size > 1 and float(np.mean(np.diff(seen) != 0.0)) >= _MOVES
+    return seen.size > 1 and float(np.mean(seen[1:] != seen[:-1])) >= _MOVES

@@ -73,9 +73,11 @@ def at_nearest(signal: Timed, times: np.ndarray) -> Placed:
     if not inside.any():
         return Placed(samples, 0.0, 0)
     few = seconds.size < 3
-    slope = np.zeros(seconds.size) if few else np.gradient(values, seconds, edge_order=2)
     away = times[np.clip(nearest, 0, times.size - 1)] - seconds
-    moved = values + slope * away
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = np.zeros(seconds.size) if few else np.gradient(values, seconds, edge_order=2)
+        moved = values + slope * away
+    moved = np.where(np.isfinite(moved), moved, values)  # the slope of huge values is no number
     # Backwards by distance, so that of two at one instant the nearer is written last.
     order = np.argsort(-np.abs(away), kind="stable")
     order = order[inside[order]]
