@@ -82,7 +82,6 @@ class SignalsConfig(_Strict):
 class AlignConfig(_Strict):
     """A motion that both logs hold, from which the lag between their clocks is found."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
     # A word of Python's own, so that the field has another name.
     same: Annotated[str, Field(alias="with")]
     """a signal of the first log, by the model's name"""

@@ -62,6 +62,9 @@ def lag_between(a: Timed, b: Timed) -> Lag:
         NotAligned: too short, too weakly correlated, against one another, or ambiguous.
     """
     a, b = own_clock(a), own_clock(b)
+    # Each from its own beginning: an epoch's digits would cost those of the lag.
+    first_a, first_b = float(a.seconds[0]), float(b.seconds[0])
+    a, b = Timed(a.seconds - first_a, a.values), Timed(b.seconds - first_b, b.values)
     step = max(usual_step(a.seconds), usual_step(b.seconds))
     (at_a, even_a), (at_b, even_b) = _even(a, step), _even(b, step)
     shift, correlation = _coarse(even_a, even_b)
@@ -71,7 +74,8 @@ def lag_between(a: Timed, b: Timed) -> Lag:
     x, t = even_a[first:last], at_a + step * np.arange(first, last)
     y = _Smooth(at_b, even_b, step)
     lag, sd = _refined(t, x, y, lag, step)
-    return Lag(lag, sd, correlation, (last - first - 1) * step, _drift(t, x, y, lag, step))
+    drift = _drift(t, x, y, lag, step)
+    return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step, drift)
 
 
 def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:

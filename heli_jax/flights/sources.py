@@ -142,10 +142,12 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Besi
     signals = _clocked(_open(asked), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
-    return Beside(shifted, _note(name, also, lag))
+    sha256 = other.sha256 if isinstance(other, ChannelLog) else other.table.sha256
+    return Beside(shifted, _note(f"{name} (sha256 {sha256[:12]})", also, lag))
 
 
 def _note(name: str, also: Also, lag: Lag) -> str:
+    """What was found of the clock of a further log, in words."""
     words = (
         f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
         f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "

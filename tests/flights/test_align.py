@@ -112,7 +112,8 @@ def test_two_files_make_one_flight(tmp_path):
     at = 5.0 + flight.times[seen]
     assert at[0] == pytest.approx(7.0, abs=6e-3)
     np.testing.assert_allclose(flight.outputs["roll"][seen], 0.5 * at, atol=2e-3)
-    (note,) = [n for n in flight.source.notes if n.startswith("mocap.csv: 7")]
+    (note,) = [n for n in flight.source.notes if n.startswith("mocap.csv (sha256 ")]
+    assert "): 7" in note
     assert "(sd " in note
     wrong = dataclasses.replace(also, same="yaw")
     with pytest.raises(InputError, match="expected a signal of the first log"):
@@ -147,6 +148,10 @@ def test_by_configuration(tmp_path):
         return config.read_flights(config.load(tmp_path / "flight.yaml"))
 
     (made,) = read(flight)
+    # As a run writes it out, for whoever repeats it from another folder.
+    written_out = config.resolved(config.load(tmp_path / "flight.yaml"))["flights"][0]["also"][0]
+    assert written_out["log"] == str((tmp_path / "mocap.csv").resolve())
+    assert written_out["align"] == also["align"]
     assert list(made.outputs) == ["roll_rate", "roll"]
     also["signals"]["outputs"]["roll_rate"] = {"signal": "q", "unit": "deg/s"}
     with pytest.raises(InputError, match=r"also\[0\].*'roll_rate' is taken from another log"):
