@@ -34,9 +34,9 @@ def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02), drift=0.0):
 
 
 def test_lags_are_found_to_a_part_of_a_sample():
-    """Over 12 records; experiments/alignment.py has more, and other rates and noise."""
+    """Over 6 records; experiments/alignment.py has more, and other rates and noise."""
     z = []
-    for seed in range(12):
+    for seed in range(6):
         lag = np.random.default_rng(seed + 99).uniform(-5, 5) + 1.6e9 * (seed % 2)
         found = lag_between(*pair(seed, lag))
         assert found.sd < 2e-3
@@ -44,7 +44,7 @@ def test_lags_are_found_to_a_part_of_a_sample():
         z.append((found.lag - lag) / found.sd)
     # 1.6e9 s are 200 ns in float64: the epoch costs nothing.
     assert np.abs(z).max() < 3.0
-    assert 0.5 < np.std(z) < 1.5
+    assert 0.4 < np.std(z) < 1.6
 
 
 def test_a_clock_that_drifts_is_told():

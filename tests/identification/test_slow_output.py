@@ -2,14 +2,19 @@
 
 import dataclasses
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Problem, fit, models
 from heli_jax.flights.slower import Timed, at_nearest
+from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.equation_error.smoothing import segments
 from heli_jax.identification.validation.feedback import untested
 from heli_jax.identification.validation.metrics import whiteness
+from heli_jax.report.figures.residuals import residual_correlation
+from heli_jax.report.figures.time_domain import response
 
 from .bench import BENCH, amplitude_for, denominators, steps, vehicle
 
@@ -84,6 +89,38 @@ def test_feedback_that_cannot_be_told_is_said(fits):
     alone = dataclasses.replace(flight, outputs={"roll": flight.outputs["roll"]})
     (words,) = untested(problem(alone))
     assert "was not tested" in words
+
+
+def test_an_equation_error_start_has_something_to_smooth():
+    flight = record(0, slow=True)
+    parts, bridged = segments(flight.outputs)
+    (part,) = parts
+    assert part.stop - part.start > 0.97 * N
+    truth_there = truth(0)[1]["roll"][::FINE][part]
+    assert np.std(bridged["roll"][part] - truth_there) < 0.1 * np.std(truth_there)
+    # A gap that is long for the slow sensor too ends a segment.
+    roll = np.where(abs(np.arange(N) - 700) < 30, np.nan, flight.outputs["roll"])
+    assert len(segments({"roll": roll})[0]) == 2
+
+
+def test_recursive_least_squares_takes_what_is_whole(bench30):
+    flight = record(0, slow=True)
+    made = baseline(models.roll_on_stand, bench30, flight, order=2)
+    assert made.output == "roll_rate"
+    assert any("which roll has too few of" in s for s in made.sentences)
+
+
+def test_figures_show_single_samples(fits):
+    signals = fits[True].signals[0]
+    top, below, *_ = response(signals, "roll", models.roll_on_stand)
+    for ax, line in ((top, top.lines[0]), (below, below.lines[0])):
+        assert line.get_marker() == "o"
+        assert line.get_xdata().size == 148
+        plt.close(ax.figure)
+    first, *_ = residual_correlation(signals, "roll")
+    # Lags in the sensor's own samples, a quarter of which there are.
+    assert first.get_xlim()[1] == pytest.approx(0.2 * 37.5)
+    plt.close(first.figure)
 
 
 def test_a_handful_of_samples_is_refused():
