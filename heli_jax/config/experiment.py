@@ -298,7 +298,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     """
     config, path = experiment.config, experiment.path
     # Without what is None: an absent key means the same, and stays right where a default changes.
-    content = config.model_dump(mode="json", exclude_none=True)
+    content = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     # A shipped model keeps its name, which means the same on any machine.
     if isinstance(config.model, LinearConfig) and not is_shipped(config.model.linear):
         content["model"] = {"linear": str((path.parent / config.model.linear).resolve())}
@@ -307,7 +307,8 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
             del free["start"]
     for flight in content.get("flights", []):
         # With links resolved too: the run's config.yaml is read from its own directory.
-        flight["log"] = str((path.parent / flight["log"]).resolve())
+        for log in (flight, *flight["also"]):
+            log["log"] = str((path.parent / log["log"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())

@@ -21,6 +21,8 @@ class Signal:
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
         hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
             log shows of it.
+        repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
+            table), "keep", or "auto", missing where that is unmistakable.
     """
 
     name: str
@@ -28,6 +30,7 @@ class Signal:
     si: str
     sd: float | None = None
     hold: str = "auto"
+    repeats: str = "auto"
 
 
 @dataclass(frozen=True)
