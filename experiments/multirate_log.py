@@ -138,7 +138,7 @@ RATES = (GYRO_HZ, ATTITUDE_HZ, GPS_HZ, STICK_HZ)
 
 def config(measured: bool) -> dict:
     """The configuration of a fit, with filter and delays or without."""
-    gyro, gps = {"signal": "IMU.GyrX"}, {"signal": "GPS.VY"}
+    gyro, gps = {"signal": "IMU.GyrX", "unit": "rad/s"}, {"signal": "GPS.VY", "unit": "m/s"}
     if measured:
         gyro |= {"filter": "from log", "delay": GYRO_LATE}
         gps |= {"delay": GPS_LATE}
