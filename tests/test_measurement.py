@@ -110,7 +110,10 @@ def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
         tmp_path / "flight.log", np.sin(TIMES), (("INS_GYRO_FILTER", 0), ("INS_HNTCH_ENABLE", 1))
     )
     (moving,) = read_flights(load(flight()))
-    assert "INS_HNTCH_ENABLE = 1.0), which are not modelled" in moving.source.cautions[0]
+    assert (
+        "p was also filtered by INS_HNTCH_ENABLE = 1.0: such filters move"
+        in moving.source.cautions[0]
+    )
 
 
 ROTORFLIGHT = {
@@ -138,11 +141,16 @@ def test_settings_of_firmwares():
     logged = logged_filters("Betaflight 4.2", betaflight, "gyroADC[2]")
     # Q of a notch from its lower edge: f f1 / (f^2 - f1^2).
     assert logged.filters == (Filter("pt1", 90.0), Filter("notch", 200.0, 30000 / 17500))
-    assert logged.dynamic == ("dyn_notch_count = 3",)
+    assert logged.unknown == ("dyn_notch_count = 3",)
     moving = {**ROTORFLIGHT, "gyro_lpf1_dyn_hz": "25,200"}
     logged = logged_filters("Rotorflight 4.3.0", moving, "gyroADC[0]")
-    assert logged.dynamic == ("gyro_lpf1_dyn_hz = 25,200",)
+    assert logged.unknown == ("gyro_lpf1_dyn_hz = 25,200",)
     assert Filter("pt1", 150.0) not in logged.filters
+    # Its newer versions number the types from 6 on otherwise.
+    newer = {**ROTORFLIGHT, "gyro_lpf1_type": "7", "gyro_lpf2_type": "0"}
+    logged = logged_filters("Rotorflight 4.6.0", newer, "gyroADC[0]")
+    assert logged.unknown == ("gyro_lpf1_static_hz = 150 of type 7",)
+    assert len(logged.filters) == 2
 
 
 def test_lines_are_found_named_and_unfolded():

@@ -22,8 +22,8 @@ class LoggedFilters(NamedTuple):
     """those with fixed constants"""
     settings: tuple[str, ...]
     """that say so, as `NAME = value`"""
-    dynamic: tuple[str, ...]
-    """settings of filters that move in flight and cannot be modelled by constants"""
+    unknown: tuple[str, ...]
+    """settings of filters that move in flight, which no constants describe, or of unknown kind"""
 
 
 def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
@@ -47,7 +47,7 @@ class _Reading:
         self.firmware, self.settings = firmware, settings
         self.filters: list[Filter] = []
         self.used: list[str] = []
-        self.dynamic: list[str] = []
+        self.unknown: list[str] = []
 
     def numbers(self, name: str) -> list[float]:
         """The numbers of a setting; none where it is not there or holds something else."""
@@ -67,12 +67,12 @@ class _Reading:
 
     def moving(self, *names: str) -> None:
         """Filters that follow the flight, where a setting of these is not zero."""
-        self.dynamic += [f"{n} = {self.settings[n]}" for n in names if any(self.numbers(n))]
+        self.unknown += [f"{n} = {self.settings[n]}" for n in names if any(self.numbers(n))]
 
     @property
     def result(self) -> LoggedFilters:
         """All of it."""
-        return LoggedFilters(tuple(self.filters), tuple(self.used), tuple(self.dynamic))
+        return LoggedFilters(tuple(self.filters), tuple(self.used), tuple(self.unknown))
 
 
 def _px4_gyro(read: _Reading) -> LoggedFilters | None:
@@ -147,11 +147,15 @@ def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
     if rotorflight:
         _decimation(read)
     for type_name, name, moving in stages:
-        hz, kind = read.number(name), read.numbers(type_name)
+        hz, kind = read.number(name), next(iter(read.numbers(type_name)), -1.0)
+        if rotorflight and kind == 0:  # none; in Betaflight a lag
+            continue
         if _moves(read.numbers(moving), hz, rotorflight):
             read.moving(moving)
-        elif hz > 0 and kind and kind[0] in types:
-            read.add(name, types[kind[0]](hz))
+        elif hz > 0 and kind in types:
+            read.add(name, types[kind](hz))
+        elif hz > 0:
+            read.unknown.append(f"{name} = {hz:g} of type {kind:g}")
     for hz, edge in zip(
         read.numbers("gyro_notch_hz"), read.numbers("gyro_notch_cutoff"), strict=False
     ):

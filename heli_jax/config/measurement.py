@@ -132,10 +132,10 @@ def filter_cautions(source: Source | None, flight: FlightConfig) -> tuple[str, .
             continue
         if output.filter is None and logged.filters:
             said.append(_not_modelled(name, logged))
-        if logged.dynamic:
+        if logged.unknown:
             said.append(
-                f"{name}: the autopilot filtered it with filters that move in flight "
-                f"({', '.join(_short(s) for s in logged.dynamic)}), which are not modelled"
+                f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}: such "
+                "filters move in flight or are of an unknown kind, and are not modelled"
             )
     return tuple(said)
 
