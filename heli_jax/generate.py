@@ -197,7 +197,7 @@ def _run(
             u,
             dt=1.0 / settings.rate,
             initial_state=x,
-            substeps=substeps_for(1.0 / settings.rate),
+            substeps=substeps_for(1.0 / settings.rate, model.fastest),
             key=jax.random.key(settings.seed) if model.noise_intensity else None,
             feedback=pilot,
             events=ends or None,

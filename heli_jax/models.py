@@ -8,6 +8,7 @@ from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import with_delays
+from heli_jax.dynamics.onboard.filters import Filter, with_filters
 from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
 from heli_jax.dynamics.onboard.sensors import with_sensors
 from heli_jax.dynamics.onboard.servos import with_servos
@@ -19,6 +20,7 @@ roll_on_stand = on_stand(roll)
 pitch_on_stand = on_stand(pitch)
 
 __all__ = [
+    "Filter",
     "by_name",
     "helicopter",
     "on_stand",
@@ -27,6 +29,7 @@ __all__ = [
     "roll",
     "roll_on_stand",
     "with_delays",
+    "with_filters",
     "with_gyro",
     "with_rate_loop",
     "with_sensors",

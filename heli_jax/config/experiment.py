@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.measurement import with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
@@ -86,6 +87,8 @@ def _started(config: Config, path: Path, model: Model) -> Model:
     # The devices first: their states can be named in the initial state as those of the bare model
     # are.
     model = with_onboard(model, config.onboard, path)
+    # Behind all of them, since it is what the autopilot did to what its sensors had.
+    model = with_measurement(model, config.flights, path)
     if not config.initial_state:
         return model
     for name in config.initial_state:
@@ -295,7 +298,7 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     """
     config, path = experiment.config, experiment.path
     # Without what is None: an absent key means the same, and stays right where a default changes.
-    content = config.model_dump(mode="json", exclude_none=True)
+    content = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     # But the one key whose absence means something else.
     if config.rls is None:
         content["rls"] = None
@@ -307,7 +310,8 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
             del free["start"]
     for flight in content.get("flights", []):
         # With links resolved too: the run's config.yaml is read from its own directory.
-        flight["log"] = str((path.parent / flight["log"]).resolve())
+        for log in (flight, *flight["also"]):
+            log["log"] = str((path.parent / log["log"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())

@@ -2,14 +2,23 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
+from heli_jax.config.measurement import filter_cautions
+from heli_jax.config.schema import (
+    AlsoConfig,
+    FlightConfig,
+    InputConfig,
+    OutputConfig,
+    SignalsConfig,
+)
+from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
-from heli_jax.flights import Flight, Signal, read_flight
+from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 
 
 def read_flights(
@@ -30,13 +39,16 @@ def read_flights(
     if not config.flights:
         raise InputError(f"{path}: flights: expected at least one log, got none")
     return tuple(
-        _read_flight(experiment, i, f, gain, moving_inputs) for i, f in enumerate(config.flights)
+        flight
+        for i, f in enumerate(config.flights)
+        for flight in _read_flight(experiment, i, f, gain, moving_inputs)
     )
 
 
 def _read_flight(
     experiment: Experiment, i: int, f: FlightConfig, gain: bool, moving: bool
-) -> Flight:
+) -> tuple[Flight, ...]:
+    """The flight, or where a gap splits it its parts."""
     model = experiment.model
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
@@ -48,14 +60,18 @@ def _read_flight(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
                 f"{nearest(name, naming.names(model.Params))}"
             )
+    # Of all logs together: what one lacks may stand in another.
+    inputs = signals(model, "inputs", _merged(f, "inputs", where), f"{where}.signals", gain)
+    outputs = signals(model, "outputs", _merged(f, "outputs", where), f"{where}.signals")
     time = f.signals.time
     try:
-        flight = read_flight(
+        # A flight as it is unless asked otherwise: parts have initial states of their own.
+        flights = (read_parts if f.gaps == "split" else _read_one)(
             experiment.path.parent / f.log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
-            inputs=signals(model, "inputs", f.signals.inputs, f"{where}.signals", gain),
-            outputs=signals(model, "outputs", f.signals.outputs, f"{where}.signals"),
+            inputs={n: inputs[n] for n in f.signals.inputs},
+            outputs={n: outputs[n] for n in f.signals.outputs},
             rate=f.rate,
             window=f.window,
             known=f.known,
@@ -63,12 +79,52 @@ def _read_flight(
             name=f.name or f"flight {i + 1}",
             moving_inputs=moving,
             number=f.flight,
+            also=tuple(_also(experiment.path.parent, a, inputs, outputs) for a in f.also),
         )
     except InputError:
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    return _with_notes(flight, _unstated_units(model, f.signals))
+    stated = [f.signals, *(a.signals for a in f.also)]
+    notes = [note for one in stated for note in _unstated_units(model, one)]
+    first, *others = (with_notches(flight, f.notch or (), f"{where}.notch") for flight in flights)
+    cautions = (*filter_cautions(first.source, f), *vibration_notes(experiment, first, f, where))
+    return (_with_notes(first, tuple(notes), cautions), *others)
+
+
+def _merged(f: FlightConfig, role: Literal["inputs", "outputs"], where: str) -> dict[str, Any]:
+    """What is stated of the inputs or outputs of all logs of a flight."""
+    merged: dict[str, Any] = dict(getattr(f.signals, role))
+    for k, also in enumerate(f.also):
+        for name, config in getattr(also.signals, role).items():
+            if name in merged:
+                raise InputError(
+                    f"{where}.also[{k}].signals.{role}: {name!r} is taken from another log already,"
+                    " expected it from one"
+                )
+            merged[name] = config
+    return merged
+
+
+def _also(
+    folder: Path, also: AlsoConfig, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal]
+) -> Also:
+    """A further log, its signals with units as `signals` checked them."""
+    align, time = also.align, also.signals.time
+    return Also(
+        str(folder / also.log),
+        align.same,
+        align.to,
+        {n: inputs[n] for n in also.signals.inputs},
+        {n: outputs[n] for n in also.signals.outputs},
+        None if time is None else Signal(time.signal, time.unit, "s"),
+        also.flight,
+        align.reverse,
+    )
+
+
+def _read_one(path: Path, **request: Any) -> tuple[Flight, ...]:
+    return (read_flight(path, **request),)
 
 
 def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
@@ -86,11 +142,12 @@ def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _with_notes(flight: Flight, notes: tuple[str, ...]) -> Flight:
+def _with_notes(flight: Flight, notes: tuple[str, ...], cautions: tuple[str, ...]) -> Flight:
     # A flight that a script made has no source, and nobody who would read a note on it.
-    if not notes or flight.source is None:
+    if not (notes or cautions) or flight.source is None:
         return flight
-    source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
+    notes = (*flight.source.notes, *notes)
+    source = dataclasses.replace(flight.source, notes=notes, cautions=cautions)
     return dataclasses.replace(flight, source=source)
 
 
@@ -137,7 +194,8 @@ def signals(
         unit = config.unit if config.unit is not None else (si or "1")
         # Inputs have a hold and no sd, outputs the reverse.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
-        out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold)
+        repeats = getattr(config, "repeats", "auto")
+        out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold, repeats)
     return out
 
 

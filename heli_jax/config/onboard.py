@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import ORDER, with_delays
+from heli_jax.dynamics.onboard.filters import Filter, check_delay
 from heli_jax.dynamics.onboard.rate_loop import with_gyro, with_rate_loop
 from heli_jax.dynamics.onboard.sensors import with_sensors
 from heli_jax.dynamics.onboard.servos import with_servos
@@ -99,6 +100,91 @@ class DelaysConfig(_Strict):
     """names, or by name the parameter"""
     outputs: NamesOrPairs = []
     order: Order = ORDER
+
+
+FROM_LOG = "from log"
+"""the kind of filter that the log's own settings state"""
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class FilterConfig(_Strict):
+    """A filter between a sensor and the log (`Filter`)."""
+
+    kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
+    hz: _Positive | None = None
+    """where a low-pass is 3 dB down, or the notch's centre"""
+    q: _Positive | None = None
+    bandwidth: _Positive | None = None
+    """of a notch [Hz], in place of q"""
+    attenuation: _Positive | None = None
+    """of a notch at its centre [dB]"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FilterConfig":
+        if self.kind == FROM_LOG:
+            if self.model_fields_set - {"kind"}:
+                raise ValueError("from log: expected no numbers beside it, got some")
+        elif self.hz is None:
+            raise ValueError(f"hz: missing, {self.kind} needs its frequency")
+        elif self.bandwidth is not None and (self.kind != "notch" or self.q is not None):
+            raise ValueError("bandwidth: expected it for a notch, in place of q")
+        else:
+            self.filter.checked()
+        return self
+
+    @property
+    def filter(self) -> Filter:
+        """The filter of these numbers; not for one from the log."""
+        assert self.hz is not None  # `_consistent`
+        q = self.q if self.bandwidth is None else self.hz / self.bandwidth
+        numbers = {} if self.attenuation is None else {"attenuation": self.attenuation}
+        return Filter(self.kind, self.hz, q, **numbers)
+
+
+def _filters(value: object) -> object:
+    if value == FROM_LOG:
+        return [{"kind": FROM_LOG}]
+    # One filter is the usual case and needs no list.
+    value = [value] if isinstance(value, dict | FilterConfig) else value
+    if isinstance(value, list) and all(isinstance(v, dict | FilterConfig) for v in value):
+        return value
+    raise ValueError(
+        f"expected {FROM_LOG}, a filter such as {{kind: pt1, hz: 150}}, or a list of these, got "
+        f"{value!r:.60}"
+    )
+
+
+def _seconds(value: object) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected a number of seconds, got {value!r:.60}")
+    check_delay(value, "delay")
+    return value
+
+
+Filters = Annotated[list[FilterConfig], BeforeValidator(_filters)]
+Delay = Annotated[float, BeforeValidator(_seconds)]
+
+
+def _notches(value: object) -> object:
+    numbers = isinstance(value, list) and all(
+        isinstance(v, int | float) and not isinstance(v, bool) for v in value
+    )
+    if numbers or value is None:
+        return value
+    raise ValueError(
+        f"expected a list of frequencies in Hz such as [25.1, 50.2], got {value!r:.60}"
+    )
+
+
+Notches = Annotated[list[_Positive], BeforeValidator(_notches)]
+
+
+class VibrationConfig(_Strict):
+    """What shakes the sensors, to give lines of the spectrum a name."""
+
+    rotor: _Positive
+    """speed of the rotor"""
+    unit: str = "rad/s"
 
 
 class OnboardConfig(_Strict):

@@ -58,7 +58,7 @@ def problem(experiment: Experiment) -> Problem:
             free,
             nuisance,
             # One number for all flights, since they share one compiled program: the slowest log's.
-            substeps=max(substeps_for(f.dt) for f in flights),
+            substeps=max(substeps_for(f.dt, model.fastest) for f in flights),
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
             fixed_noise=fixed,

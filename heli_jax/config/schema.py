@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
+from heli_jax.config.design_section import DesignConfig, ReduceConfig, TrajectoriesConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
-from heli_jax.config.onboard import OnboardConfig
+from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -65,6 +66,13 @@ class OutputConfig(_Strict):
     signal: str
     unit: str | None = None
     sd: Positive | None = None
+    filter: Filters | None = None
+    """what the autopilot filtered it with: from log, or one or several of {kind, hz, ...}
+    (docs/onboard.md); none: nothing is known of it"""
+    delay: Delay | None = None
+    """by how much it is logged late [s]"""
+    repeats: Literal["auto", "keep", "missing"] = "auto"
+    """of values that a logger wrote again until the next was there (docs/logs.md)"""
 
 
 class SignalsConfig(_Strict):
@@ -76,6 +84,32 @@ class SignalsConfig(_Strict):
     outputs: dict[str, OutputConfig]
 
 
+class AlignConfig(_Strict):
+    """A motion that both logs hold, from which the lag between their clocks is found."""
+
+    # A word of Python's own, so that the field has another name.
+    same: Annotated[str, Field(alias="with")]
+    """a signal of the first log, by the model's name"""
+    to: str
+    """the same motion in this log, in any unit"""
+    reverse: StrictBool = False
+    """whether it has the opposite sign"""
+
+
+class AlsoSignalsConfig(SignalsConfig):
+    inputs: dict[str, InputConfig] = {}
+    outputs: dict[str, OutputConfig] = {}
+
+
+class AlsoConfig(_Strict):
+    """A further log of the same flight (docs/logs.md)."""
+
+    log: str
+    align: AlignConfig
+    signals: AlsoSignalsConfig
+    flight: Annotated[int, Field(ge=1)] | None = None
+
+
 class FlightConfig(_Strict):
     log: str
     signals: SignalsConfig
@@ -85,10 +119,17 @@ class FlightConfig(_Strict):
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.
     window: tuple[Finite, Finite] | None = None
+    gaps: Literal["fail", "split"] = "fail"
+    """what to do about gaps too long to be bridged: refuse them, or make flights of the parts"""
+    also: list[AlsoConfig] = []
     # Such a run is predicted and never fitted: agreement with it is the only one that no free
     # parameter was bent to.
     hold_out: bool = False
     known: dict[str, Finite] = {}
+    notch: Notches | None = None
+    """frequencies [Hz] that are taken out of inputs and outputs alike"""
+    vibration: VibrationConfig | None = None
+    """the rotor's speed, by which lines of vibration are named"""
 
 
 class PriorConfig(_Strict):
@@ -293,62 +334,10 @@ class SimulateConfig(_Strict):
         return self
 
 
-class AxisConfig(_Strict):
-    """The values of one axis: from lower to upper, a list, or a column of the table."""
-
-    lower: Finite | None = None
-    upper: Finite | None = None
-    scale: Literal["linear", "log"] = "linear"
-    n: int | None = None
-    """points, for a grid or a list"""
-    values: list[Finite] | None = None
-    column: str | None = None
-    """of the table; the axis's name unless given"""
-    unit: str | None = None
-    """of these numbers; the model's SI unit unless given"""
-
-
-class DesignConfig(_Strict):
-    """A design of experiments: which values the axes take, one design point after the other."""
-
-    # Which of the other keys a kind may have is refused where the design is made, with a sentence
-    # that says why.
-    design: Literal["grid", "list", "lhs", "sobol", "table", "product", "zip"]
-    n: int | None = None
-    """design points, for lhs and sobol"""
-    axes: dict[str, AxisConfig] = {}
-    # A section within itself: designs nest to any depth.
-    of: list["DesignConfig"] = []
-    """the designs of a product or a zip"""
-    file: str | None = None
-    """a table: .csv, .txt, .tsv or .parquet"""
-    seed: Annotated[int, Field(ge=0)] | None = None
-    """of lhs and sobol; the sweep's and the place among its designs unless given"""
-
-
-class ReduceConfig(_Strict):
-    """A result of each run."""
-
-    # Checked against the reducers where the sweep is put together: a path may lead to any function.
-    how: str
-    """a name, or package.module:function of one's own"""
-    signal: str | None = None
-    input: str | None = None
-    gain: Finite = 1.0
-
-
-class TrajectoriesConfig(_Strict):
-    """Runs to keep."""
-
-    signals: list[str]
-    every: int = 1
-    """samples from one kept to the next"""
-
-
 class SweepConfig(DesignConfig):
     """Many runs: a design, what is kept of each run, and how it is computed."""
 
-    reduce: dict[str, ReduceConfig] = {}
+    reduce: dict[str, ReduceConfig] = Field(default_factory=dict)
     trajectories: TrajectoriesConfig | None = None
     inputs: Literal["flights", "simulate"] | None = None
     """where the inputs come from; the flights unless there are none"""

@@ -120,6 +120,7 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         delays=model.delays,
         delay_lines=model.delay_lines,
         positive=model.positive,
+        fastest=model.fastest,
         disturbances=(*model.disturbances, *added),
     )
 

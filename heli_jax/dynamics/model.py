@@ -119,6 +119,9 @@ class Model(eqx.Module):
     parameter that is its delay [s]"""
     positive: tuple[str, ...] = eqx.field(static=True, default=())
     """the parameters that are above zero whatever else may change its sign"""
+    fastest: float = eqx.field(static=True, default=0.0, kw_only=True)
+    """of a model with filters of fixed constants the rate of the fastest [rad/s], which fixed steps
+    have to follow"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)

@@ -2,10 +2,11 @@
 
 from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log
 from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.read import read_flight, require_moving_inputs
-from heli_jax.flights.request import ReadOptions
+from heli_jax.flights.read import read_flight, read_parts, require_moving_inputs
+from heli_jax.flights.request import Also, ReadOptions
 
 __all__ = [
+    "Also",
     "ColumnInfo",
     "Flight",
     "Gap",
@@ -16,5 +17,6 @@ __all__ = [
     "TimeInfo",
     "describe_log",
     "read_flight",
+    "read_parts",
     "require_moving_inputs",
 ]

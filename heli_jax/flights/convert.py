@@ -15,7 +15,7 @@ from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
-from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
+from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
 from heli_jax.flights.table import Table, require_few_columns, shown, wrong
 
 ENDINGS = (".csv", ".parquet", ".nc")
@@ -23,6 +23,8 @@ TIME = "time"
 """the name of the first column, in seconds from the log's beginning"""
 _SHARE = 0.5
 """of the longest topic's time: where nothing is asked for, topics of less are left out"""
+_INTERPOLATED = 2.0
+"""times a topic's rate, from which on it is said that most values are none that were measured"""
 _LONGEST = 3 * 10**8
 """cells: 2.4 GB"""
 
@@ -88,6 +90,9 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
         columns = _resampled(log, names, clocks, selection.rate)
         for clock in clocks.values():
             notes += [f"{clock.words}: {n}" for n in new_clock(clock.seconds, selection.rate).notes]
+            # A table has a value in every row; a fit takes slow outputs as missing in between.
+            if selection.rate * clock.usual > _INTERPOLATED:
+                notes.append(f"{clock.words}: interpolated, so its noise is no longer white")
     notes += _missing(columns)
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
     return Converted(columns, {TIME: "s"} | units, tuple(notes))
@@ -232,7 +237,7 @@ def _resampled(
         problem = f"{len(names)} signals at {rate:g} Hz are {times.size * len(names)} numbers"
         raise wrong(log.path, f"{problem}, expected at most {_LONGEST}; take fewer signals")
     columns = {TIME: times}
-    gaps = {name: _in_gaps(clock.seconds, times) for name, clock in clocks.items()}
+    gaps = {name: in_gaps(clock.seconds, times) for name, clock in clocks.items()}
     for name in names:
         topic = log.topic_of(name).name
         clock = clocks[topic]
@@ -250,16 +255,6 @@ def _resampled(
 def _finite(values: np.ndarray) -> np.ndarray:
     """Values with infinite ones as missing: no filter has an answer to them."""
     return np.where(np.isfinite(values), values, np.nan)
-
-
-def _in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Whether each of the times (M,) lies in a gap of the stamps (N,) that is not bridged."""
-    behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
-    step = seconds[behind] - seconds[behind - 1]
-    away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
-    # A step of exactly the limit passes whatever its rounding, and a time at a stamp has that
-    # sample, however wide the gap beside it is.
-    return (step > longest_gap(seconds) * (1 + 1e-9)) & (away > 1e-9)
 
 
 def require_output(out: Path, log: str | Path) -> None:

@@ -1,6 +1,7 @@
 """What a flight is, whichever log it came from."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,8 @@ class Signal:
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
         hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
             log shows of it.
+        repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
+            table), "keep", or "auto", missing where that is unmistakable.
     """
 
     name: str
@@ -27,15 +30,25 @@ class Signal:
     si: str
     sd: float | None = None
     hold: str = "auto"
+    repeats: str = "auto"
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did."""
+    """Where a flight came from: the file, its fingerprint, and what the reader assumed or did.
+
+    `firmware` and `parameters` are those of the autopilot that wrote the log; `rates` the usual
+    rates of outputs in an autopilot's log [Hz]; `cautions` are sentences on what biases a fit to
+    the log as it is used, which every fit repeats.
+    """
 
     path: str
     sha256: str
     notes: tuple[str, ...] = ()
+    firmware: str = ""
+    parameters: Mapping[str, str | int | float] = field(default_factory=dict)
+    rates: Mapping[str, float] = field(default_factory=dict)
+    cautions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,30 +1,35 @@
 """From the channels of an autopilot's log to a `Flight`: each signal from its own clock."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.onto_grid import (
+    FEWEST,
+    MOST_UPSAMPLING,
+    Key,
+    at_times,
+    decided_holds,
+    even_expected,
+    flight_of,
+    long_gap,
+    measured_once,
+    missing_notes,
+)
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
+from heli_jax.flights.resample import new_clock
+from heli_jax.flights.slower import Timed, is_slower
 from heli_jax.flights.table import shown, wrong
-
-_FEWEST = 8
-"""samples of a topic"""
-_MOST_UPSAMPLING = 100
-"""times the fastest topic's rate: more is a slip, and fills the memory with straight lines"""
 
 _MOST_GAPS = 20
 """times the samples that there are"""
-
-_Key = tuple[str, str]
-"""a model's name, and `input` or `output`"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,18 +51,24 @@ class TopicClock:
 
 
 @dataclass(frozen=True, eq=False)
-class _Signal:
-    """Samples (N,) in SI on a clock."""
+class ClockedSignal:
+    """Samples (N,) in SI on the clock of a topic."""
 
     clock: TopicClock
     values: np.ndarray
+
+    @property
+    def timed(self) -> Timed:
+        """The stamps and the samples."""
+        return Timed(self.clock.seconds, self.values)
 
 
 def read_channels(log: ChannelLog, request: Request) -> Flight:
     """The flight of an autopilot's log.
 
     Topics of different clocks are resampled one by one to the rate that is asked for: inputs by
-    their hold, outputs on straight lines.
+    their hold, outputs on straight lines where they are as fast as it; what is slower is missing
+    between its samples.
 
     Args:
         log: what was opened.
@@ -67,30 +78,37 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
         InputError: a channel is missing or holds no numbers, a clock is none, the window lies
             outside the log, a rate is needed or makes no sense.
     """
-    if request.time is not None:
-        problem = "its topics have clocks of their own, expected no time to be stated, got "
-        raise wrong(log.path, problem + shown(request.time.name))
-    options = request.options
-    signals = _signals(log, request)
+    source = Source(log.path, log.sha256, log.notes, log.firmware, log.parameters)
+    return flight_of_signals(signals_of(log, request), request, source, log.first_time)
+
+
+def flight_of_signals(
+    signals: Mapping[Key, ClockedSignal], request: Request, source: Source, first_time: float
+) -> Flight:
+    """The flight of signals with clocks of their own.
+
+    Args:
+        signals: by key, in SI inside the window.
+        request: what was asked for.
+        source: where they came from, with notes on it so far.
+        first_time: from which the clocks count [s], in the log's own count.
+
+    Raises:
+        InputError: a rate is needed or makes no sense, or a clock has a gap.
+    """
     # Before any resampling, which moves an input at more samples than the log shows it to.
-    holds = _holds(request, signals)
-    start, dt, samples, notes = _on_grid(log.path, options.rate, signals, holds)
-    return Flight(
-        dt=dt,
-        inputs=request.of_kind("input", samples),
-        outputs=request.of_kind("output", samples),
-        t0=log.first_time + start,
-        sd=request.noise(),
-        known=request.known,
-        hold_out=options.hold_out,
-        name=options.name,
-        source=Source(log.path, log.sha256, (*log.notes, *_missing(request, signals), *notes)),
-        hold={key: decision.hold for key, decision in holds.items()},
-        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
-    )
+    values = {key: signal.values for key, signal in signals.items()}
+    holds = decided_holds(request, values)
+    values, repeated = measured_once(request, values)
+    signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
+    start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
+    notes = (*source.notes, *repeated, *missing_notes(request, values), *notes)
+    rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
+    source = replace(source, notes=notes, rates=rates)
+    return flight_of(request, samples, dt, first_time + start, holds, source)
 
 
-def _signals(log: ChannelLog, request: Request) -> dict[_Key, _Signal]:
+def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
     """The signals in SI inside the window, each on the clock of its topic."""
     clocks: dict[str, TopicClock] = {}
     signals = {}
@@ -109,7 +127,7 @@ def _signals(log: ChannelLog, request: Request) -> dict[_Key, _Signal]:
             at = f"channel {shown(signal.name)}"
             problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"
             raise wrong(log.path, f"{problem}, expected a finite number", at)
-        signals[key, kind] = _Signal(clock, values)
+        signals[key, kind] = ClockedSignal(clock, values)
     return signals
 
 
@@ -136,10 +154,10 @@ def topic_clock(
         inside = np.flatnonzero((elapsed >= window[0] - 1e-9) & (elapsed <= window[1] + 1e-9))
         first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
     seconds = elapsed[first:last]
-    if seconds.size < _FEWEST:
+    if seconds.size < FEWEST:
         where = "" if window is None else f" from {window[0]:g} s to {window[1]:g} s"
         span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
-        problem = f"holds {seconds.size} samples{where}, expected at least {_FEWEST}{span}"
+        problem = f"holds {seconds.size} samples{where}, expected at least {FEWEST}{span}"
         raise wrong(path, problem, place)
     steps = np.diff(seconds)
     back = np.flatnonzero(steps <= 0)
@@ -153,37 +171,16 @@ def topic_clock(
     return TopicClock(topic, seconds, slice(first, last))
 
 
-def _holds(request: Request, signals: Mapping[_Key, _Signal]) -> dict[str, Decision]:
-    """What each input does between samples: as stated, or by what its own samples show."""
-    holds = {}
-    for (key, kind), signal in request.signals.items():
-        if kind == "input":
-            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
-            holds[key] = decide(signals[key, kind].values) if signal.hold == "auto" else stated
-    return holds
-
-
-def _missing(request: Request, signals: Mapping[_Key, _Signal]) -> list[str]:
-    """A note for every output with missing samples."""
-    notes = []
-    for key, signal in signals.items():
-        count = int(np.isnan(signal.values).sum())
-        if count:
-            name = shown(request.signals[key].name)
-            notes.append(f"{count} of {signal.values.size} samples of {name} are missing")
-    return notes
-
-
 def _on_grid(
     path: str,
-    rate: float | None,
-    signals: Mapping[_Key, _Signal],
+    request: Request,
+    signals: Mapping[Key, ClockedSignal],
     holds: Mapping[str, Decision],
-) -> tuple[float, float, dict[_Key, np.ndarray], tuple[str, ...]]:
+) -> tuple[float, float, dict[Key, np.ndarray], tuple[str, ...]]:
     """First time and step [s] of the grid, the samples (N,) on it, and notes on how they came
     there."""
-    # One for each topic, since signals of the same topic share their stamps.
-    clocks = list({s.clock.topic: s.clock for s in signals.values()}.values())
+    rate = request.options.rate
+    clocks = clocks_of(signals.values())
     if rate is None:
         if len(clocks) > 1:
             slowest = min(1 / clock.usual for clock in clocks)
@@ -193,16 +190,28 @@ def _on_grid(
         dt, notes = _uniform(path, clocks[0])
         samples = {key: signal.values for key, signal in signals.items()}
         return float(clocks[0].seconds[0]), dt, samples, notes
-    notes = tuple(f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes)
+    clocks = on_all_the_time(signals, rate)
+    notes = [f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes]
     _require_no_gaps(path, clocks)
     times = common_times(path, clocks, rate)
-    samples = {}
-    for (key, kind), signal in signals.items():
-        # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
-        stays = kind == "input" and holds[key].hold == "zero-order"
-        method = hold if stays else resampled
-        samples[key, kind] = method(signal.clock.seconds, signal.values, times)
-    return float(times[0]), 1.0 / rate, samples, notes
+    timed = {key: signal.timed for key, signal in signals.items()}
+    samples, more = at_times(request, timed, holds, times)
+    return float(times[0]), 1.0 / rate, samples, (*notes, *more)
+
+
+def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:
+    """One for each topic, since signals of the same topic share their stamps."""
+    return list({s.clock.topic: s.clock for s in signals}.values())
+
+
+def on_all_the_time(signals: Mapping[Key, ClockedSignal], rate: float) -> list[TopicClock]:
+    """The clocks whose samples the flight needs throughout: of the inputs, and of outputs that are
+    not slower than the `rate` [Hz]; what is slower is missing most of the time anyway."""
+    needed = [s for (_, kind), s in signals.items() if kind == "input"]
+    needed += [
+        s for (_, kind), s in signals.items() if kind == "output" and not is_slower(s.timed, rate)
+    ]
+    return clocks_of(needed or signals.values())
 
 
 def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
@@ -215,22 +224,18 @@ def _uniform(path: str, clock: TopicClock) -> tuple[float, tuple[str, ...]]:
             problem = f"its times leave a uniform grid by {grid.drift:.2g} samples"
         else:
             problem = f"a step of {grid.step:.6g} s before {at}, usual are {grid.usual:.6g} s"
-        # Where a gap is too long to be bridged, a rate would only lead to the next error.
-        bridged = np.diff(seconds).max() <= longest_gap(seconds)
-        remedy = f"`rate: {1 / grid.usual:.4g}` to resample, or " if bridged else ""
-        problem += f", expected a uniform grid; give {remedy}a window without such steps"
+        problem += f", {even_expected(seconds, grid.usual)}"
         raise wrong(path, problem, f"topic {shown(clock.topic)}")
     return grid.dt, grid.notes
 
 
 def _require_no_gaps(path: str, clocks: list[TopicClock]) -> None:
     for clock in clocks:
-        steps, most = np.diff(clock.seconds), longest_gap(clock.seconds)
-        row = int(np.argmax(steps))
-        # A step of exactly the limit, but for its rounding, passes.
-        if steps[row] > most * (1 + 1e-9):
-            problem = f"a gap of {steps[row]:.6g} s at {clock.seconds[row]:.6g} s, expected none"
-            problem += f" longer than {most:.3g} s; give a window without it"
+        gap = long_gap(clock.seconds)
+        if gap is not None:
+            problem = f"a gap of {gap.step:.6g} s at {clock.seconds[gap.row]:.6g} s, expected none"
+            problem += f" longer than {gap.most:.3g} s; give a window without it, or"
+            problem += " `gaps: split`"
             raise wrong(path, problem, f"topic {shown(clock.topic)}")
 
 
@@ -252,12 +257,12 @@ def common_times(path: str, clocks: list[TopicClock], rate: float) -> np.ndarray
     fastest = min(clock.usual for clock in clocks)
     count = (end - start) * rate
     # Written so that a NaN is refused too, here and below.
-    if not count >= _FEWEST - 1 - 1e-6:
+    if not count >= FEWEST - 1 - 1e-6:
         problem = f"the topics share {max(end - start, 0.0):.6g} s, at {rate:g} Hz fewer than"
-        raise wrong(path, f"{problem} {_FEWEST} samples, expected more")
-    if not (rate * fastest <= _MOST_UPSAMPLING and math.isfinite(count)):
+        raise wrong(path, f"{problem} {FEWEST} samples, expected more")
+    if not (rate * fastest <= MOST_UPSAMPLING and math.isfinite(count)):
         problem = f"a rate of {rate:g} Hz for topics of at most {1 / fastest:.4g} Hz"
-        raise wrong(path, f"{problem}, expected at most {_MOST_UPSAMPLING} times as much")
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")
     # One wrong stamp at the end of a damaged log would otherwise fill the memory.
     most = _MOST_GAPS * max(clock.seconds.size * max(1.0, rate * clock.usual) for clock in clocks)
     if count > most:

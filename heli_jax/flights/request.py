@@ -6,13 +6,39 @@ not wait for it.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
+from heli_jax.flights.repeats import REPEATS
 from heli_jax.flights.table import column, wrong
+
+
+@dataclass(frozen=True)
+class Also:
+    """A further log of the same flight, whose clock knows nothing of the first one's.
+
+    Attributes:
+        path: of the log.
+        same: the signal of the first log, by the model's name, that both hold.
+        to: the column or channel of the same motion in this log, in any unit.
+        inputs: signals to take from this log, by the model's names.
+        outputs: the same for what was measured.
+        time: the column of time stamps of a table.
+        number: which flight of a file that holds several, from 1.
+        reverse: whether `to` has the opposite sign.
+    """
+
+    path: str
+    same: str
+    to: str
+    inputs: Mapping[str, Signal] = field(default_factory=dict)
+    outputs: Mapping[str, Signal] = field(default_factory=dict)
+    time: Signal | None = None
+    number: int | None = None
+    reverse: bool = False
 
 
 @dataclass(frozen=True)
@@ -33,6 +59,8 @@ class ReadOptions:
     """whether a run in which no input ever moves is refused"""
     number: int | None = None
     """which flight of a file that holds several, from 1"""
+    also: tuple[Also, ...] = ()
+    """further logs of the same flight, aligned with this one; they need a rate"""
 
 
 class Request:
@@ -63,6 +91,7 @@ class Request:
         self._check_units()
         self._check_noise()
         self._check_holds()
+        self._check_repeats()
         self._check_numbers()
 
     @property
@@ -132,6 +161,18 @@ class Request:
             if signal.hold not in ("auto", *HOLDS):
                 known = ", ".join(("auto", *HOLDS))
                 problem = f"the hold of {use}: expected one of {known}, got {signal.hold!r:.60}"
+                raise wrong(self.path, problem, column(signal.name))
+
+    def _check_repeats(self) -> None:
+        for (key, kind), signal in self.signals.items():
+            use = f"{kind} {key!r}"
+            # What an input repeats is what it was: it stays, as its hold says.
+            if kind == "input" and signal.repeats != "auto":
+                problem = f"repeats is stated for {use}, expected it for outputs alone"
+                raise wrong(self.path, problem, column(signal.name))
+            if signal.repeats not in REPEATS:
+                known, got = ", ".join(REPEATS), f"{signal.repeats!r:.60}"
+                problem = f"repeats of {use}: expected one of {known}, got {got}"
                 raise wrong(self.path, problem, column(signal.name))
 
     def _check_numbers(self) -> None:

@@ -40,9 +40,17 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, steps stay steps")
-    if rate * usual > 2.0:
-        notes.append("outputs were interpolated between samples: their noise is no longer white")
     return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
+
+
+def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Whether each of the times (M,) lies in a gap of the stamps (N,) that is not bridged."""
+    behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
+    step = seconds[behind] - seconds[behind - 1]
+    away = np.minimum(np.abs(times - seconds[behind - 1]), np.abs(times - seconds[behind]))
+    # A step of exactly the limit passes whatever its rounding, and a time at a stamp has that
+    # sample, however wide the gap beside it is.
+    return (step > longest_gap(seconds) * (1 + 1e-9)) & (away > 1e-9)
 
 
 def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -41,7 +41,12 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
-from heli_jax.identification.validation.feedback import Feedback, feedback_notes, feedback_of
+from heli_jax.identification.validation.feedback import (
+    Feedback,
+    feedback_notes,
+    feedback_of,
+    untested,
+)
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
@@ -214,7 +219,8 @@ def _feedback(
     # Whether feedback does harm depends on the residuals: with white innovations the direct method
     # is unbiased in a closed loop too.
     found = feedback_of(problem)
-    return found, tuple(feedback_notes(problem, found, all(w.white for w in white.values())))
+    notes = feedback_notes(problem, found, all(w.white for w in white.values()))
+    return found, (*notes, *untested(problem))
 
 
 def _missing(

@@ -82,7 +82,7 @@ def check(problem: Problem) -> Check:
     verdict = verdict_of(problem, guess.layout, guess.e)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
-    notes = excitation.notes(problem, runs, guess.noise.sd)
+    notes = [*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd)]
     notes += feedback_notes(problem, feedback_of(problem))
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
@@ -163,5 +163,15 @@ def fit(
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
         optimum = which(search, optimum)
+    optimum = optimum._replace(notes=(*cautions(problem), *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))
+
+
+def cautions(problem: Problem) -> tuple[str, ...]:
+    """What the logs say of their signals that biases a fit to them; once where flights agree."""
+    flights, said = tuple(problem.flights), {}
+    for label, flight in zip(labels(flights), flights, strict=True):
+        for caution in flight.source.cautions if flight.source else ():
+            said.setdefault(caution, label)
+    return tuple(f"{label}: {caution}" for caution, label in said.items())

@@ -103,7 +103,7 @@ def at_record(flight: FittedFlight) -> OperatingPoint:
         inputs,
         signals.measured,
         dt,
-        substeps=substeps_for(dt),
+        substeps=substeps_for(dt, flight.model.fastest),
     )
 
 

@@ -124,8 +124,10 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.n
         return x, y
     bins = (most - 2) // 2  # two points each, and the two ends
     edges = np.linspace(0, n, bins + 1).astype(int)
-    low = [a + int(np.argmin(y[a:b])) for a, b in itertools.pairwise(edges)]
-    high = [a + int(np.argmax(y[a:b])) for a, b in itertools.pairwise(edges)]
+    # A missing sample is neither the lowest nor the highest.
+    down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
+    low = [a + int(np.argmin(down[a:b])) for a, b in itertools.pairwise(edges)]
+    high = [a + int(np.argmax(up[a:b])) for a, b in itertools.pairwise(edges)]
     keep = np.unique(np.concatenate([[0, n - 1], low, high]))
     return x[keep], y[keep]
 
@@ -140,6 +142,25 @@ def line(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
         **line_style: as of matplotlib's `plot`.
     """
     ax.plot(*thinned(np.asarray(x), np.asarray(y)), **line_style)
+
+
+def samples(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
+    """Draw what was measured: a line, or where few samples have neighbours a dot for each, of which
+    a line would show nothing.
+
+    Args:
+        ax: where.
+        x: (N,), ascending.
+        y: (N,), NaN where one is missing.
+        **line_style: as of matplotlib's `plot`; of dots all but the width.
+    """
+    x, y = np.asarray(x), np.asarray(y)
+    seen = ~np.isnan(y)
+    beside = np.convolve(seen, [1, 0, 1], "same")[seen] > 0
+    if seen.any() and beside.mean() < 0.5:
+        line_style = {**line_style, "lw": 0.0, "ls": "none", "marker": "o", "ms": 2.2}
+        x, y = x[seen], y[seen]
+    line(ax, x, y, **line_style)
 
 
 def pretty(unit: str | None) -> str:

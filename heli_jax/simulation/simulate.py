@@ -31,12 +31,23 @@ from heli_jax.simulation.wrappers import StateFeedback, Stopping
 _LONGEST_STEP = 0.005
 """of a fixed-step solver [s]: the flapping of a flybar, once a turn, is the fastest motion"""
 
+_OF_FASTEST = 1.4
+"""longest step times the rate of the fastest filter"""
 
-def substeps_for(dt: float) -> int:
-    """Steps of a fixed-step solver in a sample of dt [s]: four, and more in samples over 20 ms."""
+
+def substeps_for(dt: float, fastest: float = 0.0) -> int:
+    """Steps of a fixed-step solver in a sample of dt [s]: four, and more in samples over 20 ms.
+
+    Args:
+        dt: [s].
+        fastest: rate of the fastest filter around the model [rad/s], `Model.fastest`.
+    """
     # RK4 needs four in 20 ms for 1e-6 with the first-order bar; a flybar by eq. 12 turns with
     # Omega. 1e-9: a dt of 0.02 must not become five steps by a rounding error.
-    return max(4, math.ceil(dt / _LONGEST_STEP - 1e-9))
+    # RK4 diverges beyond 2.8 of the reciprocal of a rate; at 1.4 it is off by a twentieth in what
+    # a filter forgets within that step anyway.
+    longest = min(_LONGEST_STEP, _OF_FASTEST / fastest) if fastest > 0 else _LONGEST_STEP
+    return max(4, math.ceil(dt / longest - 1e-9))
 
 
 @explained

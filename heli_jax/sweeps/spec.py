@@ -214,7 +214,7 @@ def job(
     substeps = options.substeps
     if substeps is None:
         # One program serves all flights alike, so the slowest rate says how many steps it needs.
-        substeps = substeps_for(max(f.dt for f in flights))
+        substeps = substeps_for(max(f.dt for f in flights), model.fastest)
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
     # Plain numbers and no arrays: they are compared with those that a store remembers, as JSON.

@@ -127,6 +127,22 @@ def test_missing_samples_cost_information_and_no_more(disturbed):
         assert np.isfinite(found.metrics["roll"].vaf)
 
 
+def test_an_output_of_every_tenth_sample(disturbed):
+    """The same programs as above: a slow sensor is one of which most samples are missing."""
+    params, problem, first = disturbed
+    [flight] = problem.flights
+    roll = np.where(np.arange(N) % 10 == 7, flight.outputs["roll"], np.nan)
+    flight = dataclasses.replace(flight, outputs={"roll": roll})
+    found = fit(dataclasses.replace(problem, flights=[flight]))
+    assert found.status == "converged"
+    assert found.n_samples == N // 10
+    assert all(abs(e) < 4 for e in errors(found, params).values())
+    for name, one in found.estimates.items():
+        full = first.estimates[name]
+        assert one.sd > full.sd
+        assert one.value == pytest.approx(full.value, abs=2.0 * one.sd)
+
+
 def test_outputs_of_different_quality_get_each_its_noise(bench30):
     model, params, start, flight = made(bench30, 2)
     rng = np.random.default_rng(7)

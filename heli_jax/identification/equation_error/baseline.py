@@ -85,7 +85,7 @@ def baseline(
     Raises:
         ValueError: too few samples in a row.
     """
-    output = _output(model, flight)
+    output = _output(model, flight, _PER_ORDER * order)
     input_ = next(n for n in naming.names(model.Inputs) if n in flight.inputs)
     part = _whole_part(flight, output, order)
     u, y = flight.inputs[input_][part], flight.outputs[output][part]
@@ -98,6 +98,7 @@ def baseline(
     combinations, doubts = _combinations(model, params, flight, output, continuous_den, order)
     agreement = _metrics(y, simulated)
     sentences = [
+        *_instead(model, flight, output),
         *_gaps(flight, output, part),
         *_stability(poles),
         *([note] if note else []),
@@ -206,11 +207,25 @@ def _simulate(
     return np.concatenate([y[:n], np.ravel(rest)])
 
 
-def _output(model: Model, flight: Flight) -> str:
+def _output(model: Model, flight: Flight, least: int) -> str:
+    """The first output that has `least` samples in a row, else the first."""
+    names = _by_preference(model, flight)
+    parts = {n: _longest_whole(flight.outputs[n]) for n in names}
+    return next((n for n in names if parts[n].stop - parts[n].start >= least), names[0])
+
+
+def _by_preference(model: Model, flight: Flight) -> list[str]:
     # eq. 23, from which physical parameters are read, is that of an angle.
     present = [n for n in naming.names(model.Outputs) if n in flight.outputs]
-    angles = [n for n in present if naming.unit(model.Outputs, n) == "rad"]
-    return (angles or present)[0]
+    return sorted(present, key=lambda n: naming.unit(model.Outputs, n) != "rad")
+
+
+def _instead(model: Model, flight: Flight, output: str) -> list[str]:
+    """That the output which would be taken is missing too often."""
+    first = _by_preference(model, flight)[0]
+    if first == output:
+        return []
+    return [f"It needs samples in a row, which {first} has too few of, so it is of {output}."]
 
 
 def _metrics(y: Float[np.ndarray, " N"], simulated: Float[np.ndarray, " N"]) -> Metrics:

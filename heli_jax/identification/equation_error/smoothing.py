@@ -23,6 +23,10 @@ _MOST_LEFT_OUT = 0.05
 """part of a signal's motion that smoothing may take away beside the noise"""
 _BRIDGED = 3
 """missing samples in a row that a straight line replaces; more end a segment"""
+_LOST = 2.5
+"""usual steps of a slow sensor that a cubic bridges: one lost sample, with jitter"""
+_FEWEST = 8
+"""samples of a slow sensor through which a cubic is drawn"""
 # Of the fourth power the kernel and its first three derivatives vanish at the ends. Sums over
 # samples are then close to the integrals that integration by parts is about, for all derivatives
 # that are taken here, and the parts at the ends are zero.
@@ -157,8 +161,17 @@ def _bridged(y: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
         return y
     # NaN outside: a line between two samples is a guess with two ends, beyond the last there is
     # none.
+    usual, allowed = float(np.median(np.diff(seen))), _BRIDGED
     filled = np.interp(np.arange(y.size), seen, y[seen], left=np.nan, right=np.nan)
+    if usual > _BRIDGED and seen.size >= _FEWEST:
+        # A slow sensor on a fast grid: a cubic from sample to sample. What is regressed is then no
+        # faster than it, which is enough to begin with; the fit itself sees the samples alone.
+        from scipy.interpolate import CubicSpline
+
+        inside = slice(int(seen[0]), int(seen[-1]) + 1)
+        filled[inside] = CubicSpline(seen, y[seen])(np.arange(inside.start, inside.stop))
+        allowed = _LOST * usual
     for before, after in itertools.pairwise(seen):
-        if after - before - 1 > _BRIDGED:
+        if after - before - 1 > allowed:
             filled[before + 1 : after] = np.nan
     return filled

@@ -109,18 +109,23 @@ class _Part(NamedTuple):
     """what the fit takes from J' R J, were R one"""
     window: Float[np.ndarray, " 2*f-2"]
     """over all lags"""
-    seen: int
-    """samples, of the output that has most"""
+    seen: Float[np.ndarray, " outputs"]
+    """samples"""
 
     def variance(self, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of D' J' r for the columns of D (q, k), and its degrees of freedom."""
         W = self.J @ D
-        power = np.sum(np.real(W.conj() * (self.S @ W)), axis=1)
+        by_output = np.real(W.conj() * (self.S @ W))
+        power = np.sum(by_output, axis=1)
         # Its value at lag zero is the variance; what the window passes of its square says from how
         # many independent parts of the spectrum that was made.
         p = np.fft.irfft(power, self.window.size, axis=0)
         spent = np.sum(np.square(self.window[:, None] * p), axis=0)
-        freedom = self.seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
+        # As many samples as those outputs have that the combination is known from: what a slow
+        # sensor tells has no more freedom for a fast one beside it.
+        share = np.maximum(np.sum(by_output, axis=0), 0.0)
+        seen = self.seen @ share / np.maximum(np.sum(share, axis=0), 1e-300)
+        freedom = seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
         white = np.sum(D * (self.plain @ D), axis=0)
         taken = np.sum(D * (self.taken @ D), axis=0) / np.where(white > 0, white, 1.0)
         # HC2 divides by what the fit leaves. Where it leaves next to nothing that is rounding, so
@@ -233,10 +238,9 @@ def _part(J: np.ndarray, r: np.ndarray, seen: np.ndarray, T: np.ndarray) -> _Par
     # takes from that of the residuals.
     fitted = np.fft.irfft(U @ U.conj().swapaxes(1, 2), size, axis=0) * apart
     L = np.fft.rfft(fitted * window[:, None, None], axis=0)
-    most = int(seen.sum(axis=1).max())
     white = np.broadcast_to(np.eye(J.shape[1]), S.shape)
     meat, plain, taken = (_weighed(J, x, size) for x in (S, white, L))
-    return _Part(J, S, meat, plain, taken, window, most)
+    return _Part(J, S, meat, plain, taken, window, seen.sum(axis=1).astype(float))
 
 
 def _spectrum(r: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -311,8 +315,9 @@ def _correlation_time(R: np.ndarray, pairs: np.ndarray, n: int) -> float:
         return 1.0
     # Lags at which no pair is seen count as those between which they lie.
     whole = 1.0 + 2.0 * (n // 5) * float(np.mean((R[lags] / R[0]) ** 2))
-    # The noise of an autocorrelation has the variance 1 / n: its square adds that at each lag.
-    return max(1.0, whole / (1.0 + 2.0 * (n // 5) / n))
+    # The noise of an autocorrelation has the variance 1 / n: its square adds that at each lag. At
+    # lag zero all samples that are seen are pairs.
+    return max(1.0, whole / (1.0 + 2.0 * (n // 5) / round(float(pairs[0]))))
 
 
 def _window(n: int, size: int, times: list[float]) -> Float[np.ndarray, " size"]:

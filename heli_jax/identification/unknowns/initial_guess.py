@@ -79,7 +79,7 @@ def _state_that_shows(
 
     Three Gauss-Newton steps: outputs are mostly states themselves, or angles of them.
     """
-    measured = {n: _at_start(np.asarray(y)[k : k + _LINE]) for n, y in flight.outputs.items()}
+    measured = {n: _at_start(np.asarray(y)[k:]) for n, y in flight.outputs.items()}
     measured = {n: v for n, v in measured.items() if np.isfinite(v)}
     inputs = jax.tree.map(lambda u: u[k], flight.inputs)
     names, x = naming.names(layout.model.State), first
@@ -95,10 +95,12 @@ def _state_that_shows(
 
 
 def _at_start(y: np.ndarray) -> float:
-    """The value at the first of a few samples, with less noise than that sample has; NaN where
+    """The value at the first of the samples, from a few with less noise than one has; NaN where
     nothing is measured."""
-    seen = np.flatnonzero(np.isfinite(y))
+    seen = np.flatnonzero(np.isfinite(y[:_LINE]))
     if seen.size < 3:
-        # Too few for a line that averages anything.
+        # Too few for a line that averages anything. A slow sensor's first sample comes later: the
+        # machine was near that, rather than at zero.
+        seen = seen if seen.size else np.flatnonzero(np.isfinite(y))
         return float(y[seen[0]]) if seen.size else float("nan")
     return float(np.polyval(np.polyfit(seen, y[seen], 1), 0.0))

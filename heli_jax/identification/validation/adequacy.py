@@ -257,7 +257,11 @@ def _covariance_by_chance(y: np.ndarray, m: np.ndarray) -> tuple[float, float, f
     """Of the disturbance's part d = y - m of an output: d'm, m'm, and the variance that d'm has
     where the two are independent."""
     # The slope of y on m is 1 + d'm / m'm.
-    d, m = np.where(np.isnan(y), 0.0, y - m - np.nanmean(y - m)), m - m.mean()
+    # Only where something was measured, for both: a slope over all of the simulation and a few
+    # samples of the output would be none.
+    seen = ~np.isnan(y)
+    y, m = y[seen], m[seen]
+    d, m = y - m - np.mean(y - m), m - m.mean()
     lags = max(1, y.size // 5)
     # Bartlett's window: without it the sum over the lags can be negative, and no variance.
     window = 1.0 - np.arange(lags + 1) / (lags + 1)

@@ -181,7 +181,9 @@ def _alignment(measured: np.ndarray, simulated: np.ndarray, dt: float) -> tuple[
         return 0.0, 0.0
     lags = max(1, min(round(MAX_TIME_SHIFT / dt), measured.size // 4))
     with np.errstate(all="ignore"):
-        c = cross_correlation(simulated, measured, lags)
+        # Missing samples add nothing to the products and all of the simulation to their scale.
+        share = float(np.mean(~np.isnan(measured)))
+        c = cross_correlation(simulated, measured, lags) / np.sqrt(share)
     if not np.isfinite(c).all():
         return 0.0, 0.0
     # Largest in size: a response of the wrong sign is aligned where it is most negative.

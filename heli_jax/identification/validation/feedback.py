@@ -116,6 +116,22 @@ def feedback_of(problem: Problem) -> tuple[Feedback, ...]:
     )
 
 
+def untested(problem: Problem) -> list[str]:
+    """A sentence for the flights of which feedback cannot be told, since too much is missing."""
+    flights = problem.training
+    sparse = [
+        label
+        for label, f in zip(labels(flights), flights, strict=True)
+        if all(np.mean(np.isfinite(y)) < _SEEN for y in f.outputs.values())
+    ]
+    if not sparse:
+        return []
+    return [
+        f"{', '.join(sparse)}: whether the inputs follow the response was not tested, since of "
+        f"every output more than {1 - _SEEN:.0%} of the samples are missing."
+    ]
+
+
 def feedback_notes(
     problem: Problem, found: Sequence[Feedback], white: bool | None = None
 ) -> list[str]:

@@ -29,6 +29,9 @@ BAND99 = 2.5758293035489004
 """half width of the 99 % band of a white residual's correlation, times sqrt(N): the 99.5 % point of
 the normal distribution"""
 
+_MOSTLY_MISSING = 0.5
+"""part of the samples that are seen, below which a signal is one of fewer samples"""
+
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
@@ -116,6 +119,18 @@ def _centred(signal: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
 
 
+def sequence(signal: np.ndarray) -> np.ndarray:
+    """A signal (N,), or where most of it is missing the samples that there are, one behind the
+    other.
+
+    White noise is white at whatever instants it is sampled. A slow sensor's samples, put on the
+    nearest instants of a fast grid, have no lag at which many pairs are seen: lags are then counted
+    in its own samples.
+    """
+    seen = ~np.isnan(signal)
+    return signal[seen] if seen.mean() < _MOSTLY_MISSING else signal
+
+
 def lags_for(n: int) -> int:
     """How many lags a record of n samples bears: a quarter of it, at most 500."""
     # Beyond a quarter an autocorrelation is the mean of too few products (Box and Jenkins).
@@ -128,6 +143,7 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
     `together` is how many signals are judged side by side: the p value is multiplied by it
     (Bonferroni), so that one in a hundred white records fails, not one in a hundred signals.
     """
+    residual = sequence(residual)
     n = int(np.count_nonzero(~np.isnan(residual)))
     r, pairs, whole = _seen_autocorrelation(residual)
     lags = r.size

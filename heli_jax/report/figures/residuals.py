@@ -10,6 +10,7 @@ from heli_jax.identification.validation.metrics import (
     autocorrelation,
     cross_correlation,
     lags_for,
+    sequence,
     whiteness,
 )
 from heli_jax.report import style
@@ -30,6 +31,12 @@ def residual_correlation(
         figure: to draw on; a new one where None.
     """
     residual, dt = signals.error(output), sample_time(signals)
+    whole, residual = residual, sequence(residual)
+    seen = np.arange(whole.size)
+    if residual.size < whole.size:
+        # Mostly missing: lags count in the sensor's own samples.
+        seen = np.flatnonzero(~np.isnan(whole))
+        dt *= float(np.median(np.diff(seen)))
     n, lags = residual.size, lags_for(residual.size)
     inputs = list(signals.inputs)
     axes = panels(figure, 2.4 + 1.6 * len(inputs), [1.2, *[1.0] * len(inputs)], sharex=False)
@@ -42,7 +49,7 @@ def residual_correlation(
     for ax, name in zip(axes[1:], inputs, strict=True):
         # Both signs: correlation at negative lags means that the input answers the residual (a
         # pilot, a controller), or that the clocks of the two differ.
-        c = cross_correlation(signals.inputs[name], residual, lags)
+        c = cross_correlation(signals.inputs[name][seen], residual, lags)
         _stems(ax, dt * np.arange(-lags, lags + 1), c, BAND99 / np.sqrt(n))
         ax.set_xlim(-dt * (lags + 0.5), dt * (lags + 0.5))
         ax.set_ylabel(f"with {name}")
@@ -52,7 +59,7 @@ def residual_correlation(
 
 def _head(ax: Axes, signals: Signals, output: str, together: int) -> None:
     """Title and subtitle: what of which flight, and the test of whiteness."""
-    residual = signals.error(output)
+    residual = sequence(signals.error(output))
     test = whiteness(residual, together)
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"

@@ -12,7 +12,7 @@ from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels
-from heli_jax.report.style import label, legend_above, line, subtitle
+from heli_jax.report.style import label, legend_above, line, samples, subtitle
 
 
 def response(
@@ -34,13 +34,13 @@ def response(
     t = signals.times
     # The measured line is the wider and lies behind, so that it still shows as a rim where the
     # simulation covers it.
-    line(top, t, signals.measured[output], color=style.PALE, lw=1.9, label="measured")
+    samples(top, t, signals.measured[output], color=style.PALE, lw=1.9, label="measured")
     line(top, t, signals.simulated[output], color=style.BLUE, lw=0.9, label="simulated")
     top.set_ylabel(label(output, unit))
     top.set_title(_agreement(signals, output), loc="left")
     legend_above(top)
     residual = signals.residual(output)
-    line(below, t, residual, color=style.VERMILLION, lw=0.7)
+    samples(below, t, residual, color=style.VERMILLION, lw=0.7)
     below.axhline(0.0, color="#444444", lw=0.6)
     below.set_ylabel(label("residual", unit))
     for ax, name in zip(rest, inputs, strict=True):

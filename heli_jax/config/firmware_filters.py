@@ -1,0 +1,233 @@
+"""What the settings in a log say of how its signals were filtered before they were logged.
+
+PX4 filters `vehicle_angular_velocity` and `vehicle_acceleration` (VehicleAngularVelocity.cpp,
+VehicleAcceleration.cpp), ArduPilot the gyros and accelerometers of all its messages but the raw
+ones (AP_InertialSensor_Backend.cpp), Betaflight and Rotorflight `gyroADC` (gyro_init.c). Angles and
+velocities are estimated by Kalman filters and the like, of which no setting says what they did.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from heli_jax.dynamics.onboard.filters import Filter
+
+type Settings = Mapping[str, str | int | float]
+
+
+class LoggedFilters(NamedTuple):
+    """How a signal was filtered, as far as the settings say."""
+
+    filters: tuple[Filter, ...]
+    """those with fixed constants"""
+    settings: tuple[str, ...]
+    """that say so, as `NAME = value`"""
+    unknown: tuple[str, ...]
+    """settings of filters that move in flight, which no constants describe, or of unknown kind"""
+
+
+def logged_filters(firmware: str, settings: Settings, channel: str) -> LoggedFilters | None:
+    """How a channel was filtered; None where the log does not say.
+
+    Args:
+        firmware: as the log names it.
+        settings: of the firmware, by name.
+        channel: of the log.
+    """
+    for pattern, reader in _CHANNELS:
+        if re.fullmatch(pattern, channel):
+            return reader(_Reading(firmware, settings))
+    return None
+
+
+class _Reading:
+    """Settings as they are read, with what has been used."""
+
+    def __init__(self, firmware: str, settings: Settings) -> None:
+        self.firmware, self.settings = firmware, settings
+        self.filters: list[Filter] = []
+        self.used: list[str] = []
+        self.unknown: list[str] = []
+
+    def numbers(self, name: str) -> list[float]:
+        """The numbers of a setting; none where it is not there or holds something else."""
+        try:
+            return [float(part) for part in str(self.settings[name]).split(",")]
+        except (KeyError, ValueError):
+            return []
+
+    def number(self, name: str) -> float:
+        """The number of a setting; zero, which switches a filter off, where there is none."""
+        return next(iter(self.numbers(name)), 0.0)
+
+    def add(self, name: str, *filters: Filter) -> None:
+        """Filters that a setting states."""
+        self.filters += filters
+        self.used.append(f"{name} = {self.settings[name]}")
+
+    def moving(self, *names: str) -> None:
+        """Filters that follow the flight, where a setting of these is not zero."""
+        self.unknown += [f"{n} = {self.settings[n]}" for n in names if any(self.numbers(n))]
+
+    @property
+    def result(self) -> LoggedFilters:
+        """All of it."""
+        return LoggedFilters(tuple(self.filters), tuple(self.used), tuple(self.unknown))
+
+
+def _px4_gyro(read: _Reading) -> LoggedFilters | None:
+    if "IMU_GYRO_CUTOFF" not in read.settings:
+        return None
+    # NF_FREQ was the one static notch before version 1.12, NF0 and NF1 the two since.
+    for stem in ("IMU_GYRO_NF_", "IMU_GYRO_NF0_", "IMU_GYRO_NF1_"):
+        name = f"{stem}FREQ" if stem.endswith("NF_") else f"{stem}FRQ"
+        hz, width = read.number(name), read.number(f"{stem}BW")
+        if hz > 0 and width > 0:
+            read.add(name, Filter("notch", hz, hz / width))
+    read.moving("IMU_GYRO_DNF_EN", "IMU_GYRO_FFT_EN")
+    _biquad(read, "IMU_GYRO_CUTOFF")
+    return read.result
+
+
+def _px4_accel(read: _Reading) -> LoggedFilters | None:
+    if "IMU_ACCEL_CUTOFF" not in read.settings:
+        return None
+    _biquad(read, "IMU_ACCEL_CUTOFF")
+    return read.result
+
+
+def _biquad(read: _Reading, name: str) -> None:
+    if read.number(name) > 0:
+        read.add(name, Filter("biquad", read.number(name)))
+
+
+def _ardupilot_gyro(read: _Reading) -> LoggedFilters | None:
+    if "INS_GYRO_FILTER" not in read.settings:
+        return None
+    # The static notch of version 3.x and 4.0.
+    hz, width = read.number("INS_NOTCH_FREQ"), read.number("INS_NOTCH_BW")
+    if read.number("INS_NOTCH_ENABLE") and hz > width / 2 > 0:
+        attenuation = read.number("INS_NOTCH_ATT") or 40.0
+        notch = Filter("notch", hz, _octave_q(hz, hz - width / 2), attenuation)
+        read.add("INS_NOTCH_FREQ", notch)
+    # The harmonic notches follow the rotor, its throttle or a spectrum, in most of their modes.
+    read.moving("INS_HNTCH_ENABLE", "INS_HNTC2_ENABLE")
+    _biquad(read, "INS_GYRO_FILTER")
+    return read.result
+
+
+def _ardupilot_accel(read: _Reading) -> LoggedFilters | None:
+    if "INS_ACCEL_FILTER" not in read.settings:
+        return None
+    _biquad(read, "INS_ACCEL_FILTER")
+    return read.result
+
+
+def _octave_q(centre: float, edge: float) -> float:
+    """Q of a notch from its centre and lower edge [Hz] (filterGetNotchQ; NotchFilter.cpp)."""
+    return centre * edge / (centre**2 - edge**2)
+
+
+def _blackbox_gyro(read: _Reading) -> LoggedFilters | None:
+    rotorflight = read.firmware.startswith("Rotorflight")
+    types = _ROTORFLIGHT if rotorflight else _BETAFLIGHT
+    # Before version 4.3 of Betaflight: gyro_lowpass_hz and its like.
+    stages = [
+        stage
+        for stage in (
+            ("gyro_lpf1_type", "gyro_lpf1_static_hz", "gyro_lpf1_dyn_hz"),
+            ("gyro_lpf2_type", "gyro_lpf2_static_hz", ""),
+            ("gyro_lowpass_type", "gyro_lowpass_hz", "gyro_lowpass_dyn_hz"),
+            ("gyro_lowpass2_type", "gyro_lowpass2_hz", ""),
+        )
+        if stage[1] in read.settings
+    ]
+    if not stages:
+        return None
+    if rotorflight:
+        _decimation(read)
+    for type_name, name, moving in stages:
+        hz, kind = read.number(name), next(iter(read.numbers(type_name)), -1.0)
+        if rotorflight and kind == 0:  # none; in Betaflight a lag
+            continue
+        if _moves(read.numbers(moving), hz, rotorflight):
+            read.moving(moving)
+        elif hz > 0 and kind in types:
+            read.add(name, types[kind](hz))
+        elif hz > 0:
+            read.unknown.append(f"{name} = {hz:g} of type {kind:g}")
+    for hz, edge in zip(
+        read.numbers("gyro_notch_hz"), read.numbers("gyro_notch_cutoff"), strict=False
+    ):
+        if 0 < edge < hz:
+            read.add("gyro_notch_hz", Filter("notch", hz, _octave_q(hz, edge)))
+    read.moving("dyn_notch_count", "rpm_filter_harmonics", "gyro_rpm_notch_harmonics")
+    read.moving("gyro_rpm_filter_bank_motor_index")
+    return read.result
+
+
+def _rotorflight_raw(read: _Reading) -> LoggedFilters | None:
+    """Of `gyroRAW`, which is taken behind the decimation."""
+    if "gyro_decimation_hz" not in read.settings:
+        return None
+    _decimation(read)
+    return read.result
+
+
+def _decimation(read: _Reading) -> None:
+    # The sensor's samples are brought to the loop's rate behind a Bessel filter of fourth order.
+    hz = read.number("gyro_decimation_hz")
+    if hz > 0:
+        read.add("gyro_decimation_hz", *_bessel_4(hz))
+
+
+def _moves(limits: list[float], hz: float, rotorflight: bool) -> bool:
+    """Whether a low-pass follows throttle or headspeed: by its lower limit in Betaflight; in
+    Rotorflight the fixed frequency lies between the two limits as well."""
+    if len(limits) != 2 or not limits[0] > 0:
+        return False
+    return limits[0] <= hz <= limits[1] if rotorflight else limits[1] > limits[0]
+
+
+def _bessel_4(hz: float) -> tuple[Filter, Filter]:
+    return (
+        Filter("biquad", 1.603357516 * hz, 0.805538282),
+        Filter("biquad", 1.430171560 * hz, 0.521934582),
+    )
+
+
+def _bessel(hz: float) -> Filter:
+    return Filter("biquad", 1.272019649 * hz, 0.577350269)
+
+
+def _pt1(hz: float) -> Filter:
+    return Filter("pt1", hz)
+
+
+def _pt2(hz: float) -> Filter:
+    return Filter("pt2", hz)
+
+
+def _pt3(hz: float) -> Filter:
+    return Filter("pt3", hz)
+
+
+def _butterworth(hz: float) -> Filter:
+    return Filter("biquad", hz)
+
+
+# In the order of the enumerations in their filter.h. Rotorflight 4.6 has PT4 in between, which
+# moves the last four; its types from 6 on are therefore not read.
+_BETAFLIGHT: dict[float, Callable[[float], Filter]] = {0: _pt1, 1: _butterworth, 2: _pt2, 3: _pt3}
+_ROTORFLIGHT: dict[float, Callable[[float], Filter]] = {
+    1: _pt1, 2: _bessel, 3: _pt1, 4: _pt2, 5: _pt3,
+}  # fmt: skip
+
+_CHANNELS: tuple[tuple[str, Callable[[_Reading], LoggedFilters | None]], ...] = (
+    (r"vehicle_angular_velocity(\[\d+\])?\.xyz\[[012]\]", _px4_gyro),
+    (r"vehicle_acceleration(\[\d+\])?\.xyz\[[012]\]", _px4_accel),
+    (r"RATE\.[RPY]|IMU\d?(\[\d+\])?\.Gyr[XYZ]|SIDD\.G[xyz]", _ardupilot_gyro),
+    (r"IMU\d?(\[\d+\])?\.Acc[XYZ]|SIDD\.A[xyz]", _ardupilot_accel),
+    (r"gyroADC\[[012]\]", _blackbox_gyro),
+    (r"gyroRAW\[[012]\]", _rotorflight_raw),
+)

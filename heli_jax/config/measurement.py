@@ -1,0 +1,158 @@
+"""What stands between motion and log according to the flights' outputs: filters and delays."""
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from heli_jax import naming
+from heli_jax.config.firmware_filters import LoggedFilters, logged_filters
+from heli_jax.config.onboard import FROM_LOG
+from heli_jax.config.schema import FlightConfig, OutputConfig
+from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.onboard.filters import Filter, with_filters
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Source
+from heli_jax.flights.open_log import chosen_flights, open_flights
+
+type _Channel = tuple[tuple[Filter, ...], float]
+
+
+def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) -> Model:
+    """The model with the filters and delays that the flights state for their outputs.
+
+    Args:
+        model: with the devices of `onboard` around it.
+        flights: of the configuration.
+        path: the configuration; logs are found from its folder.
+
+    Raises:
+        InputError: two flights state different ones, a log does not say what it is asked, or the
+            model cannot have them.
+    """
+    channels: dict[str, tuple[_Channel, int]] = {}
+    for i, flight in enumerate(flights):
+        for part, name, output in _outputs(flight):
+            if name not in naming.names(model.Outputs):
+                continue  # refused where the log is read, with the names that there are
+            channel = _channel(part, i, name, output, path)
+            first, at = channels.setdefault(name, (channel, i))
+            # One model serves all flights, so that one program does.
+            if first != channel:
+                raise InputError(
+                    f"{path}: flights[{i}].signals.outputs.{name}: its filter and delay "
+                    f"({_words(channel)}) differ from those of flights[{at}] ({_words(first)}), "
+                    "expected the same in all flights; fit them one by one"
+                )
+    try:
+        return with_filters(
+            model,
+            {n: filters for n, ((filters, _), _) in channels.items()},
+            {n: delay for n, ((_, delay), _) in channels.items()},
+        )
+    except ValueError as e:
+        raise InputError(f"{path}: flights.signals.outputs: {e}") from e
+
+
+def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
+    """The outputs of a flight with the section that names their log, which has `log`, `flight` and
+    `signals`: the flight itself, or a further log of it."""
+    for part in (flight, *getattr(flight, "also", ())):
+        for name, output in part.signals.outputs.items():
+            yield part, name, output
+
+
+def _channel(part: Any, i: int, name: str, output: OutputConfig, path: Path) -> _Channel:
+    """The filters and the delay of one output."""
+    filters: list[Filter] = []
+    for config in output.filter or ():
+        if config.kind != FROM_LOG:
+            filters.append(config.filter)
+            continue
+        log = str((path.parent / part.log).absolute())
+        logged = logged_filters(*_settings(log, part.flight, _version(log)), output.signal)
+        if logged is None:
+            raise InputError(
+                f"{path}: flights[{i}].signals.outputs.{name}.filter: {part.log} does not say "
+                f"how {output.signal} was filtered, expected a filter such as "
+                "{kind: biquad, hz: 30}"
+            )
+        filters += logged.filters
+    return tuple(filters), output.delay or 0.0
+
+
+def _version(log: str) -> tuple[int, int]:
+    """By which a log that was written anew is known."""
+    try:
+        stat = Path(log).stat()
+    except OSError:  # the reader says what is wrong with it
+        return 0, 0
+    return stat.st_mtime_ns, stat.st_size
+
+
+# Of the last log only: its outputs are asked for one after the other, and it may take seconds to
+# read.
+@functools.lru_cache(maxsize=1)
+def _settings(log: str, number: int | None, version: tuple[int, int]) -> tuple[str, Any]:
+    """Firmware and settings of a log."""
+    opened = chosen_flights(log, open_flights(log), number)
+    if not isinstance(opened, tuple):
+        return "", {}
+    return opened[0].firmware, opened[0].parameters
+
+
+def _words(channel: _Channel) -> str:
+    filters, delay = channel
+    parts = [filter_words(f) for f in filters] + ([f"{delay:g} s late"] if delay else [])
+    return ", ".join(parts) or "none"
+
+
+def filter_words(filter: Filter) -> str:
+    """A filter in words, as a configuration would have it."""
+    more = "" if filter.q is None else f", q {filter.q:.3g}"
+    if not math.isinf(filter.attenuation):
+        more += f", {filter.attenuation:g} dB"
+    return f"{filter.kind} {filter.hz:.4g} Hz{more}"
+
+
+def filter_cautions(source: Source | None, flight: FlightConfig) -> tuple[str, ...]:
+    """What the log's settings say of an output's filter and the configuration does not model.
+
+    Args:
+        source: of the flight that was read.
+        flight: its configuration.
+    """
+    if source is None:
+        return ()
+    said = []
+    for name, output in flight.signals.outputs.items():
+        logged = logged_filters(source.firmware, source.parameters, output.signal)
+        if logged is None:
+            continue
+        if output.filter is None and logged.filters:
+            said.append(_not_modelled(name, logged))
+        if logged.unknown:
+            said.append(
+                f"{name} was also filtered by {', '.join(_short(s) for s in logged.unknown)}: such "
+                "filters move in flight or are of an unknown kind, and are not modelled"
+            )
+    return tuple(said)
+
+
+def _not_modelled(name: str, logged: LoggedFilters) -> str:
+    filters = logged.filters
+    lowpasses = [f for f in filters if f.kind != "notch"]
+    what = f"low-passed at {min(f.hz for f in lowpasses):.4g} Hz" if lowpasses else "notched"
+    late = 1e3 * sum(f.delay for f in filters)
+    # The inputs were not: were both filtered alike, the machine would look the same.
+    return (
+        f"{name} was {what} by the autopilot ({', '.join(_short(s) for s in logged.settings)}), "
+        f"which delays it by about {late:.1f} ms, and the inputs were not: what is estimated takes "
+        "that delay for the machine's; state `filter: from log` to model it, or `filter: []` if it "
+        "is of no account"
+    )
+
+
+def _short(setting: str) -> str:
+    return setting if len(setting) <= 48 else f"{setting[:45]}..."

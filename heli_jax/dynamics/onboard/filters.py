@@ -1,0 +1,324 @@
+r"""Filters of a flight controller between sensor and log: low-passes, notches, pure delays.
+
+Their constants are stated, not estimated: they are settings of a firmware, known to the digit. A
+low-pass of first order is $H = \omega/(s+\omega)$, one of second order
+$H = \omega^2/(s^2 + s\,\omega/Q + \omega^2)$, a notch
+$H = (s^2 + d\,s\,\omega/Q + \omega^2)/(s^2 + s\,\omega/Q + \omega^2)$, where d is what it leaves of
+its centre. In the firmware they are digital; docs/onboard.md says how far apart the two are.
+"""
+
+import functools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.model import Model, zeros
+from heli_jax.dynamics.onboard.delays import ORDER, line_rates, line_states
+from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
+from heli_jax.naming import Record
+
+KINDS = ("pt1", "pt2", "pt3", "biquad", "notch")
+LONGEST_DELAY = 1.0
+"""s: a line of four states follows nothing faster than 4 rad/s through a longer one"""
+_BUTTERWORTH = 1.0 / math.sqrt(2.0)
+_FASTEST_MOTION = 160.0
+"""rad/s (25 Hz): up to here a delay line is to err by less than `_LINE_ERROR`"""
+_LINE_ERROR = 1e-3
+
+
+class Filter(NamedTuple):
+    """A filter as a firmware states it."""
+
+    kind: str
+    """of `KINDS`: pt1, pt2 and pt3 are one, two and three equal lags whose cascade is 3 dB down at
+    `hz` (Betaflight, Rotorflight); biquad is a low-pass of second order (PX4's and ArduPilot's
+    LowPassFilter2p), notch one too"""
+    hz: float
+    """where a low-pass is 3 dB down (a biquad with the Q of Butterworth), or the notch's centre"""
+    q: float | None = None
+    """quality factor, centre over width of a notch; a biquad's is that of Butterworth unless
+    given"""
+    attenuation: float = math.inf
+    """of a notch at its centre [dB]; infinite unless given"""
+
+    def checked(self) -> "Filter":
+        """The filter itself.
+
+        Raises:
+            ValueError: it is none.
+        """
+        if self.kind not in KINDS:
+            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r:.40}")
+        if not (math.isfinite(self.hz) and self.hz > 0):
+            raise ValueError(f"hz: expected a frequency above zero, got {self.hz:g}")
+        if self.kind == "notch" and self.q is None:
+            raise ValueError("q: a notch needs its quality factor, got none")
+        if self.kind not in ("notch", "biquad") and self.q is not None:
+            raise ValueError(f"q: {self.kind} has none, expected it for a biquad or a notch")
+        if self.q is not None and not (math.isfinite(self.q) and self.q > 0):
+            raise ValueError(f"q: expected a number above zero, got {self.q:g}")
+        if not self.attenuation > 0 or (self.kind != "notch" and self.attenuation != math.inf):
+            raise ValueError(
+                f"attenuation: expected decibels above zero, of a notch, got {self.attenuation:g}"
+            )
+        return self
+
+    @property
+    def delay(self) -> float:
+        """By how much slow signals are late behind it [s]: the phase's slope at zero."""
+        return sum(section.delay for section in _sections(self))
+
+
+class _Section(NamedTuple):
+    """A part of first or second order."""
+
+    order: int
+    omega: float
+    """[rad/s]"""
+    q: float = _BUTTERWORTH
+    left: float | None = None
+    """of a notch what it leaves of its centre; None for a low-pass"""
+
+    @property
+    def delay(self) -> float:
+        """[s]"""
+        if self.order == 1:
+            return 1.0 / self.omega
+        return (1.0 if self.left is None else 1.0 - self.left) / (self.q * self.omega)
+
+
+def _sections(filter: Filter) -> tuple[_Section, ...]:
+    omega = 2.0 * math.pi * filter.hz
+    if filter.kind == "notch":
+        assert filter.q is not None  # `Filter.checked`
+        return (_Section(2, omega, filter.q, 10.0 ** (-filter.attenuation / 20.0)),)
+    if filter.kind == "biquad":
+        return (_Section(2, omega, filter.q or _BUTTERWORTH),)
+    # n equal lags are 3 dB down together where each is by 3/n: it is faster than the whole by this
+    # factor (CUTOFF_CORRECTION_PT2 and PT3 of Betaflight's filter.c).
+    n = int(filter.kind[-1])
+    return (_Section(1, omega / math.sqrt(2.0 ** (1.0 / n) - 1.0)),) * n
+
+
+def with_filters(
+    model: Model,
+    filters: Mapping[str, Sequence[Filter]] | None = None,
+    delays: Mapping[str, float] | None = None,
+) -> Model:
+    """The model with its outputs as a flight controller filters them, late by fixed delays.
+
+    Each filter has states `OUTPUT_filter1` and, of second order, `OUTPUT_filter1_rate`; a delay is
+    a line of states as in `with_delays`. Both are linear, with constants that are fixed.
+
+    Args:
+        model: any.
+        filters: by output, one after the other.
+        delays: by output [s], at most `LONGEST_DELAY`; the delay stands behind the filters.
+
+    Raises:
+        ValueError: no such output, a filter that is none, a negative or too long delay, or one
+            beside a delay that the output has already.
+    """
+    check_model(model)
+    filters, delays = filters or {}, delays or {}
+    for name, each in filters.items():
+        for i, filter in enumerate(each):
+            try:
+                filter.checked()
+            except ValueError as e:
+                raise ValueError(f"filter {i + 1} of {name}: {e}") from e
+    for name, delay in delays.items():
+        check_delay(delay, f"delay of {name}")
+        if delay and name in dict(model.delay_lines):
+            raise ValueError(
+                f"delay of {name}: it is late by {dict(model.delay_lines)[name]} already, expected "
+                "one delay"
+            )
+    # What does nothing adds no device: the same model, and the same compiled program.
+    channels = tuple(
+        (name, tuple(filters.get(name, ())), float(delays.get(name, 0.0)))
+        for name in dict.fromkeys((*filters, *delays))
+        if filters.get(name) or delays.get(name)
+    )
+    return _with_channels(model, channels) if channels else model
+
+
+def check_delay(delay: float, where: str) -> None:
+    """Refuse what is no delay of an output.
+
+    Args:
+        delay: [s].
+        where: what the sentence begins with.
+
+    Raises:
+        ValueError: it is negative, too long or no number.
+    """
+    if not delay >= 0:
+        raise ValueError(
+            f"{where}: expected 0 s or more, since no log has an output before it happened, got "
+            f"{delay:g}; if the inputs are logged late, give them a negative delay (onboard.delays)"
+        )
+    if not delay <= LONGEST_DELAY:
+        raise ValueError(
+            f"{where}: expected seconds, at most {LONGEST_DELAY:g}, got {delay:g}; 4 ms are 0.004"
+        )
+
+
+type _Channel = tuple[str, tuple[Filter, ...], float]
+
+
+@functools.cache
+def _with_channels(model: Model, channels: tuple[_Channel, ...]) -> Model:
+    require((name for name, *_ in channels), model.Outputs, "output", model)
+    device = _Filtered(model, channels)
+    return device.made(
+        "filtered",
+        lambda bare: _with_channels(bare, channels),
+        fastest=max(model.fastest, device.fastest),
+    )
+
+
+class _Filtered(Device):
+    """Filters, then a delay line, on some outputs."""
+
+    def __init__(self, model: Model, channels: tuple[_Channel, ...]) -> None:
+        self.sections = {
+            name: tuple(s for filter in filters for s in _sections(filter))
+            for name, filters, _ in channels
+        }
+        self.delays = {name: delay for name, _, delay in channels if delay}
+        self.orders = {name: line_order(delay) for name, delay in self.delays.items()}
+        lines = (line_rate(self.orders[n], delay) for n, delay in self.delays.items())
+        omegas = (s.omega for sections in self.sections.values() for s in sections)
+        self.fastest = max((*lines, *omegas))
+        states = {}
+        for n, sections in self.sections.items():
+            unit = naming.unit(model.Outputs, n)
+            for state, speed, section in _named(n, sections):
+                states[state] = Quantity(unit, f"{n}, low-passed at {section.omega:.5g} rad/s")
+                if section.order == 2:
+                    states[speed] = Quantity(quotient(unit, "s"), f"rate of {state}")
+            for i, state in enumerate(line_states(n, self.orders.get(n, 0))):
+                states[state] = Quantity(unit, f"past of {n}, Legendre coefficient {i}")
+        super().__init__(model, Parts({}, states))
+
+    def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
+        """The derivatives of filters and lines, per second.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+        """
+        measured, rates = self.measured(p, s, u), {}
+        for n, sections in self.sections.items():
+            value = getattr(measured, n)
+            for state, speed, section in _named(n, sections):
+                x = getattr(s, state)
+                if section.order == 1:
+                    rates[state] = section.omega * (value - x)
+                else:
+                    v = getattr(s, speed)
+                    rates[state] = v
+                    rates[speed] = section.omega**2 * (value - x) - section.omega / section.q * v
+                value = self._behind(s, state, speed, section, value)
+            if n in self.delays:
+                line = line_states(n, self.orders[n])
+                past = [getattr(s, state) for state in line]
+                rates |= zip(line, line_rates(past, value, self.delays[n]), strict=True)
+        return rates
+
+    def shown(self, p: Record, s: Record, u: Record, y: Record) -> Record:
+        """The outputs as they are logged.
+
+        Args:
+            p: the Params of the whole model, SI.
+            s: its State, with the states added here.
+            u: its Inputs, as they come from outside.
+            y: the outputs before the filters.
+        """
+        logged = {}
+        for n, sections in self.sections.items():
+            value = getattr(y, n)
+            for state, speed, section in _named(n, sections):
+                value = self._behind(s, state, speed, section, value)
+            if n in self.delays:
+                # Legendre polynomials are one at the far end of the line: the sum is the value
+                # there.
+                value = sum(getattr(s, state) for state in line_states(n, self.orders[n]))
+            logged[n] = value
+        return naming.replace(y, **logged)
+
+    def _behind(self, s: Record, state: str, speed: str, section: _Section, value: Any) -> Any:
+        """The signal behind a section.
+
+        Args:
+            s: the State.
+            state: the section's own.
+            speed: that of its rate.
+            section: its constants.
+            value: the signal before it.
+        """
+        if section.left is None:
+            return getattr(s, state)
+        # The low-passed signal's rate over omega Q is the band that a notch takes away.
+        band = getattr(s, speed) / (section.omega * section.q)
+        return value - (1.0 - section.left) * band
+
+    def first(self, p: Record) -> dict[str, Any]:
+        # As if the machine had always been where it starts: low-passes there, their rates at zero.
+        y = self.model.output(p, self.model.initial_state(p), zeros(self.model.Inputs))
+        first = super().first(p)
+        for n, sections in self.sections.items():
+            settled = {state: getattr(y, n) for state, *_ in _named(n, sections)}
+            if n in self.delays:
+                settled[line_states(n, 1)[0]] = getattr(y, n)
+            first |= settled
+        return first
+
+
+def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str, _Section]]:
+    """Each section with the names of its state and of the state that is its rate."""
+    for i, section in enumerate(sections):
+        yield f"{name}_filter{i + 1}", f"{name}_filter{i + 1}_rate", section
+
+
+@functools.cache
+def line_order(delay: float) -> int:
+    """The states of a fixed delay's line: as few as are exact to a thousandth up to 25 Hz, at most
+    four.
+
+    Args:
+        delay: [s].
+    """
+    # Few, because a line's own rates grow with its states, and a fixed-step solver has to follow
+    # them: a delay of 3 ms needs two states, and is four times as slow as with four.
+    for order in range(1, ORDER):
+        A, b = _line(order)
+        x = 1j * _FASTEST_MOTION * delay
+        late = np.sum(np.linalg.solve(x * np.eye(order) - A, b))
+        if abs(late - np.exp(-x)) < _LINE_ERROR:
+            return order
+    return ORDER
+
+
+def line_rate(order: int, delay: float) -> float:
+    """The fastest rate of a delay line [rad/s].
+
+    Args:
+        order: its states.
+        delay: [s].
+    """
+    return float(np.max(np.abs(np.linalg.eigvals(_line(order)[0])))) / delay
+
+
+def _line(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """A and b of a line of one second."""
+    no = [0.0] * order
+    b = np.array(line_rates(no, 1.0, 1.0))
+    columns = [line_rates([float(i == j) for i in range(order)], 0.0, 1.0) for j in range(order)]
+    return np.array(columns).T, b

@@ -1,0 +1,292 @@
+"""By how much one log's clock is behind another's, from a signal that both hold.
+
+The lag where the correlation coefficient of the two is largest, over all lags that leave enough of
+both; then to a part of a sample by least squares,
+
+    a(t) = g b(t - lag) + c + d t + e(t),
+
+where g, c and d allow for a scale, a bias and its drift. The standard deviation of the lag is that
+of least squares with autocorrelated errors: the curvature of the sum of squares, which the shape of
+the signal gives, and the spectrum of what is left (L. Ljung, System Identification, 1999, section
+9.4; with white errors it is the Cramer-Rao bound of a delay).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.resample import in_gaps, resampled
+from heli_jax.flights.slower import Timed, own_clock, usual_step
+
+BAND = 0.2
+"""of the slower signal's rate: what is faster is taken away, and cubics pass what is left"""
+LEAST = 0.8
+"""correlation below which two signals are not taken for the same motion"""
+_RIVAL = 2.0
+"""times the unexplained variance of the best lag, up to which another explains nearly as well"""
+_SHARE = 0.3
+"""of the shorter signal that the two overlap by, at least"""
+_FEWEST = 40
+"""common samples at least"""
+_STEPS = 30
+_DRIFTS = 3.0
+"""standard deviations by which the lags of both halves differ before a drift is stated"""
+
+
+class Lag(NamedTuple):
+    """What has to be added to the second clock, and how surely that is known."""
+
+    lag: float
+    """[s]"""
+    sd: float
+    """[s]"""
+    correlation: float
+    overlap: float
+    """[s]"""
+    drift: tuple[float, float] | None
+    """rate of the second clock against the first, less one, and its sd, where it shows"""
+
+
+class NotAligned(ValueError):
+    """Why no lag can be told, in words."""
+
+
+def lag_between(a: Timed, b: Timed) -> Lag:
+    """What has to be added to the stamps of `b`, so that it is the same motion as `a`.
+
+    Args:
+        a: a signal on its clock; the unit may be another than that of `b`.
+        b: the same motion, on a clock of any origin.
+
+    Raises:
+        NotAligned: too short, too weakly correlated, against one another, or ambiguous.
+    """
+    a, b = own_clock(a), own_clock(b)
+    # Each from its own beginning: an epoch's digits would cost those of the lag.
+    first_a, first_b = float(a.seconds[0]), float(b.seconds[0])
+    a, b = Timed(a.seconds - first_a, a.values), Timed(b.seconds - first_b, b.values)
+    step = max(usual_step(a.seconds), usual_step(b.seconds))
+    (at_a, even_a), (at_b, even_b) = _even(a, step), _even(b, step)
+    shift, correlation = _coarse(even_a, even_b)
+    # Sample k of a is beside sample k - shift of b.
+    lag = at_a - at_b + shift * step
+    first, last = max(0, shift), min(even_a.size, even_b.size + shift)
+    x, t = even_a[first:last], at_a + step * np.arange(first, last)
+    y = _Smooth(at_b, even_b, step)
+    lag, sd = _refined(t, x, y, lag, step)
+    drift = _drift(t, x, y, lag, step)
+    return Lag(lag + first_a - first_b, sd, correlation, (last - first - 1) * step, drift)
+
+
+def _even(signal: Timed, step: float) -> tuple[float, np.ndarray]:
+    """First time and samples (N,) at even steps [s] of what is slow in a signal, NaN in gaps."""
+    seconds, values = signal
+    seen = np.isfinite(values)
+    if seen.sum() < _FEWEST:
+        raise NotAligned(f"{int(seen.sum())} samples, expected at least {_FEWEST}")
+    seconds, values = seconds[seen], values[seen]
+    count = int((seconds[-1] - seconds[0]) / step + 1e-6) + 1
+    if count > 100 * seconds.size:
+        raise NotAligned(f"{seconds.size} samples in {seconds[-1] - seconds[0]:.4g} s, mostly gaps")
+    times = seconds[0] + step * np.arange(count)
+    even = np.where(in_gaps(seconds, times), np.nan, resampled(seconds, values, times))
+    if np.isfinite(even).sum() < _FEWEST:
+        raise NotAligned(f"{int(np.isfinite(even).sum())} samples, expected at least {_FEWEST}")
+    return float(seconds[0]), _low_passed(even)
+
+
+def _low_passed(x: np.ndarray) -> np.ndarray:
+    """What of even samples (N,) is below `BAND` of their rate; NaN where they are."""
+    from scipy.signal import firwin
+
+    taps = np.asarray(firwin(31, 2.0 * BAND, window="hamming"))
+    seen = np.isfinite(x)
+    middle = float(np.mean(x[seen]))
+    # Weights of missing samples go to their neighbours, so that a gap's edge is not drawn to zero.
+    known = np.convolve(seen.astype(float), taps, "same")
+    sums = np.convolve(np.where(seen, x - middle, 0.0), taps, "same")
+    return np.where(seen & (known > 0.5), middle + sums / np.where(known > 0.5, known, 1.0), np.nan)
+
+
+def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
+    """The shift [steps] of b (M,) that correlates best with a (N,), and the coefficient.
+
+    Raises:
+        NotAligned: no shift does, or several do.
+    """
+    r = _correlation(a, b)
+    # As where sample k of a stands beside sample k - shift of b.
+    shifts = np.arange(-(b.size - 1), a.size)
+    best = int(np.argmax(r))
+    if r[best] < LEAST:
+        lowest = float(r.min())
+        if lowest < -LEAST and -lowest > r[best]:
+            raise NotAligned(
+                f"the two move against one another (correlation {lowest:.2f}); expected the same "
+                "sign, or `reverse: true`"
+            )
+        raise NotAligned(
+            f"they hardly agree (correlation {r[best]:.2f} at the best lag), expected at least "
+            f"{LEAST}"
+        )
+    rival = _rival(r, best)
+    if rival is not None and 1.0 - r[rival] ** 2 < _RIVAL * (1.0 - r[best] ** 2):
+        raise NotAligned(
+            f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags explain nearly the "
+            f"same (correlations {r[best]:.4f} and {r[rival]:.4f}); expected a signal that does "
+            "not repeat itself"
+        )
+    return int(shifts[best]), float(r[best])
+
+
+def _rival(r: np.ndarray, best: int) -> int | None:
+    """The highest maximum outside the hill of the best."""
+    # Down both sides to where it turns: what is on the hill is the same solution.
+    left, right = best, best
+    while left > 0 and r[left - 1] < r[left]:
+        left -= 1
+    while right < r.size - 1 and r[right + 1] < r[right]:
+        right += 1
+    others = np.where((np.arange(r.size) < left) | (np.arange(r.size) > right), r, -1.0)
+    rival = int(np.argmax(others))
+    return rival if others[rival] > 0 else None
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Correlation coefficient (N + M - 1,) of a (N,) and b (M,) over what overlaps at each shift,
+    -1 < 0 < 1; zero where that is too short."""
+    from scipy.signal import correlate
+
+    seen_a, seen_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    # By the means of the whole: sums of squares of large numbers would lose the small motion.
+    x, y = np.nan_to_num(a - np.nanmean(a)), np.nan_to_num(b - np.nanmean(b))
+
+    def sums(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.asarray(correlate(u, v, "full", "fft"))
+
+    n = np.round(sums(seen_a, seen_b))
+    n = np.where(n > 0, n, 1.0)
+    mean_a, mean_b = sums(x, seen_b) / n, sums(seen_a, y) / n
+    var_a = sums(x**2, seen_b) / n - mean_a**2
+    var_b = sums(seen_a, y**2) / n - mean_b**2
+    size = np.sqrt(np.maximum(var_a, 0.0) * np.maximum(var_b, 0.0))
+    shortest = max(_FEWEST, _SHARE * min(seen_a.sum(), seen_b.sum()))
+    # Where one of the two hardly moves within the overlap anything correlates by chance.
+    enough = (n >= shortest) & (var_a > 0.05 * np.var(x)) & (var_b > 0.05 * np.var(y))
+    if not enough.any():
+        raise NotAligned("they are too short or too still to be compared")
+    return np.where(enough, (sums(x, y) / n - mean_a * mean_b) / np.where(size > 0, size, 1), 0.0)
+
+
+class _Smooth:
+    """Even samples as a smooth function of time, with its first two derivatives."""
+
+    def __init__(self, first: float, samples: np.ndarray, step: float) -> None:
+        from scipy.interpolate import CubicSpline
+
+        seen = np.isfinite(samples)
+        t = first + step * np.arange(samples.size)
+        self._spline = CubicSpline(t[seen], samples[seen])
+        self._t, self._seen, self._step = t, seen, step
+
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value and first two derivatives at times (n,); NaN beside what is missing."""
+        i = np.floor((t - self._t[0]) / self._step + 1e-9).astype(np.int64)
+        inside = (i >= 0) & (i < self._seen.size - 1)
+        i = np.clip(i, 0, self._seen.size - 2)
+        known = inside & self._seen[i] & self._seen[i + 1]
+        value, slope, bend = (np.where(known, self._spline(t, k), np.nan) for k in range(3))
+        return value, slope, bend
+
+
+def _refined(
+    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
+) -> tuple[float, float]:
+    """The lag of least squares from a near one, and its standard deviation, both [s].
+
+    Args:
+        t: times (n,) of `x` (n,), by the first clock.
+        x: the first signal, NaN where missing.
+        y: the second.
+        lag: to begin with.
+        step: between the times.
+    """
+    begun = lag
+    for _ in range(_STEPS):
+        slope, bend, left = _linearised(t, x, y, lag)
+        # Newton's: the slope of the sum of squares over its curvature. Where noise makes that
+        # negative the plain Gauss-Newton step does not fail.
+        curvature = float(slope @ slope - left @ bend)
+        curvature = curvature if curvature > 0.1 * float(slope @ slope) else float(slope @ slope)
+        # The model falls as the lag grows: its derivative is minus the slope.
+        move = float(np.clip(-(left @ slope) / curvature, -0.5 * step, 0.5 * step))
+        lag += move
+        if abs(lag - begun) > 3.0 * step:
+            raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
+        if abs(move) < 1e-7 * step:
+            break
+    slope, bend, left = _linearised(t, x, y, lag)
+    curvature = float(slope @ slope - left @ bend)
+    if not curvature > 0:
+        raise NotAligned("the lag is not told by the sum of squares, which has no minimum near")
+    return lag, float(np.sqrt(t.size * _long_run(slope * left)) / curvature)
+
+
+def _linearised(
+    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slope and second derivative of the model by time, and what it leaves of x, each (n,), zero
+    where one of the two is missing.
+
+    Scale, bias and drift are taken out of slope and rest, as least squares does.
+    """
+    value, slope, bend = y.at(t - lag)
+    seen = np.isfinite(value) & np.isfinite(x)
+    if seen.sum() < _FEWEST:
+        raise NotAligned("they overlap by too little")
+    others = np.stack([value, np.ones(t.size), t - t.mean()])[:, seen].T
+    gains, *_ = np.linalg.lstsq(others, x[seen], rcond=None)
+    left = x[seen] - others @ gains
+    slope = gains[0] * slope[seen]
+    slope = slope - others @ np.linalg.lstsq(others, slope, rcond=None)[0]
+    whole = np.zeros((3, t.size))
+    whole[:, seen] = slope, gains[0] * bend[seen], left
+    return whole[0], whole[1], whole[2]
+
+
+def _long_run(v: np.ndarray) -> float:
+    """Variance of the sum of v (n,) over n: the sum of its autocovariances under Parzen's window,
+    whose length its correlation time asks for (Andrews, 1991)."""
+    n = v.size
+    size = 1 << (2 * n - 1).bit_length()
+    c = np.fft.irfft(np.abs(np.fft.rfft(v, size)) ** 2, size)[:n] / n
+    if not c[0] > 0:
+        return 0.0
+    rho = c[1 : max(n // 5, 2)] / c[0]
+    time = max(1.0, (1.0 + 2.0 * float(np.sum(rho**2))) / (1.0 + 2.0 * rho.size / n))
+    length = min(max(6.0 * time * (n / time) ** 0.2, 2.0), 0.5 * n)
+    lags = np.minimum(np.arange(n) / length, 1.0)
+    window = np.where(lags < 0.5, 1 - 6 * lags**2 * (1 - lags), 2 * (1 - lags) ** 3)
+    # Few windows fit into a short record, and what least squares fits is missing in the rest.
+    return max(float(c[0] + 2.0 * np.sum(window[1:] * c[1:])), 0.1 * float(c[0]))
+
+
+def _drift(
+    t: np.ndarray, x: np.ndarray, y: _Smooth, lag: float, step: float
+) -> tuple[float, float] | None:
+    """How much faster the second clock is, from the lags of both halves, and its sd; None where
+    that is less than chance makes, or one half does not tell."""
+    middle = t.size // 2
+    halves = []
+    for part in (slice(0, middle), slice(middle, t.size)):
+        try:
+            halves.append(_refined(t[part], x[part], y, lag, step))
+        except NotAligned:
+            return None
+    (early, sd_early), (late, sd_late) = halves
+    span = float(t[-1] - t[0]) / 2.0
+    change, sd = late - early, float(np.hypot(sd_early, sd_late))
+    if abs(change) < _DRIFTS * sd:
+        return None
+    # A second clock that runs fast has the larger stamps, and less has to be added to them.
+    return -change / span, sd / span

@@ -1,0 +1,152 @@
+"""What tables of rows and topics with clocks of their own share on the way to a `Flight`.
+
+Sentences about a wrong log are not among it: they name rows of a table, and seconds of a topic.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.flight import Flight, Source
+from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.repeats import repeats_removed
+from heli_jax.flights.request import Request
+from heli_jax.flights.resample import hold, in_gaps, longest_gap, resampled
+from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
+from heli_jax.flights.slower import note as slower_note
+from heli_jax.flights.table import shown
+
+Key = tuple[str, str]
+"""a model's name, and `input` or `output`"""
+FEWEST = 8
+"""samples in a run"""
+MOST_UPSAMPLING = 100
+"""times the log's rate: more is a slip, and fills the memory with straight lines"""
+
+
+class LongGap(NamedTuple):
+    """A step that nothing should bridge: the sample before it, its size and the limit [s]."""
+
+    row: int
+    step: float
+    most: float
+
+
+def long_gap(seconds: np.ndarray) -> LongGap | None:
+    """The longest step between stamps (N,) [s] where it is too long to be bridged."""
+    steps, most = np.diff(seconds), longest_gap(seconds)
+    row = int(np.argmax(steps))
+    # A step of exactly the limit, but for its rounding, passes.
+    return LongGap(row, float(steps[row]), most) if steps[row] > most * (1 + 1e-9) else None
+
+
+def even_expected(seconds: np.ndarray, usual: float) -> str:
+    """What to do about stamps (N,) [s] that are no uniform grid, in words; `usual` is the step
+    [s] of most."""
+    # Where a gap is too long to be bridged, a rate would only lead to the next error.
+    bridged = long_gap(seconds) is None
+    remedy = f"`rate: {1 / usual:.4g}` to resample, or " if bridged else ""
+    # The parts beside it may well be uniform.
+    split = "" if bridged else " or `gaps: split`"
+    return f"expected a uniform grid; give {remedy}a window without such steps{split}"
+
+
+def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[str, Decision]:
+    """What each input does between samples: as stated, or by what its own samples (N,) show."""
+    holds = {}
+    for (key, kind), signal in request.signals.items():
+        if kind == "input":
+            stated = Decision(signal.hold, "")  # no reason: the log decided nothing
+            holds[key] = decide(values[key, kind]) if signal.hold == "auto" else stated
+    return holds
+
+
+def missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
+    """A note for every output (N,) with missing samples."""
+    notes = []
+    for key, samples in values.items():
+        count = int(np.isnan(samples).sum())
+        if count:
+            name = shown(request.signals[key].name)
+            notes.append(f"{count} of {samples.size} samples of {name} are missing")
+    return notes
+
+
+def measured_once(
+    request: Request, values: Mapping[Key, np.ndarray]
+) -> tuple[dict[Key, np.ndarray], list[str]]:
+    """The signals (N,), repeated values of slow outputs taken as missing, and notes."""
+    outputs = request.of_kind("output", values)
+    stated = {name: request.signals[name, "output"].repeats for name in outputs}
+    made, notes = repeats_removed(outputs, stated)
+    return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
+
+
+def at_times(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+    times: np.ndarray,
+) -> tuple[dict[Key, np.ndarray], list[str]]:
+    """The signals' samples (M,) on a grid, and notes.
+
+    Inputs follow their hold. Outputs are interpolated, or low-pass filtered where the rate goes
+    down; those that are slower than the grid stand at the instants nearest to their own.
+
+    Args:
+        request: names them.
+        signals: by key, SI, each on its own clock.
+        holds: by input.
+        times: of the grid (M,) [s].
+    """
+    samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    for (key, kind), signal in signals.items():
+        if kind == "input":
+            # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
+            method = hold if holds[key].hold == "zero-order" else resampled
+            samples[key, kind] = method(*signal, times)
+        elif is_slower(signal, rate):
+            placed = at_nearest(signal, times)
+            samples[key, kind] = placed.samples
+            notes.append(slower_note(shown(request.signals[key, kind].name), placed, signal, rate))
+        else:
+            own = own_clock(signal)
+            # Missing rows are no longer there to say where too much is missing.
+            gaps = in_gaps(own.seconds, times) if own is not signal else False
+            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
+    return samples, notes
+
+
+def flight_of(
+    request: Request,
+    samples: Mapping[Key, np.ndarray],
+    dt: float,
+    t0: float,
+    holds: Mapping[str, Decision],
+    source: Source,
+) -> Flight:
+    """The flight of samples (N,) on one grid.
+
+    Args:
+        request: what was asked for.
+        samples: by key, SI.
+        dt: step of the grid [s].
+        t0: time in the log of the first sample [s].
+        holds: by input.
+        source: where the samples came from.
+    """
+    options = request.options
+    return Flight(
+        dt=dt,
+        inputs=request.of_kind("input", samples),
+        outputs=request.of_kind("output", samples),
+        t0=t0,
+        sd=request.noise(),
+        known=request.known,
+        hold_out=options.hold_out,
+        name=options.name,
+        source=source,
+        hold={key: decision.hold for key, decision in holds.items()},
+        hold_reason={key: decision.reason for key, decision in holds.items() if decision.reason},
+    )

@@ -1,0 +1,42 @@
+"""A flight with gaps as several: nobody knows what lies in a gap, but what lies beside it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.flights.resample import longest_gap
+
+SHORTEST = 2.0
+"""s; a part brings an initial state and biases of its own, which shorter ones hardly tell"""
+FEWEST = 50
+"""samples of the fastest clock in a part"""
+
+
+def stretches(clocks: Sequence[np.ndarray]) -> list[tuple[float, float]]:
+    """First and last time [s] of each stretch in which no clock has a gap that nothing bridges.
+
+    Args:
+        clocks: stamps (N,) [s] of each, increasing.
+    """
+    begin = max(float(seconds[0]) for seconds in clocks)
+    end = min(float(seconds[-1]) for seconds in clocks)
+    gaps = []
+    for seconds in clocks:
+        rows = np.flatnonzero(np.diff(seconds) > longest_gap(seconds) * (1 + 1e-9))
+        gaps += [(float(seconds[i]), float(seconds[i + 1])) for i in rows]
+    found, at = [], begin
+    for before, after in sorted(gaps):
+        if before > at:
+            found.append((at, min(before, end)))
+        # Gaps of several clocks may overlap.
+        at = max(at, after)
+    if at < end:
+        found.append((at, end))
+    return [(a, b) for a, b in found if b > a]
+
+
+def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> bool:
+    """Whether a stretch [s] is left out."""
+    fastest = min(float(np.median(np.diff(seconds))) for seconds in clocks)
+    length = stretch[1] - stretch[0]
+    return length < SHORTEST or length < (FEWEST - 1.5) * fastest

@@ -1,0 +1,276 @@
+"""From a table of rows, one column of which is the time, to a `Flight`."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heli_jax import units
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.grid import (
+    LATEST,
+    SHORTEST_STEP,
+    Grid,
+    Uneven,
+    not_increasing,
+    rounding_of,
+    uniform_grid,
+)
+from heli_jax.flights.holds import Decision
+from heli_jax.flights.onto_grid import (
+    FEWEST,
+    MOST_UPSAMPLING,
+    Key,
+    at_times,
+    decided_holds,
+    even_expected,
+    flight_of,
+    long_gap,
+    measured_once,
+    missing_notes,
+)
+from heli_jax.flights.read_channels import ClockedSignal, TopicClock
+from heli_jax.flights.request import Request
+from heli_jax.flights.resample import new_clock
+from heli_jax.flights.slower import Timed
+from heli_jax.flights.table import Table, column, wrong
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedTable:
+    """A table with the columns (N,) that are asked for, and its clock."""
+
+    table: Table
+    numbers: Mapping[str, np.ndarray]
+    clock: "_Clock"
+
+    @property
+    def first_time(self) -> float:
+        """Of the first stamp [s], from which windows count."""
+        return float(self.clock.stamps[0] * self.clock.scale)
+
+
+def load_table(table: Table, request: Request) -> LoadedTable:
+    """The columns that are asked for, and the clock.
+
+    Raises:
+        InputError: a column is missing or holds no numbers, or the time is none.
+    """
+    if request.time is None:
+        problem = "no time is stated, expected the name of the column of time stamps"
+        raise wrong(table.path, problem)
+    numbers = table.numbers(request.columns)
+    return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
+
+
+def read_table(loaded: LoadedTable, request: Request) -> Flight:
+    """The flight inside the window of `request`.
+
+    Raises:
+        InputError: one sentence on what is wrong with the table, the window or the rate.
+    """
+    table, clock, options = loaded.table, loaded.clock, request.options
+    assert request.time is not None  # or `load_table` would have refused it
+    # The window before anything else is asked of the samples: what lies outside of it may be as
+    # wrong as it likes.
+    rows, notes = _rows(table.path, clock.elapsed, options.window)
+    signals = _to_si(table, request, loaded.numbers, rows)
+    stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
+    # Before the grid, whose rounding is a part of a step: steps of a wrong unit would make it
+    # meaningless.
+    _check_step(stamps)
+    grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
+    if isinstance(grid, Uneven) and options.rate is None:
+        raise _uneven(stamps, grid)
+    # Before any resampling, which moves an input at more samples than the log shows it to.
+    holds = decided_holds(request, signals)
+    signals, repeated = measured_once(request, signals)
+    dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
+    notes = (*notes, *repeated, *missing_notes(request, signals), *more)
+    source = Source(table.path, table.sha256, notes)
+    t0 = float(clock.stamps[rows.start] * clock.scale)
+    return flight_of(request, samples, dt, t0, holds, source)
+
+
+def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
+    """The signals inside the window as those of one topic, in seconds from the first stamp.
+
+    Raises:
+        InputError: as `read_table`, but for what a uniform grid needs.
+    """
+    table, clock = loaded.table, loaded.clock
+    assert request.time is not None  # or `load_table` would have refused it
+    rows, _ = _rows(table.path, clock.elapsed, request.options.window)
+    signals = _to_si(table, request, loaded.numbers, rows)
+    stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
+    _check_step(stamps)
+    topic = TopicClock(Path(table.path).name, stamps.seconds, rows)
+    return {key: ClockedSignal(topic, x) for key, x in signals.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """Stamps (N,) in the log's unit, which is `scale` seconds, and the time since the first."""
+
+    stamps: np.ndarray
+    scale: float
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """(N,) [s], from 0; subtracted first, so that a calendar's digits do not cost any."""
+        return (self.stamps - self.stamps[0]) * self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class _Stamps:
+    """The stamps (N,) that are used, in seconds from the log's first, and where they stand."""
+
+    table: Table
+    name: str
+    """of their column"""
+    seconds: np.ndarray
+    first_row: int
+
+    def wrong(self, problem: str, i: int) -> InputError:
+        """The error for the i-th of these stamps, placed in the file's own rows."""
+        place = self.table.place(self.first_row + i)
+        return wrong(self.table.path, problem, place, column(self.name))
+
+
+def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
+    """The stamps, finite and increasing."""
+    place = column(time.name)
+    # A column of time stamps says by its type what its ticks are, whatever the user thinks.
+    scale = units.factor(table.time_unit(time.name) or time.unit, "s")
+    with np.errstate(over="ignore"):
+        bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
+    if bad.size:
+        row = int(bad[0])
+        problem = f"got {table.cell_text(time.name, row)}, expected a time"
+        raise wrong(table.path, problem, table.place(row), place)
+    back = not_increasing(stamps)
+    if back is not None:
+        row, fault = back
+        after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
+        problem = f"the time {fault}, got {now} after {after}, expected increasing times"
+        raise wrong(table.path, problem, table.place(row), place)
+    return _Clock(stamps, scale)
+
+
+def _rows(
+    path: str, elapsed: np.ndarray, window: tuple[float, float] | None
+) -> tuple[slice, tuple[str, ...]]:
+    """The rows inside the window, and a note where the window reaches beyond the log."""
+    first, last, notes = 0, elapsed.size, ()
+    where = "the log"
+    if window is not None and elapsed.size > 1:
+        step = float(np.median(np.diff(elapsed)))  # the mean would count the gaps
+        start, end = window
+        where = f"the window from {start:g} s to {end:g} s"
+        if end < 0 or start > elapsed[-1]:
+            raise wrong(
+                path,
+                f"{where} lies outside the log, expected a part of 0 s to {elapsed[-1]:.6g} s",
+            )
+        if start < 0 or end > elapsed[-1] + step:
+            notes = (f"{where} was cut to the log, which ends at {elapsed[-1]:.6g} s",)
+        # The bounds are inclusive whatever the rounding of the stamps.
+        first = int(np.searchsorted(elapsed, start - 1e-3 * step, side="left"))
+        last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
+    if last - first < FEWEST:
+        count = max(last - first, 0)
+        raise wrong(path, f"{where} holds {count} samples, expected at least {FEWEST}")
+    return slice(first, last), notes
+
+
+_Samples = dict[Key, np.ndarray]
+
+
+def _to_si(
+    table: Table, request: Request, numbers: Mapping[str, np.ndarray], rows: slice
+) -> _Samples:
+    """The signals (N,) inside the window in SI, by name and kind."""
+    samples = {}
+    for (key, kind), signal in request.signals.items():
+        with np.errstate(over="ignore"):  # what overflows is refused below, with its line
+            values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
+        # An output may be missing here and there; a stick is somewhere all the time.
+        bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
+        if bad.size:
+            row = rows.start + int(bad[0])
+            problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"
+            raise wrong(table.path, problem, table.place(row), column(signal.name))
+        samples[key, kind] = values
+    return samples
+
+
+def _check_step(stamps: _Stamps) -> None:
+    """Refuse steps that no clock resolves: the time's unit is wrong."""
+    usual = float(np.median(np.diff(stamps.seconds)))
+    if usual < SHORTEST_STEP:
+        problem = f"the usual step is {usual:.3g} s, expected at least 1 ns"
+        raise stamps.wrong(f"{problem}; look at the time's unit", 0)
+
+
+def _uneven(stamps: _Stamps, uneven: Uneven) -> InputError:
+    """The error for stamps that are no uniform grid, with the remedy."""
+    if uneven.drift is not None:
+        problem = f"the times leave a uniform grid by {uneven.drift:.2g} samples"
+    else:
+        problem = f"a step of {uneven.step:.6g} s where {uneven.usual:.6g} s is usual"
+    expected = even_expected(stamps.seconds, uneven.usual)
+    return stamps.wrong(f"{problem}, {expected}", uneven.row)
+
+
+def _on_grid(
+    stamps: _Stamps,
+    request: Request,
+    signals: _Samples,
+    grid: Grid | Uneven,
+    holds: Mapping[str, Decision],
+) -> tuple[float, _Samples, tuple[str, ...]]:
+    """The time step, the signals on the uniform grid, and notes on how they came there."""
+    seconds, rate = stamps.seconds, request.options.rate
+    notes: tuple[str, ...] = ()
+    if isinstance(grid, Grid):
+        if rate is None:
+            return grid.dt, signals, grid.notes
+        # A rate that leaves the log's own grid by less than half a sample at its end is that grid:
+        # the samples stay as they are, unblurred by interpolation.
+        if abs(rate * grid.dt - 1.0) * seconds.size < 0.5:
+            return 1.0 / rate, signals, grid.notes
+        # The grid is better than its rounded stamps: held inputs would slip by a sample.
+        seconds, notes = seconds[0] + grid.dt * np.arange(seconds.size), grid.notes
+        stamps = dataclasses.replace(stamps, seconds=seconds)
+    assert rate is not None  # `read_flight` refuses uneven stamps without one
+    _check_rate(stamps, rate)
+    clock = new_clock(seconds, rate)
+    timed = {key: Timed(seconds, x) for key, x in signals.items()}
+    samples, more = at_times(request, timed, holds, clock.times)
+    return clock.dt, samples, (*notes, *clock.notes, *more)
+
+
+def _check_rate(stamps: _Stamps, rate: float) -> None:
+    """Refuse gaps that nothing should bridge, and rates that make no sense for the log."""
+    seconds, path = stamps.seconds, stamps.table.path
+    gap = long_gap(seconds)
+    if gap is not None:
+        raise stamps.wrong(
+            f"a gap of {gap.step:.6g} s, {seconds[gap.row]:.6g} s after the first sample,"
+            f" expected none longer than {gap.most:.3g} s; give a window without it,"
+            " or `gaps: split`",
+            gap.row + 1,
+        )
+    usual = float(np.median(np.diff(seconds)))
+    count = (seconds[-1] - seconds[0]) * rate
+    if not count >= FEWEST - 1 - 1e-6:
+        problem = f"a rate of {rate:g} Hz leaves fewer than {FEWEST} samples, expected more"
+        raise wrong(path, problem)
+    # The product can overflow where the rate alone is finite.
+    if not (rate * usual <= MOST_UPSAMPLING and math.isfinite(count)):
+        problem = f"a rate of {rate:g} Hz for a log of about {1 / usual:.4g} Hz"
+        raise wrong(path, f"{problem}, expected at most {MOST_UPSAMPLING} times as much")

@@ -1,0 +1,183 @@
+"""What a flight is read from: a log, and others of the same flight with clocks of their own."""
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.align import Lag, NotAligned, lag_between
+from heli_jax.flights.flight import Flight, Signal, Source
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.onto_grid import FEWEST, Key
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.read_channels import (
+    ClockedSignal,
+    TopicClock,
+    flight_of_signals,
+    read_channels,
+    signals_of,
+)
+from heli_jax.flights.read_table import LoadedTable, clocked_table, load_table, read_table
+from heli_jax.flights.request import Also, ReadOptions, Request
+from heli_jax.flights.table import shown, wrong
+
+
+class Beside(NamedTuple):
+    """The signals of a further log, by the clock of the first [s], and a note on how that was
+    found."""
+
+    signals: Mapping[Key, ClockedSignal]
+    note: str
+
+
+class Opened(NamedTuple):
+    """What is read for one flight."""
+
+    log: ChannelLog | LoadedTable
+    keys: frozenset[Key]
+    """the signals that the first log holds"""
+    beside: tuple[Beside, ...]
+
+
+def opened(request: Request) -> tuple[Opened, Request]:
+    """The logs of a request, those beside the first aligned with it, and the request for the
+    signals of all of them.
+
+    Raises:
+        InputError: a log cannot be read, or not be aligned with the first.
+    """
+    log = _open(request)
+    keys, everything, beside = frozenset(request.signals), copy.copy(request), []
+    for also in request.options.also:
+        signals = {(n, "input"): s for n, s in also.inputs.items()}
+        signals |= {(n, "output"): s for n, s in also.outputs.items()}
+        twice = next((key for key in signals if key in everything.signals), None)
+        if twice is not None:
+            raise wrong(also.path, f"{twice[1]} {twice[0]!r} is taken from two logs, expected one")
+        everything.signals = {**everything.signals, **signals}
+        beside.append(_beside(log, request, also))
+    return Opened(log, keys, tuple(beside)), everything
+
+
+def clocked(logs: Opened, request: Request) -> dict[Key, ClockedSignal]:
+    """The signals inside the window, each on its clock, in seconds from the first log's
+    beginning."""
+    signals = _clocked(logs.log, _only(request, logs.keys))
+    for one in logs.beside:
+        signals |= {key: _within(s, request) for key, s in one.signals.items()}
+    return signals
+
+
+def flight_from(logs: Opened, request: Request) -> Flight:
+    """The flight inside the window.
+
+    Raises:
+        InputError: one sentence on what is wrong with a log, the window or the rate.
+    """
+    log = logs.log
+    if not logs.beside:
+        if isinstance(log, ChannelLog):
+            return read_channels(log, request)
+        # A table by itself has rows that a message can name, and stamps whose rounding is known.
+        return read_table(log, request)
+    notes = tuple(one.note for one in logs.beside)
+    if isinstance(log, ChannelLog):
+        source = Source(log.path, log.sha256, (*log.notes, *notes), log.firmware, log.parameters)
+        first = log.first_time
+    else:
+        source, first = Source(log.table.path, log.table.sha256, notes), log.first_time
+    return flight_of_signals(clocked(logs, request), request, source, first)
+
+
+def _open(request: Request) -> ChannelLog | LoadedTable:
+    log = open_log(request.path, request.options.number)
+    if not isinstance(log, ChannelLog):
+        return load_table(log, request)
+    if request.time is not None:
+        problem = "its topics have clocks of their own, expected no time to be stated, got "
+        raise wrong(log.path, problem + shown(request.time.name))
+    return log
+
+
+def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
+    return signals_of(log, request) if isinstance(log, ChannelLog) else clocked_table(log, request)
+
+
+def _only(request: Request, keys: frozenset[Key]) -> Request:
+    part = copy.copy(request)
+    part.signals = {key: s for key, s in request.signals.items() if key in keys}
+    return part
+
+
+def _whole(request: Request) -> Request:
+    """The same over all of the log: a lag is found from as much as there is."""
+    request = copy.copy(request)
+    request.options = dataclasses.replace(request.options, window=None)
+    return request
+
+
+def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Beside:
+    """The signals of a further log, its clock shifted to that of the first."""
+    key = next((key for key in request.signals if key[0] == also.same), None)
+    if key is None:
+        known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
+        problem = f"expected a signal of the first log ({known}), got {also.same!r:.60}"
+        raise wrong(also.path, problem, "align.with")
+    options = ReadOptions(number=also.number)
+    # Apart from the others, since it may well be one of them.
+    alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
+    other = _open(alone)
+    reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
+    (twin,) = _clocked(other, alone).values()
+    try:
+        # A scale does not matter for it, so that no unit is asked for.
+        sign = -1.0 if also.reverse else 1.0
+        lag = lag_between(reference, twin.timed._replace(values=sign * twin.values))
+    except NotAligned as e:
+        what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
+        raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
+    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    signals = _clocked(_open(asked), asked)
+    name = Path(also.path).name
+    shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
+    sha256 = other.sha256 if isinstance(other, ChannelLog) else other.table.sha256
+    return Beside(shifted, _note(f"{name} (sha256 {sha256[:12]})", also, lag))
+
+
+def _note(name: str, also: Also, lag: Lag) -> str:
+    """What was found of the clock of a further log, in words."""
+    words = (
+        f"{name}: {lag.lag:.6g} s (sd {1e3 * lag.sd:.2g} ms) were added to its times, counted from "
+        f"its beginning, by which {shown(also.to)} agrees best with {also.same} (correlation "
+        f"{lag.correlation:.3f} over {lag.overlap:.4g} s)"
+    )
+    if lag.drift is None:
+        return words
+    rate, sd = lag.drift
+    return (
+        f"{words}; the lag drifts by {-1e6 * rate:.3g} us a second (sd {1e6 * sd:.2g}), which is "
+        "not corrected"
+    )
+
+
+def _shifted(signal: ClockedSignal, lag: float, name: str) -> ClockedSignal:
+    # Two files may well have topics of the same name.
+    topic = signal.clock.topic if signal.clock.topic == name else f"{name}, {signal.clock.topic}"
+    clock = TopicClock(topic, signal.clock.seconds + lag, signal.clock.rows)
+    return ClockedSignal(clock, signal.values)
+
+
+def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
+    """The part of a signal inside the window."""
+    window, seconds = request.options.window, signal.clock.seconds
+    if window is None:
+        return signal
+    rows = slice(*np.searchsorted(seconds, [window[0] - 1e-9, window[1] + 1e-9]))
+    seconds = seconds[rows]
+    if seconds.size < FEWEST:
+        problem = f"holds {seconds.size} samples from {window[0]:g} s to {window[1]:g} s"
+        raise wrong(request.path, f"{problem}, expected at least {FEWEST}", signal.clock.topic)
+    return ClockedSignal(TopicClock(signal.clock.topic, seconds, rows), signal.values[rows])

@@ -1,0 +1,119 @@
+"""Lines of vibration in a record: which frequencies, how much of its variance, of what."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+_SEGMENT = 4.0
+"""s: lines of a quarter of a hertz, which a rotor's speed keeps to for so long"""
+_STANDS_OUT = 20.0
+"""times the median of its surroundings: noise does so once in a million bins"""
+_SURROUNDINGS = 15
+"""bins to either side of which the median is taken"""
+_SMALLEST = 0.01
+"""share of the variance below which a line biases nothing"""
+_SLOWEST = 4.0
+"""Hz: below are the machine's own motion and the sticks', whose doublets have lines too"""
+_HIGHEST = 12
+"""harmonics of the rotor that are looked for"""
+_HIGHEST_FOLDED = 4
+"""those that are looked for where they fold to: of more, one would be near any line"""
+
+
+class Line(NamedTuple):
+    """A line of the spectrum."""
+
+    hz: float
+    share: float
+    """of the variance"""
+    harmonic: int = 0
+    """of the rotor; zero where it is none"""
+    of_hz: float = 0.0
+    """the harmonic's own frequency: another one where it is aliased"""
+
+    @property
+    def aliased(self) -> bool:
+        """Whether it is above half the rate and was folded down."""
+        return self.harmonic > 0 and abs(self.of_hz - self.hz) > 0.1 * self.of_hz
+
+
+def lines(
+    x: np.ndarray, dt: float, rotor_hz: float | None = None, logged_hz: float | None = None
+) -> tuple[Line, ...]:
+    """The lines of a record, the strongest first.
+
+    Args:
+        x: samples (N,); NaN where one is missing, which are put on straight lines.
+        dt: time between them [s].
+        rotor_hz: turns per second of the rotor.
+        logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
+    """
+    # Imported here, as everywhere in the readers: it takes a third of a second.
+    from scipy.ndimage import median_filter
+    from scipy.signal import detrend, welch
+
+    n = min(x.size, max(64, round(_SEGMENT / dt)))
+    there = np.isfinite(x)
+    if np.count_nonzero(there) < max(64, x.size // 2):
+        return ()
+    times = np.arange(x.size)
+    x = detrend(np.interp(times, times[there], x[there]))
+    hz, power = welch(x, 1.0 / dt, "hann", nperseg=n, detrend="linear")
+    # Of the whole record: what is slower than a segment is part of the variance as well.
+    total = float(np.var(x)) / float(hz[1])
+    if not total > 0:
+        return ()
+    around = median_filter(power, 2 * _SURROUNDINGS + 1, mode="nearest")
+    peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
+    found = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
+    rate = 1.0 / dt if logged_hz is None else logged_hz
+    result = []
+    for i in found[hz[found] >= _SLOWEST]:
+        # Two bins to either side: as wide as the window makes a line.
+        part = slice(max(i - 2, 0), i + 3)
+        share = float(np.sum(power[part] - around[part])) / total
+        if share >= _SMALLEST:
+            name = _harmonic(float(hz[i]), rate, rotor_hz, 1.5 * float(hz[1]))
+            result.append(Line(float(hz[i]), share, *name))
+    return tuple(sorted(result, key=lambda line: -line.share))
+
+
+def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
+    """Which harmonic of the rotor a line is, and this harmonic's own frequency; zeros for none."""
+    if rotor_hz is None:
+        return 0, 0.0
+    for k in range(1, _HIGHEST + 1):
+        own = k * rotor_hz
+        # A governor keeps the speed to a percent or two.
+        there = own < 0.5 * rate or k <= _HIGHEST_FOLDED
+        if there and abs(folded(own, rate) - hz) <= width + 0.01 * own:
+            return k, own
+    return 0, 0.0
+
+
+def folded(hz: float, rate: float) -> float:
+    """Where a frequency appears in samples taken at a rate [Hz].
+
+    Args:
+        hz: [Hz].
+        rate: [Hz].
+    """
+    return abs(hz - rate * round(hz / rate))
+
+
+def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
+    """A record (N,) without some frequencies: a causal notch for each, settled at the first sample.
+
+    Args:
+        x: samples (N,), without gaps.
+        dt: time between them [s].
+        frequencies: centres of the notches [Hz], below half the rate.
+        q: centre over width.
+    """
+    from scipy.signal import iirnotch, lfilter, lfilter_zi
+
+    for hz in frequencies:
+        b, a = iirnotch(hz, q, 1.0 / dt)
+        x = lfilter(b, a, x, zi=lfilter_zi(b, a) * x[0])[0]
+    return x

@@ -1,0 +1,158 @@
+"""Two logs of one flight, their clocks brought together by a motion that both hold."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax import config
+from heli_jax.errors import InputError
+from heli_jax.flights import Also, Signal, read_flight
+from heli_jax.flights.align import NotAligned, lag_between
+from heli_jax.flights.slower import Timed
+
+from .test_configured_logs import BENCH
+
+
+def motion(seed, fastest=2.0):
+    """Random motion of a limited band, as a function of time."""
+    rng = np.random.default_rng(seed)
+    w, phase = 2 * np.pi * rng.uniform(0.05, fastest, 60), rng.uniform(0, 6.3, 60)
+    return lambda t: 0.3 * np.sin(np.multiply.outer(t, w) + phase).mean(axis=-1)
+
+
+def pair(seed, lag, rates=(100, 50), noise=(0.02, 0.02), drift=0.0):
+    """The same motion on two clocks, the second one's behind by `lag` [s]."""
+    rng, x = np.random.default_rng(seed), motion(seed)
+    t = [np.arange(a * f, b * f) / f for (a, b), f in zip([(0, 40), (8, 35)], rates, strict=True)]
+    t = [s + rng.uniform(-0.1, 0.1, s.size) / f for s, f in zip(t, rates, strict=True)]
+    a, b = (
+        x(s) + n * np.std(x(s)) * rng.standard_normal(s.size) for s, n in zip(t, noise, strict=True)
+    )
+    return Timed(t[0], a), Timed((t[1] - lag) * (1 + drift), 57.3 * b + 2.0)
+
+
+def test_lags_are_found_to_a_part_of_a_sample():
+    """Over 6 records; experiments/alignment.py has more, and other rates and noise."""
+    z = []
+    for seed in range(6):
+        lag = np.random.default_rng(seed + 99).uniform(-5, 5) + 1.6e9 * (seed % 2)
+        found = lag_between(*pair(seed, lag))
+        assert found.sd < 2e-3
+        assert found.correlation > 0.99
+        z.append((found.lag - lag) / found.sd)
+    # 1.6e9 s are 200 ns in float64: the epoch costs nothing.
+    assert np.abs(z).max() < 3.0
+    assert 0.4 < np.std(z) < 1.6
+
+
+def test_a_clock_that_drifts_is_told():
+    found = lag_between(*pair(0, 3.0, drift=5e-4))
+    assert found.drift is not None
+    rate, sd = found.drift
+    assert rate == pytest.approx(5e-4, abs=4 * sd)
+    assert lag_between(*pair(1, 3.0)).drift is None
+
+
+def signal(t, x):
+    return Timed(t, np.asarray(x, float))
+
+
+def test_what_cannot_be_told_is_refused():
+    t = np.arange(2000) / 50
+    rng = np.random.default_rng(0)
+    noise = [signal(t, rng.standard_normal(t.size)) for _ in range(2)]
+    with pytest.raises(NotAligned, match="hardly agree"):
+        lag_between(*noise)
+    waves = [signal(t, np.sin(6 * t) + 0.1 * rng.standard_normal(t.size)) for _ in range(2)]
+    with pytest.raises(NotAligned, match="explain nearly the same"):
+        lag_between(*waves)
+    x = motion(3)(t)
+    with pytest.raises(NotAligned, match="against one another"):
+        lag_between(signal(t, x), signal(t, -x))
+    with pytest.raises(NotAligned, match="expected at least 40"):
+        lag_between(signal(t, x), signal(t[:20], x[:20]))
+    with pytest.raises(NotAligned, match="too short or too still"):
+        lag_between(signal(t, x), signal(t, np.zeros(t.size)))
+
+
+def written(tmp_path):
+    """Sticks and p at 100 Hz; roll and p by a motion capture at 30 Hz, by a clock of its own."""
+    x, t, s = motion(5), np.arange(4000) / 100, 7.0 + np.arange(900) / 30
+    table = np.stack([t, np.sin(t), x(t)], axis=1)
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,u,p", comments="")
+    table = np.stack([1.6e9 + 12.3456 + s, 0.5 * s, -57.3 * x(s)], axis=1)
+    fmt = ["%.6f", "%.9g", "%.9g"]
+    np.savetxt(
+        tmp_path / "mocap.csv", table, delimiter=",", header="at,phi,q", comments="", fmt=fmt
+    )
+
+
+def test_two_files_make_one_flight(tmp_path):
+    written(tmp_path)
+    also = Also(
+        str(tmp_path / "mocap.csv"),
+        "roll_rate",
+        "q",
+        outputs={"roll": Signal("phi", "rad", "rad")},
+        time=Signal("at", "s", "s"),
+        reverse=True,
+    )
+    asked = {
+        "time": "t",
+        "inputs": {"x_roll": Signal("u", "1", "1")},
+        "outputs": {"roll_rate": Signal("p", "rad/s", "rad/s")},
+    }
+    flight = read_flight(tmp_path / "log.csv", **asked, rate=100.0, window=(5, 30), also=(also,))
+    assert flight.n_samples == 2501
+    seen = np.isfinite(flight.outputs["roll"])
+    # Slower than the grid: a third of its instants, from 7 s on.
+    assert seen.sum() == pytest.approx(23 * 30, abs=2)
+    at = 5.0 + flight.times[seen]
+    assert at[0] == pytest.approx(7.0, abs=6e-3)
+    np.testing.assert_allclose(flight.outputs["roll"][seen], 0.5 * at, atol=2e-3)
+    (note,) = [n for n in flight.source.notes if n.startswith("mocap.csv (sha256 ")]
+    assert "): 7" in note
+    assert "(sd " in note
+    wrong = dataclasses.replace(also, same="yaw")
+    with pytest.raises(InputError, match="expected a signal of the first log"):
+        read_flight(tmp_path / "log.csv", **asked, rate=100.0, also=(wrong,))
+    wrong = dataclasses.replace(also, reverse=False)
+    with pytest.raises(InputError, match=r"mocap\.csv: cannot be aligned by roll_rate of log\.csv"):
+        read_flight(tmp_path / "log.csv", **asked, rate=100.0, also=(wrong,))
+
+
+def test_by_configuration(tmp_path):
+    written(tmp_path)
+    content = yaml.safe_load(BENCH.read_text())
+    content["vehicle"] = str((BENCH.parent / content["vehicle"]).resolve())
+    also = {
+        "log": "mocap.csv",
+        "align": {"with": "roll_rate", "to": "q", "reverse": True},
+        "signals": {
+            "time": {"signal": "at"},
+            "outputs": {"roll": {"signal": "phi", "unit": "rad"}},
+        },
+    }
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": {"x_roll": {"signal": "u", "unit": "m"}},
+        "outputs": {"roll_rate": {"signal": "p", "unit": "rad/s"}},
+    }
+    flight = {"log": "log.csv", "rate": 100, "signals": signals, "also": [also]}
+
+    def read(flight):
+        content["flights"] = [flight]
+        (tmp_path / "flight.yaml").write_text(yaml.safe_dump(content))
+        return config.read_flights(config.load(tmp_path / "flight.yaml"))
+
+    (made,) = read(flight)
+    # As a run writes it out, for whoever repeats it from another folder.
+    written_out = config.resolved(config.load(tmp_path / "flight.yaml"))["flights"][0]["also"][0]
+    assert written_out["log"] == str((tmp_path / "mocap.csv").resolve())
+    assert written_out["align"] == also["align"]
+    assert list(made.outputs) == ["roll_rate", "roll"]
+    also["signals"]["outputs"]["roll_rate"] = {"signal": "q", "unit": "deg/s"}
+    with pytest.raises(InputError, match=r"also\[0\].*'roll_rate' is taken from another log"):
+        read(flight)

@@ -1,0 +1,88 @@
+"""A run with gaps that are too long to be bridged, as several."""
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax import config
+from heli_jax.errors import InputError
+from heli_jax.flights import Signal, read_flight, read_parts
+from heli_jax.flights.parts import stretches
+
+from .test_configured_logs import BENCH
+
+SIGNALS = {
+    "inputs": {"x_roll": Signal("u", "1", "1")},
+    "outputs": {"roll": Signal("y", "1", "1"), "slow": Signal("s", "1", "1")},
+}
+
+
+def run(tmp_path, *gaps, until=20.0):
+    """A table of 50 Hz without what lies within the gaps (first, last) [s]."""
+    t = np.arange(round(50 * until)) / 50
+    t = t[[not any(a < x < b for a, b in gaps) for x in t]]
+    slow = np.where(np.rint(50 * t) % 50 == 0, t, np.nan)
+    rows = [
+        f"{a:.2f},{float(np.sin(a))!r},{float(np.cos(a))!r},{'' if np.isnan(s) else s}"
+        for a, s in zip(t, slow, strict=True)
+    ]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["t,u,y,s", *rows]))
+    return path
+
+
+def test_a_run_is_split_at_its_gaps(tmp_path):
+    path = run(tmp_path, (8.99, 12.01), (13.0, 15.0))
+    with pytest.raises(InputError, match="or `gaps: split`"):
+        read_flight(path, time="t", **SIGNALS)
+    first, second = read_parts(path, time="t", **SIGNALS, name="hover")
+    assert (first.name, second.name) == ("hover, part 1", "hover, part 2")
+    assert (first.t0, second.t0) == (0.0, 15.0)
+    assert (first.duration, second.duration) == pytest.approx((8.98, 4.98))
+    np.testing.assert_allclose(second.outputs["roll"], np.cos(15.0 + second.times), atol=1e-12)
+    # One second between two gaps is left out, and said.
+    (note,) = [n for n in first.source.notes if n.startswith("left out")]
+    assert "12.02 s to 13 s" in note
+    assert "short" in note
+    # A part with five samples of the slow output is fitted without it.
+    assert "slow" in first.outputs
+    assert "slow" not in second.outputs
+    assert any("without slow" in n for n in second.source.notes)
+
+
+def test_a_run_without_gaps_stays_one(tmp_path):
+    path = run(tmp_path, until=10.0)
+    (whole,) = read_parts(path, time="t", **SIGNALS, name="hover")
+    assert whole.name == "hover"
+    assert whole.n_samples == read_flight(path, time="t", **SIGNALS).n_samples
+
+
+def test_nothing_left_is_an_error(tmp_path):
+    path = run(tmp_path, (1.0, 4.0), until=5.0)
+    with pytest.raises(InputError, match="2 parts between gaps, expected one that is long enough"):
+        read_parts(path, time="t", **SIGNALS)
+
+
+def test_gaps_of_several_clocks():
+    fast, slow = np.arange(0, 10, 0.01), np.arange(0.3, 9, 0.1)
+    fast = fast[(fast < 4) | (fast > 5.995)]
+    slow = slow[(slow < 3) | (slow > 4.95)]
+    (first, second) = stretches([fast, slow])
+    assert first == pytest.approx((0.3, 2.9))
+    assert second == pytest.approx((6.0, 8.9))
+
+
+def test_by_configuration(tmp_path):
+    path = run(tmp_path, (8.99, 12.01), (13.0, 15.0))
+    content = yaml.safe_load(BENCH.read_text())
+    content["vehicle"] = str((BENCH.parent / content["vehicle"]).resolve())
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": {"x_roll": {"signal": "u", "unit": "m"}},
+        "outputs": {"roll": {"signal": "y", "unit": "rad"}},
+    }
+    flight = {"log": path.name, "signals": signals, "gaps": "split"}
+    content["flights"] = [flight]
+    (tmp_path / "flight.yaml").write_text(yaml.safe_dump(content))
+    flights = config.read_flights(config.load(tmp_path / "flight.yaml"))
+    assert [f.name for f in flights] == ["flight 1, part 1", "flight 1, part 2"]

@@ -1,0 +1,132 @@
+"""An angle at 5 Hz beside a rate at 50 Hz: as good as its own samples, and no better."""
+
+import dataclasses
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Problem, fit, models
+from heli_jax.flights.slower import Timed, at_nearest
+from heli_jax.identification.equation_error.baseline import baseline
+from heli_jax.identification.equation_error.smoothing import segments
+from heli_jax.identification.validation.feedback import untested
+from heli_jax.identification.validation.metrics import whiteness
+from heli_jax.report.figures.residuals import residual_correlation
+from heli_jax.report.figures.time_domain import response
+
+from .bench import BENCH, amplitude_for, denominators, steps, vehicle
+
+N, DT, FINE = 1500, 0.02, 20
+"""samples of the flight, their step [s], and steps of the truth in one of them"""
+NOISE = {"roll": 2e-3, "roll_rate": 1e-2}
+FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4)}
+
+
+def truth(seed):
+    """Stick (N,), and roll and its rate (N FINE,) by scipy: eq. 23, and the same times s."""
+    rng = np.random.default_rng(seed)
+    u = steps(rng, N, DT, amplitude_for(BENCH, DT, True))
+    num, den = denominators(BENCH, True)
+    held = np.repeat(u, FINE)
+    made = {}
+    for name, numerator in (("roll", num), ("roll_rate", np.polymul(num, [1.0, 0.0]))):
+        b, a, _ = scipy.signal.cont2discrete((numerator, den), DT / FINE)
+        made[name] = scipy.signal.lfilter(np.ravel(b), a, held)
+    return u, made
+
+
+def record(seed, *, slow):
+    """A flight whose roll is measured every 0.2 s with jitter where `slow`."""
+    u, made = truth(seed)
+    rng = np.random.default_rng(seed + 1000)
+    rate = made["roll_rate"][::FINE] + NOISE["roll_rate"] * rng.standard_normal(N)
+    roll = made["roll"][::FINE] + NOISE["roll"] * rng.standard_normal(N)
+    if slow:
+        at = 200 * np.arange(1, 149) + rng.integers(-20, 21, 148)
+        values = made["roll"][at] + NOISE["roll"] * rng.standard_normal(at.size)
+        roll = at_nearest(Timed(at * DT / FINE, values), DT * np.arange(N)).samples
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll, "roll_rate": rate})
+
+
+def problem(flight, **more):
+    return Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, **more)
+
+
+@pytest.fixture(scope="module")
+def fits():
+    return {slow: fit(problem(record(0, slow=slow))) for slow in (False, True)}
+
+
+def test_the_estimates_are_those_of_the_full_rate(fits):
+    full, slow = fits[False], fits[True]
+    assert slow.status == "converged"
+    assert slow.n_samples == N + 148
+    for name, one in slow.estimates.items():
+        # Less is known, so the two differ by about the slow one's sd.
+        assert one.value == pytest.approx(full.estimates[name].value, abs=1.5 * one.sd)
+        assert abs(one.value - BENCH[name]) < 3.0 * one.sd
+        assert full.estimates[name].sd < one.sd
+    assert slow.noise["flight 1/roll"] == pytest.approx(NOISE["roll"], rel=0.2)
+    assert slow.whiteness["flight 1/roll"].white
+    assert slow.adequacy.adequate
+    assert slow.metrics["roll"].vaf > 0.99
+
+
+def test_slow_residuals_that_are_not_white_are_told(fits):
+    residual = fits[True].signals[0].residual("roll")
+    drifting = residual + 4e-3 * np.sin(0.8 * DT * np.arange(N))
+    # With jitter hardly a lag of the grid has many pairs: lags are counted in samples.
+    assert not whiteness(drifting).white
+    assert whiteness(residual).white
+    assert whiteness(drifting).lag1 > 0.5
+
+
+def test_feedback_that_cannot_be_told_is_said(fits):
+    flight = record(0, slow=True)
+    assert untested(problem(flight)) == []
+    alone = dataclasses.replace(flight, outputs={"roll": flight.outputs["roll"]})
+    (words,) = untested(problem(alone))
+    assert "was not tested" in words
+
+
+def test_an_equation_error_start_has_something_to_smooth():
+    flight = record(0, slow=True)
+    parts, bridged = segments(flight.outputs)
+    (part,) = parts
+    assert part.stop - part.start > 0.97 * N
+    truth_there = truth(0)[1]["roll"][::FINE][part]
+    assert np.std(bridged["roll"][part] - truth_there) < 0.1 * np.std(truth_there)
+    # A gap that is long for the slow sensor too ends a segment.
+    roll = np.where(abs(np.arange(N) - 700) < 30, np.nan, flight.outputs["roll"])
+    assert len(segments({"roll": roll})[0]) == 2
+
+
+def test_recursive_least_squares_takes_what_is_whole(bench30):
+    flight = record(0, slow=True)
+    made = baseline(models.roll_on_stand, bench30, flight, order=2)
+    assert made.output == "roll_rate"
+    assert any("which roll has too few of" in s for s in made.sentences)
+
+
+def test_figures_show_single_samples(fits):
+    signals = fits[True].signals[0]
+    top, below, *_ = response(signals, "roll", models.roll_on_stand)
+    for ax, line in ((top, top.lines[0]), (below, below.lines[0])):
+        assert line.get_marker() == "o"
+        assert line.get_xdata().size == 148
+        plt.close(ax.figure)
+    first, *_ = residual_correlation(signals, "roll")
+    # Lags in the sensor's own samples, a quarter of which there are.
+    assert first.get_xlim()[1] == pytest.approx(0.2 * 37.5)
+    plt.close(first.figure)
+
+
+def test_a_handful_of_samples_is_refused():
+    flight = record(0, slow=True)
+    few = np.where(np.arange(N) < 300, flight.outputs["roll"], np.nan)
+    few[np.flatnonzero(np.isfinite(few))[7:]] = np.nan
+    flight = dataclasses.replace(flight, outputs={**flight.outputs, "roll": few})
+    with pytest.raises(ValueError, match="expected at least 8 measured samples, got 7 of 1500"):
+        problem(flight)

@@ -1,0 +1,201 @@
+"""What a configuration says of filters, delays and vibration between motion and log."""
+
+import numpy as np
+import pytest
+import scipy.signal
+import yaml
+
+from heli_jax import config as configuration
+from heli_jax.config.firmware_filters import logged_filters
+from heli_jax.config.logs import read_flights
+from heli_jax.dynamics.onboard.filters import Filter
+from heli_jax.errors import InputError
+from heli_jax.flights.vibration import folded, lines, notched
+from heli_jax.identification.fit import cautions
+from heli_jax.linear_models.read import linear_model
+from heli_jax.models import with_filters
+
+DT = 0.005
+TIMES = DT * np.arange(2000)
+
+
+def stick(times):
+    return 0.1 * np.sign(np.sin(2.3 * times) + 0.5 * np.sin(5.1 * times))
+
+
+def write_log(path, p, parameters=(("INS_GYRO_FILTER", 20.0),)):
+    """A DataFlash log in text with a gyro, and sticks as they were sent."""
+    text = ["FMT, 130, 27, IMU, Qdd, TimeUS,GyrX,C1"]
+    text += ["FMT, 140, 31, PARM, QNf, TimeUS,Name,Value"]
+    text += [f"PARM, 0, {n}, {v}" for n, v in parameters]
+    for t, u, x in zip(TIMES, stick(TIMES), p, strict=True):
+        text.append(f"IMU, {round(1e6 * t)}, {x:.9g}, {u:.9g}")
+    path.write_text("\n".join(text) + "\n")
+
+
+def flight(log="flight.log", **p):
+    p = {"signal": "IMU.GyrX", "sd": 0.01, **p}
+    signals = {"inputs": {"lat": {"signal": "IMU.C1", "unit": "1"}}, "outputs": {"p": p}}
+    return {"log": log, "signals": signals}
+
+
+@pytest.fixture
+def load(tmp_path):
+    """load(flight, ...) -> the experiment with these flights."""
+
+    def load(*flights, **content):
+        path = tmp_path / "config.yaml"
+        content = {"model": {"linear": "roll-flybarless"}, "flights": list(flights), **content}
+        path.write_text(yaml.safe_dump({"fit": {"free": {"Blat": {"start": 0.1}}}, **content}))
+        return configuration.load(path)
+
+    write_log(tmp_path / "flight.log", np.sin(TIMES))
+    return load
+
+
+def test_a_filter_is_stated_or_read_from_the_log(load, tmp_path):
+    bare = linear_model("roll-flybarless").model
+    stated = load(flight(filter={"kind": "biquad", "hz": 20}, delay=0.004)).model
+    assert stated is with_filters(bare, {"p": [Filter("biquad", 20.0)]}, {"p": 0.004})
+    assert load(flight(filter="from log", delay=0.004)).model is stated
+    assert load(flight(filter=[])).model is bare
+    notches = [{"kind": "notch", "hz": 40, "bandwidth": 8}, {"kind": "pt2", "hz": 90}]
+    cascade = load(flight(filter=notches))
+    expected = [Filter("notch", 40.0, 5.0), Filter("pt2", 90.0)]
+    assert cascade.model is with_filters(bare, {"p": expected})
+    # The resolved configuration describes the same.
+    again = tmp_path / "again.yaml"
+    again.write_text(yaml.safe_dump(configuration.resolved(cascade)))
+    assert configuration.load(again).model is cascade.model
+
+
+@pytest.mark.parametrize(
+    ("p", "sentence"),
+    [
+        ({"filter": "pt1"}, "p.filter: expected from log, a filter such as"),
+        ({"filter": {"kind": "pt1"}}, r"p.filter\[0\]: hz: missing, pt1 needs its frequency"),
+        ({"filter": {"kind": "pt1", "hz": -3}}, r"p.filter\[0\].hz: got -3"),
+        ({"filter": {"kind": "pt9", "hz": 3}}, r"p.filter\[0\].kind: got 'pt9'"),
+        ({"filter": {"kind": "pt1", "herz": 3}}, r"p.filter\[0\].herz: unknown key"),
+        ({"filter": {"kind": "pt1", "hz": 3, "bandwidth": 2}}, "expected it for a notch"),
+        ({"filter": {"kind": "notch", "hz": 3}}, "a notch needs its quality factor"),
+        ({"delay": -0.01}, "p.delay: .*no log has an output before it happened"),
+        ({"delay": 4}, "p.delay: delay: expected seconds, at most 1, got 4"),
+        ({"delay": "4 ms"}, "p.delay: expected a number of seconds, got '4 ms'"),
+        ({"signal": "IMU.C1", "filter": "from log"}, "does not say how IMU.C1 was filtered"),
+    ],
+)
+def test_errors_are_sentences(load, p, sentence):
+    with pytest.raises(InputError, match=sentence):
+        load(flight(**p))
+
+
+def test_flights_share_the_model(load):
+    with pytest.raises(
+        InputError, match=r"flights\[1\].*\(none\) differ from those of flights\[0\]"
+    ):
+        load(flight(delay=0.01), flight())
+
+
+def test_a_filter_that_is_not_modelled_is_a_caution(load, tmp_path):
+    (source,) = [f.source for f in read_flights(load(flight()))]
+    # A Butterworth filter of second order delays by sqrt(2)/omega: 11.25 ms.
+    assert (
+        "p was low-passed at 20 Hz by the autopilot (INS_GYRO_FILTER = 20.0)" in source.cautions[0]
+    )
+    assert "delays it by about 11.3 ms, and the inputs were not" in source.cautions[0]
+    (modelled,) = read_flights(load(flight(filter="from log")))
+    assert not modelled.source.cautions
+    write_log(
+        tmp_path / "flight.log", np.sin(TIMES), (("INS_GYRO_FILTER", 0), ("INS_HNTCH_ENABLE", 1))
+    )
+    (moving,) = read_flights(load(flight()))
+    assert (
+        "p was also filtered by INS_HNTCH_ENABLE = 1.0: such filters move"
+        in moving.source.cautions[0]
+    )
+
+
+ROTORFLIGHT = {
+    "gyro_lpf1_type": "1", "gyro_lpf1_static_hz": "150", "gyro_lpf1_dyn_hz": "0,200",
+    "gyro_lpf2_type": "2", "gyro_lpf2_static_hz": "100", "gyro_decimation_hz": "250",
+    "gyro_notch_hz": "0,0", "gyro_notch_cutoff": "0,0",
+}  # fmt: skip
+
+
+def test_settings_of_firmwares():
+    px4 = {"IMU_GYRO_CUTOFF": 40.0, "IMU_GYRO_NF0_FRQ": 60.0, "IMU_GYRO_NF0_BW": 12.0}
+    logged = logged_filters("PX4 1.13", px4, "vehicle_angular_velocity.xyz[1]")
+    assert logged.filters == (Filter("notch", 60.0, 5.0), Filter("biquad", 40.0))
+    assert logged_filters("PX4 1.13", px4, "vehicle_attitude.q[0]") is None
+    assert logged_filters("", {}, "gyroADC[0]") is None
+    logged = logged_filters("Rotorflight 4.3.0", ROTORFLIGHT, "gyroADC[0]")
+    assert logged.filters[2] == Filter("pt1", 150.0)
+    # The same as SciPy's Bessel filters, whose frequency is that of 3 dB.
+    for filters, order, hz in ((logged.filters[:2], 4, 250.0), (logged.filters[3:], 2, 100.0)):
+        poles = scipy.signal.bessel(order, 2 * np.pi * hz, norm="mag", analog=True, output="zpk")[1]
+        ours = [np.roots([1, 2 * np.pi * f.hz / f.q, (2 * np.pi * f.hz) ** 2]) for f in filters]
+        np.testing.assert_allclose(np.sort(np.concatenate(ours)), np.sort(poles), rtol=1e-6)
+    betaflight = {"gyro_lowpass_type": "0", "gyro_lowpass_hz": "90"}
+    betaflight |= {"gyro_notch_hz": "200,0", "gyro_notch_cutoff": "150,100", "dyn_notch_count": "3"}
+    logged = logged_filters("Betaflight 4.2", betaflight, "gyroADC[2]")
+    # Q of a notch from its lower edge: f f1 / (f^2 - f1^2).
+    assert logged.filters == (Filter("pt1", 90.0), Filter("notch", 200.0, 30000 / 17500))
+    assert logged.unknown == ("dyn_notch_count = 3",)
+    moving = {**ROTORFLIGHT, "gyro_lpf1_dyn_hz": "25,200"}
+    logged = logged_filters("Rotorflight 4.3.0", moving, "gyroADC[0]")
+    assert logged.unknown == ("gyro_lpf1_dyn_hz = 25,200",)
+    assert Filter("pt1", 150.0) not in logged.filters
+    # Its newer versions number the types from 6 on otherwise.
+    newer = {**ROTORFLIGHT, "gyro_lpf1_type": "7", "gyro_lpf2_type": "0"}
+    logged = logged_filters("Rotorflight 4.6.0", newer, "gyroADC[0]")
+    assert logged.unknown == ("gyro_lpf1_static_hz = 150 of type 7",)
+    assert len(logged.filters) == 2
+
+
+def test_lines_are_found_named_and_unfolded():
+    rng = np.random.default_rng(3)
+    slow = np.sin(2 * np.pi * 0.4 * TIMES) + 0.05 * rng.standard_normal(TIMES.size)
+    shaken = slow + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES) + 0.2 * np.sin(2 * np.pi * 55 * TIMES)
+    first, second = lines(shaken, DT, 24.2)
+    np.testing.assert_allclose([first.hz, second.hz], [24.2, 55.0], atol=0.13)
+    np.testing.assert_allclose(first.share, 0.045 / np.var(shaken), rtol=0.2)
+    assert (first.harmonic, second.harmonic) == (1, 0)
+    # 80 Hz logged at 100 Hz appears at 20 Hz: two turns at 40 Hz.
+    assert folded(80.0, 100.0) == 20.0
+    times = 0.01 * np.arange(1500)
+    (line,) = lines(np.sin(2 * np.pi * 80 * times) + 0.1 * rng.standard_normal(1500), 0.01, 40.0)
+    assert line.aliased
+    assert (line.harmonic, line.of_hz) == (2, 80.0)
+    assert lines(slow, DT, 24.2) == ()
+    assert lines(np.full(300, np.nan), DT) == ()
+
+
+def test_notches_on_both_sides_bias_nothing(load, tmp_path):
+    # p follows the stick by 1/(0.05 s + 1), sampled with the stick held.
+    decay = np.exp(-DT / 0.05)
+    p = scipy.signal.lfilter([0, 1 - decay], [1, -decay], stick(TIMES))
+    write_log(tmp_path / "flight.log", p + 0.05 * np.sin(2 * np.pi * 24.2 * TIMES))
+    shaken = flight() | {"vibration": {"rotor": 24.2, "unit": "Hz"}}
+    (noisy,) = read_flights(load(shaken))
+    assert "1/rev of the rotor" in noisy.source.cautions[-1]
+    (clean,) = read_flights(load(shaken | {"notch": [24.2]}))
+    assert not any("vibrates" in c for c in clean.source.cautions)
+    # The notched stick drives the same machine to the notched motion, behind the notch's transient.
+    again = scipy.signal.lfilter([0, 1 - decay], [1, -decay], clean.inputs["lat"])
+    settled = TIMES > 2.0
+    np.testing.assert_allclose(clean.outputs["p"][settled], again[settled], atol=2e-4)
+    # On one side alone it would not.
+    assert np.max(np.abs(notched(p, DT, [24.2], 10.0) - p)[settled]) > 3e-3
+    with pytest.raises(InputError, match="notch: expected less than half the rate of 200 Hz"):
+        read_flights(load(shaken | {"notch": [150.0]}))
+    with pytest.raises(InputError, match=r"notch: expected a list of frequencies"):
+        load(shaken | {"notch": 24.2})
+    with pytest.raises(InputError, match=r"vibration\.unit"):
+        read_flights(load(flight() | {"vibration": {"rotor": 24.2, "unit": "kg"}}))
+
+
+def test_a_fit_repeats_the_cautions_once(load):
+    problem = configuration.problem(load(flight(), flight()))
+    (said,) = cautions(problem)
+    assert said.startswith("flight 1: p was low-passed at 20 Hz")
