@@ -6,10 +6,13 @@ from typing import Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
+from heli_jax.config.preset_signals import Resolved, resolve
+from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Flight, Signal, read_flight
+from heli_jax.flights.derived import with_derived
+from heli_jax.flights.open_log import open_log
 
 
 def read_flights(
@@ -49,13 +52,21 @@ def _read_flight(
                 f"{nearest(name, naming.names(model.Params))}"
             )
     time = f.signals.time
+    path = experiment.path.parent / f.log
+    # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
+    # window is otherwise told before minutes of reading.
+    asked = f.signals.preset is not None or f.signals.ccpm is not None
+    swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
+    log = with_derived(open_log(path, f.flight), swashplate) if asked else None
+    named = resolve(model, f.signals, f"{where}.signals", experiment.config.onboard, log)
+    inputs, outputs = _of_model(model, named, f"{where}.signals", gain)
     try:
         flight = read_flight(
-            experiment.path.parent / f.log,
+            path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
-            inputs=signals(model, "inputs", f.signals.inputs, f"{where}.signals", gain),
-            outputs=signals(model, "outputs", f.signals.outputs, f"{where}.signals"),
+            inputs=inputs,
+            outputs=outputs,
             rate=f.rate,
             window=f.window,
             known=f.known,
@@ -68,10 +79,36 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    return _with_notes(flight, _unstated_units(model, f.signals))
+    return _with_notes(flight, (*_unstated_units(model, named), *named.notes))
 
 
-def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
+def first_signals(experiment: Experiment) -> Resolved:
+    """The signals of the first flight as the configuration and its preset name them, without a look
+    into the log.
+
+    Raises:
+        InputError: the preset does not supply an input.
+    """
+    where, stated = f"{experiment.path}: flights[0].signals", experiment.config.flights[0].signals
+    return resolve(experiment.model, stated, where, experiment.config.onboard)
+
+
+def _of_model(
+    model: Model, named: Resolved, where: str, gain: bool
+) -> tuple[dict[str, Signal], dict[str, Signal]]:
+    """Inputs and outputs as signals, with the words of the preset that named them."""
+
+    def with_origins(role: str, by_name: dict[str, Signal]) -> dict[str, Signal]:
+        words = {name: named.origins.get((role, name), "") for name in by_name}
+        return {n: dataclasses.replace(s, origin=words[n]) for n, s in by_name.items()}
+
+    return (
+        with_origins("inputs", signals(model, "inputs", named.inputs, where, gain)),
+        with_origins("outputs", signals(model, "outputs", named.outputs, where)),
+    )
+
+
+def _unstated_units(model: Model, stated: Resolved) -> tuple[str, ...]:
     """A sentence for each signal whose numbers are read as SI because no unit is stated.
 
     Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
@@ -137,7 +174,15 @@ def signals(
         unit = config.unit if config.unit is not None else (si or "1")
         # Inputs have a hold and no sd, outputs the reverse.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
-        out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold)
+        out[name] = Signal(
+            config.signal or "",
+            unit,
+            _si(unit, si, place, gain),
+            sd,
+            hold,
+            **config.conversion,
+            constant=getattr(config, "constant", None),
+        )
     return out
 
 

@@ -8,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.onboard import OnboardConfig
+from heli_jax.config.signal_section import PresetConfig, ScaledConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -54,26 +55,34 @@ class TimeConfig(_Strict):
     unit: str = "s"
 
 
-class InputConfig(_Strict):
-    signal: str
+class InputConfig(ScaledConfig):
+    signal: str | None = None
+    constant: Finite | None = None
+    """its value in place of a signal, for an input that the log lacks"""
     unit: str | None = None
     hold: Literal["auto", "zero-order", "linear"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
 
+    @model_validator(mode="after")
+    def _one_of_two(self) -> "InputConfig":
+        if (self.signal is None) == (self.constant is None):
+            raise ValueError("expected either signal or constant")
+        return self
 
-class OutputConfig(_Strict):
+
+class OutputConfig(ScaledConfig):
     signal: str
     unit: str | None = None
     sd: Positive | None = None
 
 
-class SignalsConfig(_Strict):
+class SignalsConfig(PresetConfig):
     time: TimeConfig | None = None
     """of a table of rows; the topics of an autopilot's log have clocks of their own"""
     # Names are checked where the model is known: what it has for inputs and outputs is not known
     # here.
-    inputs: dict[str, InputConfig]
-    outputs: dict[str, OutputConfig]
+    inputs: dict[str, InputConfig] = Field(default={})
+    outputs: dict[str, OutputConfig] = Field(default={})
 
 
 class FlightConfig(_Strict):

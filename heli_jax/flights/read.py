@@ -11,6 +11,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.errors import InputError
+from heli_jax.flights.derived import DerivedTable, with_derived
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -24,6 +25,7 @@ from heli_jax.flights.grid import (
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.open_log import open_log
+from heli_jax.flights.origins import with_origins, without_constants
 from heli_jax.flights.read_channels import read_channels
 from heli_jax.flights.request import ReadOptions, Request
 from heli_jax.flights.resample import hold, longest_gap, new_clock, resampled
@@ -37,7 +39,7 @@ _DEFAULT = ReadOptions()
 
 
 def read_flight(
-    path: str | Path,
+    path: str | Path | ChannelLog | DerivedTable,
     *,
     time: str | Signal | None = None,
     inputs: Mapping[str, Signal],
@@ -48,11 +50,13 @@ def read_flight(
     """Read one run from a log.
 
     Args:
-        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md).
+        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md); or one that is
+            open, by `heli_jax.flights.derived.with_derived`.
         time: the column of time stamps, in seconds where only its name is given; None for an
             autopilot's log, whose topics have clocks of their own.
         inputs: the log's signals by the model's names; two inputs may share a column. What one
-            does between samples is its `hold`; "auto" decides by how it moves in the log.
+            does between samples is its `hold`; "auto" decides by how it moves in the log. One
+            that the log lacks may be a `constant`.
         outputs: the same for what was measured.
         options: which part of the log, at which rate; all of it unless given.
         **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
@@ -63,13 +67,18 @@ def read_flight(
         TypeError: a keyword that is no field of ReadOptions.
     """
     options = dataclasses.replace(options, **keywords)
+    logged, constants = without_constants(inputs)
     # Checked before the log is opened, which may take minutes.
-    request = Request(str(path), time, inputs, outputs, options)
-    log = open_log(path, options.number)
+    name = str(path) if isinstance(path, str | Path) else path.path
+    request = Request(name, time, logged, outputs, options)
+    log = path
+    if isinstance(log, str | Path):
+        log = with_derived(open_log(log, options.number))
     if isinstance(log, ChannelLog):
         flight = read_channels(log, request)
     else:
         flight = _read_table(log, request)
+    flight = with_origins(flight, inputs, outputs, constants)
     # Last, and for every kind of log alike: an input may move in the log and not within the window.
     if options.moving_inputs:
         require_moving_inputs(flight)
@@ -216,7 +225,7 @@ def _to_si(
     samples = {}
     for (key, kind), signal in request.signals.items():
         with np.errstate(over="ignore"):  # what overflows is refused below, with its line
-            values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
+            values = signal.to_si(numbers[signal.name][rows])
         # An output may be missing here and there; a stick is somewhere all the time.
         bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:
