@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.onboard import OnboardConfig
-from heli_jax.config.signal_section import PresetConfig, ScaledConfig
+from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -55,19 +55,10 @@ class TimeConfig(_Strict):
     unit: str = "s"
 
 
-class InputConfig(ScaledConfig):
-    signal: str | None = None
-    constant: Finite | None = None
-    """its value in place of a signal, for an input that the log lacks"""
+class InputConfig(LoggedInputConfig):
     unit: str | None = None
     hold: Literal["auto", "zero-order", "linear"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
-
-    @model_validator(mode="after")
-    def _one_of_two(self) -> "InputConfig":
-        if (self.signal is None) == (self.constant is None):
-            raise ValueError("expected either signal or constant")
-        return self
 
 
 class OutputConfig(ScaledConfig):

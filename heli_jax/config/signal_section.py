@@ -38,6 +38,24 @@ class ScaledConfig(_Strict):
         return {"scale": self.scale, "offset": self.offset, "invert": self.invert}
 
 
+class LoggedInputConfig(ScaledConfig):
+    """An input's channel, or its value where the log lacks it."""
+
+    signal: str | None = None
+    constant: _Finite | None = None
+    """in the stated unit"""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> "LoggedInputConfig":
+        if (self.signal is None) == (self.constant is None):
+            raise ValueError("expected either signal or constant")
+        if self.constant is not None and self.conversion != ScaledConfig().conversion:
+            raise ValueError(
+                "scale, offset and invert are of a signal, expected none, got constant"
+            )
+        return self
+
+
 def _numbers(value: object) -> object:
     # By hand: of a union pydantic would report every member.
     each = value if isinstance(value, list) else [value]

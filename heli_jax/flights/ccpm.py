@@ -59,9 +59,8 @@ class Swashplate:
             raise ValueError("radius: expected positive numbers")
         if not all(k != 0 for k in self.scale):
             raise ValueError("scale: expected numbers other than 0")
-        matrix = mixing_matrix(self)
-        # Scaled by column: the radius may be in metres beside a collective that counts as 1.
-        scaled = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        # At a mean radius of 1: in metres it is small beside a collective that counts as 1.
+        scaled = mixing_matrix(self) / np.array([1.0, *(np.mean(self.radius),) * 2])
         if np.linalg.cond(scaled) > _MOST_CONDITION:
             raise ValueError(
                 f"angles: {list(self.angles)} deg do not tell collective from cyclic, expected "

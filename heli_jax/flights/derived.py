@@ -215,7 +215,8 @@ def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray
     between = np.stack([np.interp(times, clock, row, np.nan, np.nan) for row in q])
     # In a gap the attitude is not known, and the velocity then counts as missing.
     right = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
-    between[:, clock[right] - clock[right - 1] > longest_gap(clock)] = np.nan
+    inside = (clock[right - 1] < times) & (times < clock[right])
+    between[:, inside & (clock[right] - clock[right - 1] > longest_gap(clock))] = np.nan
     return between
 
 
