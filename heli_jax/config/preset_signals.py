@@ -155,13 +155,13 @@ class _Search(NamedTuple):
 
     def input(self, model: Model, name: str, pilot: bool) -> Alternative:
         known = model_inputs().get(name)
-        expected = f"expected {name!r} in {self.where}.inputs"
         if known is None:
             problem = f"no preset knows the input {name!r} of model {model.name}"
             raise InputError(f"{self.where}.inputs: {problem}, expected it by name")
         chosen, why = self._signal(known.stick if pilot else known.command)
         if chosen is None:
-            raise InputError(f"{self.where}.inputs: {name}: {why}, {expected}{self.holdings()}")
+            problem = f"{name}: {why}, expected it by name"
+            raise InputError(f"{self.where}.inputs: {problem}{self.holdings()}")
         # Two inversions are none.
         return Alternative(**{**vars(chosen), "invert": chosen.invert != known.invert})
 

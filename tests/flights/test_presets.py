@@ -20,6 +20,7 @@ from heli_jax.flights.preset import (
     presets,
 )
 from heli_jax.linear_models.read import linear_model, shipped
+from heli_jax.workflow import run_fit
 
 from . import log_writers as writers
 
@@ -124,25 +125,30 @@ def ardupilot_log(path):
 
 
 @pytest.mark.parametrize(("configuration", "write"), [(PX4, px4_log), (ARDUPILOT, ardupilot_log)])
-def test_from_a_log_to_a_fit_by_one_command(tmp_path, configuration, write, capsys):
+def test_from_a_log_to_a_fit(tmp_path, configuration, write):
     assert len(configuration.read_text().splitlines()) <= 25
     log = write(tmp_path / f"flight{'.ulg' if write is px4_log else '.bin'}")
-    out = tmp_path / "run"
-    command = ["fit", str(configuration), "--set", f"flights.0.log={log}", "--out", str(out)]
-    assert cli.main(command) == 0
-    fit = json.loads((out / "fit.json").read_text())
+    run = run_fit(config.load(configuration, {"flights.0.log": str(log)}))
     for name, truth in {"Lb": LB, "Blat": BLAT}.items():
-        assert fit["parameters"][name]["value"] == pytest.approx(truth, rel=0.02)
-    signals = fit["data"][0]["signals"]
-    assert "preset" in signals["outputs"]["phi"]["origin"]
-    if write is px4_log:
-        assert signals["outputs"]["phi"]["signal"] == "euler(vehicle_attitude.q).roll"
-    else:
-        assert signals["inputs"]["lat"]["signal"] == "ccpm.roll"
-        assert signals["outputs"]["p"] == {
-            "signal": "RATE.R", "unit": "deg/s", "scale": 1.0, "offset": 0.0, "invert": False,
-            "origin": signals["outputs"]["p"]["origin"],
-        }  # fmt: skip
+        assert run.fit.estimates[name].value == pytest.approx(truth, rel=0.02)
+    source = run.problem.flights[0].source
+    wanted = "euler(vehicle_attitude.q).roll" if write is px4_log else "ATT.Roll"
+    assert source.outputs["phi"].name == wanted
+    lat = source.inputs["lat"]
+    assert lat.name == ("actuator_controls_0.control[0]" if write is px4_log else "ccpm.roll")
+
+
+@pytest.mark.slow
+def test_one_command_writes_down_what_the_channels_were(tmp_path, capsys):
+    log, out = ardupilot_log(tmp_path / "flight.bin"), tmp_path / "run"
+    command = ["fit", str(ARDUPILOT), "--set", f"flights.0.log={log}", "--out", str(out)]
+    assert cli.main(command) == 0
+    signals = json.loads((out / "fit.json").read_text())["data"][0]["signals"]
+    p = signals["outputs"]["p"]
+    assert (p["signal"], p["unit"], p["scale"], p["invert"]) == ("RATE.R", "deg/s", 1.0, False)
+    assert "ardupilot-helicopter (version 1)" in p["origin"]
+    assert "unmixed from the servos" in signals["inputs"]["lat"]["origin"]
+    assert "&#39;RATE.R&#39;, in deg/s; by preset" in (out / "report.html").read_text()
     capsys.readouterr()
 
 
@@ -246,13 +252,13 @@ def test_a_rate_loop_stands_behind_the_pilots_stick(tmp_path):
 @pytest.mark.parametrize(
     ("signals", "changes", "words"),
     [
-        ({"preset": "px4"}, {}, "no preset 'px4'; did you mean 'px4-helicopter'"),
+        ({"preset": "px4-heli"}, {}, "no preset 'px4-heli'; did you mean 'px4-helicopter'"),
         ({"preset_outputs": ["p"]}, {}, "preset_outputs: expected a preset with it"),
         ({"preset": "px4-helicopter", "preset_outputs": ["pp"]}, {},
          "model roll-flybarless has no output 'pp'; did you mean 'p'"),
         ({"preset": "px4-helicopter"}, {"model": {"linear": "yaw"}, "log": "empty"},
          r"inputs: ped: the log has no tail in vehicle_torque_setpoint.xyz\[2\], "
-         r"actuator_controls_0.control\[2\], expected 'ped' in .*holds: vehicle_attitude"),
+         r"actuator_controls_0.control\[2\], expected it by name; .*a.ulg holds: vehicle_angular_vel"),
         ({"preset": "ardupilot-helicopter"}, {},
          "is for logs of dataflash, and this ulog log has none of its channels, expected preset "
          "px4-helicopter, or inputs and outputs by name"),
@@ -296,7 +302,7 @@ def test_the_real_ulog_by_its_preset(tmp_path):
 
 @pytest.mark.skipif(not BIN.exists(), reason=ABSENT)
 def test_the_real_dataflash_by_its_preset(tmp_path):
-    inputs = {"lat": {"signal": "AETR.Ail"}}
+    inputs = {"lat": {"signal": "PIDR.P"}}
     signals = {"preset": "ardupilot-helicopter", "inputs": inputs}
     with pytest.raises(InputError, match=r"lat: the log has no cyclic_roll in RATE.ROut, expected"):
         read(tmp_path, BIN, signals | {"inputs": {}})
