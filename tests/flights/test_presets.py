@@ -258,7 +258,7 @@ def test_a_rate_loop_stands_behind_the_pilots_stick(tmp_path):
          "model roll-flybarless has no output 'pp'; did you mean 'p'"),
         ({"preset": "px4-helicopter"}, {"model": {"linear": "yaw"}, "log": "empty"},
          r"inputs: ped: the log has no tail in vehicle_torque_setpoint.xyz\[2\], "
-         r"actuator_controls_0.control\[2\], expected it by name; .*a.ulg holds: vehicle_angular_vel"),
+         r"actuator_controls_0.control\[2\], expected it by name; .*a.ulg holds: vehicle_ang"),
         ({"preset": "ardupilot-helicopter"}, {},
          "is for logs of dataflash, and this ulog log has none of its channels, expected preset "
          "px4-helicopter, or inputs and outputs by name"),
