@@ -302,7 +302,7 @@ def test_the_real_ulog_by_its_preset(tmp_path):
 
 @pytest.mark.skipif(not BIN.exists(), reason=ABSENT)
 def test_the_real_dataflash_by_its_preset(tmp_path):
-    inputs = {"lat": {"signal": "PIDR.P"}}
+    inputs = {"lat": {"signal": "IMU2.GyrX"}}
     signals = {"preset": "ardupilot-helicopter", "inputs": inputs}
     with pytest.raises(InputError, match=r"lat: the log has no cyclic_roll in RATE.ROut, expected"):
         read(tmp_path, BIN, signals | {"inputs": {}})
