@@ -1,7 +1,7 @@
 """From a preset to the signals of a model: which channel of this log is which input and output."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from heli_jax import naming
 from heli_jax.config.onboard import OnboardConfig
@@ -119,8 +119,8 @@ def _wanted(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
     return known if stated.preset_outputs is None else tuple(stated.preset_outputs)
 
 
-def _keys(chosen: Alternative) -> dict[str, str | float | bool]:
-    """The keys of a configuration that say the same."""
+def _keys(chosen: Alternative) -> dict[str, Any]:
+    """The keys of a configuration that say the same; Any: text, numbers and a boolean."""
     return {
         "signal": chosen.channel,
         "unit": chosen.unit,
@@ -192,8 +192,9 @@ class _Search(NamedTuple):
         """What the log does hold, as the end of a sentence."""
         if self.log is None:
             return ""
-        channels = isinstance(self.log, ChannelLog)
-        names = _distinct(t.name for t in self.log.topics) if channels else list(self.log.names)
+        names = list(self.log.names)
+        if isinstance(self.log, ChannelLog):
+            names = _distinct(t.name for t in self.log.topics)
         more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         listed = ", ".join(shown(name)[1:-1] for name in names[:_MOST_NAMES])
         # `wrong` takes out what a terminal would obey: names come from the file.
