@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming, units
+from heli_jax import naming
 from heli_jax.analysis.pilot import Pilot, attitude_hold
 from heli_jax.analysis.trim import STICKS, Condition, Trim, is_full_nonlinear, trim
 from heli_jax.config import (
     Experiment,
     SimulateConfig,
     disturbed,
+    first_signals,
     in_wind,
     read_flights,
     signals,
@@ -325,7 +326,7 @@ def _held_notes(experiment: Experiment, logged: dict[str, np.ndarray]) -> list[s
     """
     if not experiment.config.flights:
         return []
-    signals = experiment.config.flights[0].signals.inputs
+    signals = first_signals(experiment).inputs
     auto = [n for n, signal in signals.items() if signal.hold == "auto" and n in logged]
     moving = [n for n in auto if decide(logged[n]).hold == "linear"]
     if not moving:
@@ -377,14 +378,15 @@ def _as_logged(
         # Without flights nobody has named a column or a unit.
         return {"time": times, **driven, **outputs}
     logged, where = experiment.config.flights[0].signals, f"{experiment.path}: flights[0].signals"
-    model = experiment.model
+    model, named = experiment.model, first_signals(experiment)
     # An autopilot's log needs no name for the time; the table that is written here has one.
     name, unit = ("time", "s") if logged.time is None else (logged.time.signal, logged.time.unit)
     columns = {name: times / factor_to_si(unit, "s", f"{where}.time.unit")}
     for by_name, values in (
-        (signals(model, "inputs", logged.inputs, where), driven),
-        (signals(model, "outputs", logged.outputs, where), outputs),
+        (signals(model, "inputs", named.inputs, where), driven),
+        (signals(model, "outputs", named.outputs, where), outputs),
     ):
         for name, signal in by_name.items():
-            columns[signal.name] = values[name] / units.factor(signal.unit, signal.si)
+            if signal.constant is None:  # a constant is in no log
+                columns[signal.name] = signal.from_si(values[name])
     return columns

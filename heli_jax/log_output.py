@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
+from heli_jax.flights.preset import fitting_presets
 
 # The width of a terminal that nobody has widened.
 _WIDTH = 80
@@ -104,6 +105,9 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     yield f"duration: {length or f'{flight.duration:.6g} s'}"
     # What was lost or assumed stands before the numbers, which are read with that in mind.
     yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
+    fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
+    if fitting:
+        yield f"preset: {', '.join(fitting)} (docs/logs.md)"
     yield from _topic_lines(flight.topics)
     yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
     yield from _setting_lines(flight)

@@ -34,7 +34,7 @@ ALLOWED = {
     "summaries": {"naming", "numbers"},
     "exports": {"naming"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
-    "flights": {"errors", "regular_file", "units", "summaries"},
+    "flights": {"errors", "regular_file", "units", "summaries", "yaml_file"},
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors"},
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},

@@ -1,7 +1,7 @@
 """Experiment configurations: YAML, validated, and the problems that they describe."""
 
 from heli_jax.config.experiment import Experiment, in_wind, load, resolved
-from heli_jax.config.logs import read_flights, signals
+from heli_jax.config.logs import first_signals, read_flights, signals
 from heli_jax.config.problems import candidate_models, disturbed, problem
 from heli_jax.config.schema import Config, SimulateConfig, StickConfig
 
@@ -12,6 +12,7 @@ __all__ = [
     "StickConfig",
     "candidate_models",
     "disturbed",
+    "first_signals",
     "in_wind",
     "load",
     "problem",

@@ -8,17 +8,21 @@ from typing import Any, Literal
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.measurement import filter_cautions
+from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
     AlsoConfig,
     FlightConfig,
     InputConfig,
     OutputConfig,
-    SignalsConfig,
 )
 from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
+from heli_jax.flights.derived import with_derived
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.table import Table
 
 
 def read_flights(
@@ -60,18 +64,25 @@ def _read_flight(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
                 f"{nearest(name, naming.names(model.Params))}"
             )
-    # Of all logs together: what one lacks may stand in another.
-    inputs = signals(model, "inputs", _merged(f, "inputs", where), f"{where}.signals", gain)
-    outputs = signals(model, "outputs", _merged(f, "outputs", where), f"{where}.signals")
     time = f.signals.time
+    path = experiment.path.parent / f.log
+    # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
+    # window is otherwise told before minutes of reading.
+    asked = f.signals.preset is not None or f.signals.ccpm is not None
+    swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
+    log = with_derived(open_log(path, f.flight), swashplate) if asked else None
+    named = _resolved(experiment, f, f"{where}.signals", log)
+    # Of all logs together: what one lacks may stand in another.
+    everything = _with_also(named, f, where)
+    inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
     try:
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         flights = (read_parts if f.gaps == "split" else _read_one)(
-            experiment.path.parent / f.log,
+            path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
-            inputs={n: inputs[n] for n in f.signals.inputs},
-            outputs={n: outputs[n] for n in f.signals.outputs},
+            inputs={n: inputs[n] for n in named.inputs},
+            outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
             window=f.window,
             known=f.known,
@@ -85,25 +96,30 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    stated = [f.signals, *(a.signals for a in f.also)]
-    notes = [note for one in stated for note in _unstated_units(model, one)]
+    notes = (*_unstated_units(model, everything), *named.notes)
     first, *others = (with_notches(flight, f.notch or (), f"{where}.notch") for flight in flights)
-    cautions = (*filter_cautions(first.source, f), *vibration_notes(experiment, first, f, where))
-    return (_with_notes(first, tuple(notes), cautions), *others)
+    cautions = filter_cautions(first.source, everything.outputs)
+    cautions = (*cautions, *vibration_notes(experiment, first, f, where))
+    return (_with_notes(first, notes, cautions), *others)
 
 
-def _merged(f: FlightConfig, role: Literal["inputs", "outputs"], where: str) -> dict[str, Any]:
-    """What is stated of the inputs or outputs of all logs of a flight."""
-    merged: dict[str, Any] = dict(getattr(f.signals, role))
+def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
+    """With what is stated of the inputs and outputs of further logs."""
+    merged: dict[str, dict[str, Any]] = {
+        role: dict(getattr(named, role)) for role in ("inputs", "outputs")
+    }
     for k, also in enumerate(f.also):
-        for name, config in getattr(also.signals, role).items():
-            if name in merged:
-                raise InputError(
-                    f"{where}.also[{k}].signals.{role}: {name!r} is taken from another log already,"
-                    " expected it from one"
-                )
-            merged[name] = config
-    return merged
+        for role, known in merged.items():
+            for name, config in getattr(also.signals, role).items():
+                place = f"{where}.also[{k}].signals.{role}"
+                if name in known:
+                    problem = f"{name!r} is taken from another log already, expected it from one"
+                    raise InputError(f"{place}: {problem}")
+                if getattr(config, "constant", None) is not None:
+                    problem = "a constant is in no log, expected it among the flight's own signals"
+                    raise InputError(f"{place}.{name}: {problem}")
+                known[name] = config
+    return named._replace(**merged)
 
 
 def _also(
@@ -123,11 +139,47 @@ def _also(
     )
 
 
-def _read_one(path: Path, **request: Any) -> tuple[Flight, ...]:
+def _read_one(path: Any, **request: Any) -> tuple[Flight, ...]:
     return (read_flight(path, **request),)
 
 
-def _unstated_units(model: Model, stated: SignalsConfig) -> tuple[str, ...]:
+def first_signals(experiment: Experiment) -> Resolved:
+    """The signals of the first flight as the configuration and its preset name them, without a look
+    into the log.
+
+    Raises:
+        InputError: the preset does not supply an input.
+    """
+    where = f"{experiment.path}: flights[0]"
+    first = experiment.config.flights[0]
+    return _with_also(_resolved(experiment, first, f"{where}.signals"), first, where)
+
+
+def _resolved(
+    experiment: Experiment, f: FlightConfig, where: str, log: Table | ChannelLog | None = None
+) -> Resolved:
+    """The signals of a flight's own log; what further logs hold is not asked of its preset."""
+    elsewhere = {n for a in f.also for n in (*a.signals.inputs, *a.signals.outputs)}
+    onboard = experiment.config.onboard
+    return resolve(experiment.model, f.signals, where, onboard, log, elsewhere)
+
+
+def _of_model(
+    model: Model, named: Resolved, where: str, gain: bool
+) -> tuple[dict[str, Signal], dict[str, Signal]]:
+    """Inputs and outputs as signals, with the words of the preset that named them."""
+
+    def with_origins(role: str, by_name: dict[str, Signal]) -> dict[str, Signal]:
+        words = {name: named.origins.get((role, name), "") for name in by_name}
+        return {n: dataclasses.replace(s, origin=words[n]) for n, s in by_name.items()}
+
+    return (
+        with_origins("inputs", signals(model, "inputs", named.inputs, where, gain)),
+        with_origins("outputs", signals(model, "outputs", named.outputs, where)),
+    )
+
+
+def _unstated_units(model: Model, stated: Resolved) -> tuple[str, ...]:
     """A sentence for each signal whose numbers are read as SI because no unit is stated.
 
     Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
@@ -194,8 +246,16 @@ def signals(
         unit = config.unit if config.unit is not None else (si or "1")
         # Inputs have a hold and no sd, outputs the reverse.
         sd, hold = getattr(config, "sd", None), getattr(config, "hold", "auto")
-        repeats = getattr(config, "repeats", "auto")
-        out[name] = Signal(config.signal, unit, _si(unit, si, place, gain), sd, hold, repeats)
+        out[name] = Signal(
+            config.signal or "",
+            unit,
+            _si(unit, si, place, gain),
+            sd,
+            hold,
+            getattr(config, "repeats", "auto"),
+            **config.conversion,
+            constant=getattr(config, "constant", None),
+        )
     return out
 
 

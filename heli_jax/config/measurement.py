@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,17 +116,17 @@ def filter_words(filter: Filter) -> str:
     return f"{filter.kind} {filter.hz:.4g} Hz{more}"
 
 
-def filter_cautions(source: Source | None, flight: FlightConfig) -> tuple[str, ...]:
+def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) -> tuple[str, ...]:
     """What the log's settings say of an output's filter and the configuration does not model.
 
     Args:
         source: of the flight that was read.
-        flight: its configuration.
+        outputs: what is stated of each, or its preset says.
     """
     if source is None:
         return ()
     said = []
-    for name, output in flight.signals.outputs.items():
+    for name, output in outputs.items():
         logged = logged_filters(source.firmware, source.parameters, output.signal)
         if logged is None:
             continue

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.logs import read_flights
+from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.config.starts import first_guesses
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
@@ -163,7 +163,7 @@ def _gain_units(experiment: Experiment) -> dict[str, str]:
     """The unit that each input's gain carries: 1 where the log's unit is of the right kind."""
     # Of the first flight, since a gain is shared by all.
     out = {}
-    for name, signal in experiment.config.flights[0].signals.inputs.items():
+    for name, signal in first_signals(experiment).inputs.items():
         si = naming.unit(experiment.model.Inputs, name)
         plain = signal.unit is not None and units.is_plain(signal.unit)
         out[name] = si if si and plain and not units.is_plain(si) else "1"

@@ -9,6 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 from heli_jax.config.design_section import DesignConfig, ReduceConfig, TrajectoriesConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
+from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -55,14 +56,13 @@ class TimeConfig(_Strict):
     unit: str = "s"
 
 
-class InputConfig(_Strict):
-    signal: str
+class InputConfig(LoggedInputConfig):
     unit: str | None = None
     hold: Literal["auto", "zero-order", "linear"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
 
 
-class OutputConfig(_Strict):
+class OutputConfig(ScaledConfig):
     signal: str
     unit: str | None = None
     sd: Positive | None = None
@@ -75,13 +75,13 @@ class OutputConfig(_Strict):
     """of values that a logger wrote again until the next was there (docs/logs.md)"""
 
 
-class SignalsConfig(_Strict):
+class SignalsConfig(PresetConfig):
     time: TimeConfig | None = None
     """of a table of rows; the topics of an autopilot's log have clocks of their own"""
     # Names are checked where the model is known: what it has for inputs and outputs is not known
     # here.
-    inputs: dict[str, InputConfig]
-    outputs: dict[str, OutputConfig]
+    inputs: dict[str, InputConfig] = Field(default={})
+    outputs: dict[str, OutputConfig] = Field(default={})
 
 
 class AlignConfig(_Strict):
@@ -97,8 +97,11 @@ class AlignConfig(_Strict):
 
 
 class AlsoSignalsConfig(SignalsConfig):
-    inputs: dict[str, InputConfig] = {}
-    outputs: dict[str, OutputConfig] = {}
+    @model_validator(mode="after")
+    def _by_name(self) -> "AlsoSignalsConfig":
+        if self.preset is not None or self.ccpm is not None:
+            raise ValueError("expected inputs and outputs by name in a further log, got a preset")
+        return self
 
 
 class AlsoConfig(_Strict):

@@ -6,23 +6,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from heli_jax import units
+
 HOLDS = ("zero-order", "linear")
 """What an input may do between samples: stay until the next, or follow a straight line to it."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One signal of a log.
+    """One signal of a log: (number in the log - `offset`) `scale` in `unit`, inverted or not.
 
     Attributes:
-        name: the column's name in the log.
-        unit: the unit in the log, such as `deg`.
+        name: the column's name in the log; empty for a constant.
+        unit: the unit, such as `deg`.
         si: the SI unit of the model, such as `rad`.
         sd: stated standard deviation of the measurement noise, in `unit`; for outputs alone.
         hold: what an input does between samples: "zero-order", "linear", or "auto", by what the
             log shows of it.
         repeats: what is made of an output's repeated values: "missing" (a slow sensor in a fast
             table), "keep", or "auto", missing where that is unmistakable.
+        scale: `unit` per number in the log.
+        offset: in the log's own numbers, as 1500 of a PWM.
+        invert: whether its sign is the other one.
+        constant: value in `unit` of an input that the log lacks.
+        origin: where unit, axes and sign come from, in words, where a preset states them.
     """
 
     name: str
@@ -31,15 +38,47 @@ class Signal:
     sd: float | None = None
     hold: str = "auto"
     repeats: str = "auto"
+    scale: float = 1.0
+    offset: float = 0.0
+    invert: bool = False
+    constant: float | None = None
+    origin: str = ""
+
+    def to_si(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers of the log (N,) in SI.
+
+        Raises:
+            ValueError: the unit is unknown or of the wrong kind.
+        """
+        # Untouched where nothing is stated: the log's numbers stay exactly what they are.
+        if self.offset:
+            numbers = numbers - self.offset
+        return numbers * self._factor
+
+    def from_si(self, values: np.ndarray) -> np.ndarray:
+        """What would stand in the log (N,) for values in SI: the inverse of `to_si`."""
+        return values / self._factor + self.offset
+
+    @property
+    def _factor(self) -> float:
+        sign = -1.0 if self.invert else 1.0
+        return sign * self.scale * units.factor(self.unit, self.si)
 
 
 @dataclass(frozen=True)
 class Source:
     """Where a flight came from: the file, its fingerprint, and what the reader assumed or did.
 
-    `firmware` and `parameters` are those of the autopilot that wrote the log; `rates` the usual
-    rates of outputs in an autopilot's log [Hz]; `cautions` are sentences on what biases a fit to
-    the log as it is used, which every fit repeats.
+    Attributes:
+        path: of the file.
+        sha256: of the file.
+        notes: what the reader assumed or did, in sentences.
+        firmware: of the autopilot that wrote the log.
+        parameters: of that autopilot, by name.
+        rates: the usual rates of outputs in an autopilot's log [Hz].
+        cautions: sentences on what biases a fit to the log as it is used, which every fit repeats.
+        inputs: by the model's name, what each is in the log.
+        outputs: likewise.
     """
 
     path: str
@@ -49,6 +88,8 @@ class Source:
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     rates: Mapping[str, float] = field(default_factory=dict)
     cautions: tuple[str, ...] = ()
+    inputs: Mapping[str, Signal] = field(default_factory=dict)
+    outputs: Mapping[str, Signal] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,27 +2,36 @@
 
 import copy
 import dataclasses
+import functools
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Flight, Signal
+from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.onto_grid import FEWEST, decided_holds
+from heli_jax.flights.origins import with_origins, without_constants
 from heli_jax.flights.parts import is_too_short, stretches
 from heli_jax.flights.read_channels import clocks_of, on_all_the_time
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.sources import clocked, flight_from, opened
+from heli_jax.flights.sources import Opened, clocked, flight_from, opened
 from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
 
 
+type _Log = str | Path | ChannelLog | DerivedTable
+type _Finish = Callable[[Flight], Flight]
+"""adds what is in no log, and what the signals are in theirs"""
+
+
 def read_flight(
-    path: str | Path,
+    path: _Log,
     *,
     time: str | Signal | None = None,
     inputs: Mapping[str, Signal],
@@ -33,11 +42,13 @@ def read_flight(
     """Read one run from a log.
 
     Args:
-        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md).
+        path: the log: a table, arrays or what an autopilot wrote (docs/logs.md); or one that is
+            open, by `heli_jax.flights.derived.with_derived`.
         time: the column of time stamps, in seconds where only its name is given; None for an
             autopilot's log, whose topics have clocks of their own.
         inputs: the log's signals by the model's names; two inputs may share a column. What one
-            does between samples is its `hold`; "auto" decides by how it moves in the log.
+            does between samples is its `hold`; "auto" decides by how it moves in the log. One
+            that the log lacks may be a `constant`.
         outputs: the same for what was measured.
         options: which part of the log, at which rate; all of it unless given.
         **keywords: fields of ReadOptions, in place of those of `options`: `rate` [Hz], `window`
@@ -49,14 +60,12 @@ def read_flight(
         TypeError: a keyword that is no field of ReadOptions.
     """
     options = dataclasses.replace(options, **keywords)
-    # Checked before the log is opened, which may take minutes.
-    request = Request(str(path), time, inputs, outputs, options)
-    logs, request = opened(request)
-    return _checked(flight_from(logs, request), request)
+    logs, request, finish = _opened(path, time, inputs, outputs, options)
+    return _checked(finish(flight_from(logs, request)), request)
 
 
 def read_parts(
-    path: str | Path,
+    path: _Log,
     *,
     time: str | Signal | None = None,
     inputs: Mapping[str, Signal],
@@ -83,15 +92,14 @@ def read_parts(
         InputError: as `read_flight`, or no part is left.
     """
     options = dataclasses.replace(options, **keywords)
-    request = Request(str(path), time, inputs, outputs, options)
-    logs, request = opened(request)
+    logs, request, finish = _opened(path, time, inputs, outputs, options)
     signals = clocked(logs, request)
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
     clocks = [clock.seconds for clock in needed]
     found = stretches(clocks)
     if len(found) < 2:
-        return (_checked(flight_from(logs, request), request),)
+        return (_checked(finish(flight_from(logs, request)), request),)
     values = {key: signal.values for key, signal in signals.items()}
     holds = decided_holds(request, values)
     parts, left_out, why = [], [], None
@@ -107,18 +115,42 @@ def read_parts(
         try:
             if is_too_short((start, end), clocks):
                 raise InputError("too short")
-            flight = _enough_measured(_checked(flight_from(logs, part), part))
+            flight = _enough_measured(_checked(finish(flight_from(logs, part)), part))
         except InputError as e:
             words = str(e).removeprefix(f"{request.path}, ").removeprefix(f"{request.path}: ")
             left_out.append(f"{start:.6g} s to {end:.6g} s ({words})")
             why = e
             continue
         reasons = {key: d.reason for key, d in holds.items() if d.reason}
+        reasons = {**flight.hold_reason, **reasons}
         parts.append(dataclasses.replace(flight, hold_reason=reasons))
     if not parts:
         problem = f"{len(found)} parts between gaps, expected one that is long enough; the last: "
         raise wrong(request.path, problem + left_out[-1]) from why
     return (_with_notes(parts[0], _notes(found, left_out)), *parts[1:])
+
+
+def _opened(
+    path: _Log,
+    time: str | Signal | None,
+    inputs: Mapping[str, Signal],
+    outputs: Mapping[str, Signal],
+    options: ReadOptions,
+) -> tuple[Opened, Request, _Finish]:
+    """The logs, what is asked of all of them, and what makes a flight of them whole."""
+    logged, constants = without_constants(inputs)
+    is_open = not isinstance(path, str | Path)
+    # Checked before a log is opened, which may take minutes.
+    request = Request(path.path if is_open else str(path), time, logged, outputs, options)
+    logs, request = opened(request, path if is_open else None)
+    # In the order in which they were asked for, those of further logs last.
+    both = [
+        {**own, **{n: s for also in options.also for n, s in getattr(also, role).items()}}
+        for role, own in (("inputs", inputs), ("outputs", outputs))
+    ]
+    return logs, request, functools.partial(
+        with_origins, inputs=both[0], outputs=both[1], constants=constants
+    )  # fmt: skip
 
 
 def _notes(found: list[tuple[float, float]], left_out: list[str]) -> tuple[str, ...]:

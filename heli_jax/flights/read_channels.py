@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from heli_jax import units
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
@@ -120,7 +119,7 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
             clocks[topic] = topic_clock(log.path, topic, elapsed, request.options.window)
         clock = clocks[topic]
         with np.errstate(over="ignore"):  # what overflows is refused below
-            values = values[clock.rows] * units.factor(signal.unit, signal.si)
+            values = signal.to_si(values[clock.rows])
         # An output may be missing here and there; a stick is somewhere all the time.
         bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:

@@ -197,7 +197,7 @@ def _to_si(
     samples = {}
     for (key, kind), signal in request.signals.items():
         with np.errstate(over="ignore"):  # what overflows is refused below, with its line
-            values = numbers[signal.name][rows] * units.factor(signal.unit, signal.si)
+            values = signal.to_si(numbers[signal.name][rows])
         # An output may be missing here and there; a stick is somewhere all the time.
         bad = np.flatnonzero(np.isinf(values) if kind == "output" else ~np.isfinite(values))
         if bad.size:

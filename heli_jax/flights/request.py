@@ -12,6 +12,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
+from heli_jax.flights.origins import scale_problem
 from heli_jax.flights.repeats import REPEATS
 from heli_jax.flights.table import column, wrong
 
@@ -89,6 +90,7 @@ class Request:
         # Columns first: a column with two uses makes every further sentence about it doubtful.
         self._check_columns()
         self._check_units()
+        self._check_scales()
         self._check_noise()
         self._check_holds()
         self._check_repeats()
@@ -135,6 +137,12 @@ class Request:
                 units.factor(signal.unit, signal.si)
             except ValueError as e:
                 raise wrong(self.path, f"for {use}: {e}", column(signal.name)) from e
+
+    def _check_scales(self) -> None:
+        for (key, kind), signal in self.signals.items():
+            problem = scale_problem(signal)
+            if problem:
+                raise wrong(self.path, f"{kind} {key!r}: {problem}", column(signal.name))
 
     def _check_noise(self) -> None:
         for (key, kind), signal in self.signals.items():

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.flights.align import Lag, NotAligned, lag_between
+from heli_jax.flights.derived import with_derived
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.onto_grid import FEWEST, Key
@@ -22,7 +23,7 @@ from heli_jax.flights.read_channels import (
 )
 from heli_jax.flights.read_table import LoadedTable, clocked_table, load_table, read_table
 from heli_jax.flights.request import Also, ReadOptions, Request
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.table import Table, shown, wrong
 
 
 class Beside(NamedTuple):
@@ -42,14 +43,18 @@ class Opened(NamedTuple):
     beside: tuple[Beside, ...]
 
 
-def opened(request: Request) -> tuple[Opened, Request]:
+def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Opened, Request]:
     """The logs of a request, those beside the first aligned with it, and the request for the
     signals of all of them.
+
+    Args:
+        request: for the signals of the first log.
+        log: the first one where it is open already.
 
     Raises:
         InputError: a log cannot be read, or not be aligned with the first.
     """
-    log = _open(request)
+    first = _open(request, log)
     keys, everything, beside = frozenset(request.signals), copy.copy(request), []
     for also in request.options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
@@ -58,8 +63,8 @@ def opened(request: Request) -> tuple[Opened, Request]:
         if twice is not None:
             raise wrong(also.path, f"{twice[1]} {twice[0]!r} is taken from two logs, expected one")
         everything.signals = {**everything.signals, **signals}
-        beside.append(_beside(log, request, also))
-    return Opened(log, keys, tuple(beside)), everything
+        beside.append(_beside(first, request, also))
+    return Opened(first, keys, tuple(beside)), everything
 
 
 def clocked(logs: Opened, request: Request) -> dict[Key, ClockedSignal]:
@@ -92,8 +97,8 @@ def flight_from(logs: Opened, request: Request) -> Flight:
     return flight_of_signals(clocked(logs, request), request, source, first)
 
 
-def _open(request: Request) -> ChannelLog | LoadedTable:
-    log = open_log(request.path, request.options.number)
+def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:
+    log = log or with_derived(open_log(request.path, request.options.number))
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:

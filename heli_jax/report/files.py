@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.flights import Flight
+from heli_jax.flights.origins import as_content
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Estimate, Fit, Signals
@@ -297,6 +298,10 @@ def _source(flight: Flight) -> dict[str, Any]:
         "n_samples": flight.n_samples,
         "dt": flight.dt,
         "notes": list(flight.source.notes),
+        "signals": {
+            "inputs": {n: as_content(s) for n, s in flight.source.inputs.items()},
+            "outputs": {n: as_content(s) for n, s in flight.source.outputs.items()},
+        },
     }
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.origins import in_words
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.numbers import number
@@ -39,6 +40,9 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
             rows.append(("differs in", values))
         rows += [(f"{n} between samples", words) for n, words in _holds(flight).items()]
         source = flight.source
+        if source:
+            listed_signals = (*source.inputs.items(), *source.outputs.items())
+            rows += [(f"{n} in the log", in_words(signal)) for n, signal in listed_signals]
         rows.append(("file", source.path if source else "given in memory, no file"))
         if source:
             rows.append(("sha256", source.sha256))

@@ -1,0 +1,208 @@
+"""From a preset to the signals of a model: which channel of this log is which input and output."""
+
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
+
+from heli_jax import naming
+from heli_jax.config.onboard import OnboardConfig
+from heli_jax.config.schema import InputConfig, OutputConfig, SignalsConfig
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError, nearest
+from heli_jax.flights.derived import CCPM
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.preset import (
+    Alternative,
+    Preset,
+    choose,
+    model_inputs,
+    model_outputs,
+    preset,
+    presets,
+)
+from heli_jax.flights.table import Table, shown, wrong
+
+_STICKS = {"rate_loop": ("lat", "lon", "x_roll", "x_pitch"), "gyro": ("ped", "x_yaw")}
+"""what a rate loop and a gyro stand behind unless the configuration names it"""
+_CCPM = dict(zip(("collective", "cyclic_roll", "cyclic_pitch"), CCPM, strict=True))
+_MOST_NAMES = 12
+"""of topics, in a sentence"""
+
+
+class Resolved(NamedTuple):
+    """The signals of one flight, each with a channel.
+
+    `origins` says by role and name where unit, axes and sign of those of a preset come from, and
+    `notes` which outputs were left out.
+    """
+
+    inputs: dict[str, InputConfig]
+    outputs: dict[str, OutputConfig]
+    origins: dict[tuple[str, str], str]
+    notes: tuple[str, ...]
+
+
+def resolve(
+    model: Model,
+    stated: SignalsConfig,
+    where: str,
+    onboard: OnboardConfig | None = None,
+    log: Table | ChannelLog | None = None,
+    elsewhere: Collection[str] = (),
+) -> Resolved:
+    """The signals that a configuration states, completed by its preset.
+
+    Args:
+        model: what inputs and outputs are of.
+        stated: the section `signals`.
+        where: what a sentence about it begins with.
+        onboard: the devices around the model: an input behind a rate loop or a gyro is the pilot's
+            stick, any other what the autopilot commands.
+        log: whose channels decide; without one each signal is the first that the preset names.
+        elsewhere: the inputs and outputs that further logs of the flight hold.
+
+    Raises:
+        InputError: an input that neither the configuration nor the preset supplies, or an output
+            that was asked for; no output at all.
+    """
+    inputs, outputs = dict(stated.inputs), dict(stated.outputs)
+    if stated.preset is None:
+        return Resolved(inputs, outputs, {}, ())
+    search = _Search(preset(stated.preset), stated, log, where)
+    search.require_format()
+    origins: dict[tuple[str, str], str] = {}
+    pilot = _pilot(onboard)
+    for name in naming.names(model.Inputs):
+        if name not in inputs and name not in elsewhere:
+            chosen = search.input(model, name, name in pilot)
+            inputs[name] = InputConfig(**_keys(chosen))
+            origins["inputs", name] = search.origin(chosen)
+    left: list[str] = []
+    for name in _wanted(model, stated, where):
+        if name in outputs or name in elsewhere:
+            continue
+        chosen, why = search.output(name)
+        if chosen is None and stated.preset_outputs is not None:
+            raise InputError(f"{where}.preset_outputs: {name}: {why}{search.holdings()}")
+        if chosen is None:
+            left.append(f"{name} ({why})")
+            continue
+        outputs[name] = OutputConfig(**_keys(chosen))
+        origins["outputs", name] = search.origin(chosen)
+    if not outputs and not elsewhere:
+        problem = f"{where}: preset {stated.preset} supplies no output of model {model.name}: "
+        raise InputError(problem + ", ".join(left) + search.holdings())
+    # In the model's own order, whichever of the two named them.
+    inputs = {n: inputs[n] for n in (*naming.names(model.Inputs), *inputs) if n in inputs}
+    notes = (f"outputs that preset {stated.preset} left out: {', '.join(left)}",) if left else ()
+    return Resolved(inputs, outputs, origins, notes)
+
+
+def _pilot(onboard: OnboardConfig | None) -> set[str]:
+    """The inputs that are the pilot's sticks: those in front of a rate loop or a gyro."""
+    if onboard is None:
+        return set()
+    devices = (("rate_loop", onboard.rate_loop), ("gyro", onboard.gyro))
+    return {
+        stick
+        for key, device in devices
+        if device is not None
+        for stick in (_STICKS[key] if device.on is None else device.on)
+    }
+
+
+def _wanted(model: Model, stated: SignalsConfig, where: str) -> tuple[str, ...]:
+    known = naming.names(model.Outputs)
+    for name in stated.preset_outputs or ():
+        if name not in known:
+            raise InputError(
+                f"{where}.preset_outputs: model {model.name} has no output {name!r:.60}"
+                f"{nearest(name, known)}"
+            )
+    return known if stated.preset_outputs is None else tuple(stated.preset_outputs)
+
+
+def _keys(chosen: Alternative) -> dict[str, Any]:
+    """The keys of a configuration that say the same; Any: text, numbers and a boolean."""
+    return {
+        "signal": chosen.channel,
+        "unit": chosen.unit,
+        "scale": chosen.scale,
+        "offset": chosen.offset,
+        "invert": chosen.invert,
+    }
+
+
+class _Search(NamedTuple):
+    """A preset asked for the signals of one log."""
+
+    table: Preset
+    stated: SignalsConfig
+    log: Table | ChannelLog | None
+    where: str
+
+    def require_format(self) -> None:
+        """Refuse a preset none of whose channels is in a log of another format."""
+        log, table = self.log, self.table
+        if log is None or log.format in table.formats:
+            return
+        # A table may well have the names of the channels, as `heli-jax convert` writes them.
+        if any(choose(log, alternatives) for alternatives in table.signals.values()):
+            return
+        others = [name for name in presets() if log.format in preset(name).formats]
+        instead = f"preset {' or '.join(others)}, or " if others else ""
+        kind = " and ".join(table.formats)
+        problem = f"preset {table.name} is for logs of {kind}, and this {log.format} log has none"
+        expected = f"of its channels, expected {instead}inputs and outputs by name"
+        raise InputError(f"{self.where}.preset: {log.path}: {problem} {expected}")
+
+    def input(self, model: Model, name: str, pilot: bool) -> Alternative:
+        known = model_inputs().get(name)
+        if known is None:
+            problem = f"no preset knows the input {name!r} of model {model.name}"
+            raise InputError(f"{self.where}.inputs: {problem}, expected it by name")
+        chosen, why = self._signal(known.stick if pilot else known.command)
+        if chosen is None:
+            problem = f"{name}: {why}, expected it by name"
+            raise InputError(f"{self.where}.inputs: {problem}{self.holdings()}")
+        # Two inversions are none.
+        return Alternative(**{**vars(chosen), "invert": chosen.invert != known.invert})
+
+    def output(self, name: str) -> tuple[Alternative | None, str]:
+        signal = model_outputs().get(name)
+        return (None, "no preset knows it") if signal is None else self._signal(signal)
+
+    def _signal(self, signal: str) -> tuple[Alternative | None, str]:
+        """The channel of a signal, or why there is none."""
+        table = self.table
+        alternatives = table.signals.get(signal, ())
+        if self.stated.ccpm is not None and signal in _CCPM:
+            origin = "unmixed from the servos by signals.ccpm"
+            return Alternative(_CCPM[signal], "1", source=origin), ""
+        if not alternatives:
+            reason = table.missing.get(signal)
+            return None, f"preset {table.name} has no {signal}" + (f": {reason}" if reason else "")
+        if self.log is None:
+            return alternatives[0], ""
+        tried = ", ".join(dict.fromkeys(a.channel for a in alternatives))
+        return choose(self.log, alternatives), f"the log has no {signal} in {tried}"
+
+    def origin(self, chosen: Alternative) -> str:
+        """Where unit, axes and sign come from."""
+        return f"by preset {self.table.title}: {chosen.source}"
+
+    def holdings(self) -> str:
+        """What the log does hold, as the end of a sentence."""
+        if self.log is None:
+            return ""
+        names = list(self.log.names)
+        if isinstance(self.log, ChannelLog):
+            names = _distinct(t.name for t in self.log.topics)
+        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+        listed = ", ".join(shown(name)[1:-1] for name in names[:_MOST_NAMES])
+        # `wrong` takes out what a terminal would obey: names come from the file.
+        return str(wrong(f"; {self.log.path} holds", f"{listed}{more}"))
+
+
+def _distinct(names: Iterable[str]) -> list[str]:
+    """Topics without the numbers of their instances."""
+    return list(dict.fromkeys(name.split("[")[0] for name in names))

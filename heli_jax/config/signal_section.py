@@ -1,0 +1,132 @@
+"""The parts of the section `signals` that say what a channel's numbers mean."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+
+from heli_jax.flights.ccpm import Swashplate
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.origins import scale_problem
+from heli_jax.flights.preset import preset
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    # An unknown key is an error: a misspelt `invert` would leave a sign that nobody sees.
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ScaledConfig(_Strict):
+    """(number in the log - offset) scale, in the stated unit, inverted or not."""
+
+    scale: _Finite = 1.0
+    offset: _Finite = 0.0
+    """in the log's own numbers"""
+    invert: StrictBool = False
+
+    @model_validator(mode="after")
+    def _sensible(self) -> "ScaledConfig":
+        problem = scale_problem(Signal("", "1", "1", **self.conversion))
+        if problem:
+            raise ValueError(problem)
+        return self
+
+    @property
+    def conversion(self) -> dict[str, Any]:
+        """The keywords of a `Signal` that say it."""
+        return {"scale": self.scale, "offset": self.offset, "invert": self.invert}
+
+
+class LoggedInputConfig(ScaledConfig):
+    """An input's channel, or its value where the log lacks it."""
+
+    signal: str | None = None
+    constant: _Finite | None = None
+    """in the stated unit"""
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> "LoggedInputConfig":
+        if (self.signal is None) == (self.constant is None):
+            raise ValueError("expected either signal or constant")
+        if self.constant is not None and self.conversion != ScaledConfig().conversion:
+            raise ValueError(
+                "scale, offset and invert are of a signal, expected none, got constant"
+            )
+        return self
+
+
+def _numbers(value: object) -> object:
+    # By hand: of a union pydantic would report every member.
+    each = value if isinstance(value, list) else [value]
+    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in each):
+        return value
+    raise ValueError(f"expected a number or a list of numbers, got {value!r:.60}")
+
+
+def _booleans(value: object) -> object:
+    if all(isinstance(v, bool) for v in (value if isinstance(value, list) else [value])):
+        return value
+    raise ValueError(f"expected true, false or a list of them, got {value!r:.60}")
+
+
+# Any, since the validator before it has said what it may be.
+_Numbers = Annotated[Any, BeforeValidator(_numbers)]
+_Booleans = Annotated[Any, BeforeValidator(_booleans)]
+
+
+class CcpmConfig(_Strict):
+    """The servos of a swashplate and where they lift it (`heli_jax.flights.ccpm.Swashplate`)."""
+
+    servos: list[str]
+    angles: list[_Finite]
+    radius: _Numbers = 1.0
+    offset: _Numbers = 0.0
+    scale: _Numbers = 1.0
+    invert: _Booleans = False
+    phase: _Finite = 0.0
+
+    @model_validator(mode="after")
+    def _regular(self) -> "CcpmConfig":
+        self.swashplate()
+        return self
+
+    def swashplate(self) -> Swashplate:
+        """The geometry.
+
+        Raises:
+            ValueError: it does not tell collective from cyclic, or a list is of the wrong length.
+        """
+        count = len(self.servos)
+
+        def each(value: Any) -> tuple:
+            return tuple(value) if isinstance(value, list) else (value,) * count
+
+        return Swashplate(
+            tuple(self.servos),
+            tuple(self.angles),
+            each(self.radius),
+            each(self.offset),
+            each(self.scale),
+            each(self.invert),
+            self.phase,
+        )
+
+
+class PresetConfig(_Strict):
+    """What of the signals comes from a table or from a geometry (docs/logs.md)."""
+
+    preset: str | None = None
+    """the table of an autopilot; what `inputs` and `outputs` name goes before it"""
+    preset_outputs: list[str] | None = None
+    """the outputs to take from it; all that it can supply unless given"""
+    ccpm: CcpmConfig | None = None
+    """what `ccpm.collective`, `ccpm.roll` and `ccpm.pitch` are unmixed from"""
+
+    @model_validator(mode="after")
+    def _known(self) -> "PresetConfig":
+        if self.preset is not None:
+            preset(self.preset)
+        elif self.preset_outputs is not None:
+            raise ValueError("preset_outputs: expected a preset with it, got none")
+        return self

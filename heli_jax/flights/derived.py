@@ -1,0 +1,283 @@
+"""Channels that are computed from those of a log: `euler(vehicle_attitude.q).roll` and its like.
+
+A short list of named functions and no expressions: what a configuration can ask for is what is
+written here.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heli_jax.errors import nearest
+from heli_jax.flights.ccpm import Swashplate, unmix
+from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.resample import longest_gap
+from heli_jax.flights.table import Survey, Table, shown, wrong
+
+EULER = ("roll", "pitch", "yaw")
+BODY = ("u", "v", "w")
+CCPM = ("ccpm.collective", "ccpm.roll", "ccpm.pitch")
+"""channels that there are where a configuration states the geometry of the swashplate"""
+FORMS = (
+    "euler(Q).roll, .pitch or .yaw",
+    "body_velocity(Q, NORTH, EAST, DOWN).u, .v or .w",
+    "unwrap(CHANNEL, PERIOD)",
+)
+_CALL = re.compile(r"\s*([A-Za-z_]\w*)\((.*)\)(?:\.(\w+))?\s*")
+_LONGEST_NAME = 400
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """How a channel is computed.
+
+    Attributes:
+        groups: the channels it is computed from. The last group has the clock of the result, and
+            all of a group have one clock.
+        compute: the samples (N,) from those of the groups, (k, N) each, all on one clock.
+    """
+
+    groups: tuple[tuple[str, ...], ...]
+    compute: Callable[..., np.ndarray]
+
+
+def derivation(
+    name: str, known: Collection[str], swashplate: Swashplate | None = None
+) -> Derivation | None:
+    """How a channel of this name is computed; None where the name is that of a plain channel.
+
+    Args:
+        name: as a configuration has it.
+        known: the log's own channels.
+        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
+
+    Raises:
+        ValueError: it looks like a derived channel and is none.
+    """
+    # A column may have any name, one with parentheses too: what the file says goes first.
+    if name in known or len(name) > _LONGEST_NAME:
+        return None
+    if name in CCPM:
+        return _of_servos(name, swashplate)
+    match = _CALL.fullmatch(name)
+    if not match:
+        return None
+    function, part = match[1], match[3] or ""
+    arguments = [argument.strip() for argument in match[2].split(",")]
+    expected = f"expected {', '.join(FORMS)}, got {shown(name)}"
+    if function == "euler" and len(arguments) in (1, 4) and part in EULER:
+        return Derivation((_quaternion(arguments, known),), _euler(EULER.index(part)))
+    if function == "body_velocity" and len(arguments) in (4, 7) and part in BODY:
+        *q, north, east, down = arguments
+        groups = (_quaternion(q, known), (north, east, down))
+        return Derivation(groups, _body_velocity(BODY.index(part)))
+    if function == "unwrap" and len(arguments) == 2 and not part:
+        return Derivation(((arguments[0],),), _unwrap(_period(arguments[1], expected)))
+    if function not in ("euler", "body_velocity", "unwrap"):
+        hint = nearest(function, ("euler", "body_velocity", "unwrap"))
+        raise ValueError(f"no derived channel {shown(function)}{hint}")
+    raise ValueError(expected)
+
+
+def sources(name: str, known: Collection[str], swashplate: Swashplate | None = None) -> list[str]:
+    """The log's own channels that a channel needs: itself, unless it is derived.
+
+    Raises:
+        ValueError: as `derivation`.
+    """
+    derived = derivation(name, known, swashplate)
+    return [name] if derived is None else [n for group in derived.groups for n in group]
+
+
+def _quaternion(arguments: Sequence[str], known: Collection[str]) -> tuple[str, ...]:
+    """The four parts w, x, y, z by name: q[0] to q[3], or Q1 to Q4."""
+    if len(arguments) == 4:
+        return tuple(arguments)
+    indexed = tuple(f"{arguments[0]}[{i}]" for i in range(4))
+    numbered = tuple(f"{arguments[0]}{i}" for i in range(1, 5))
+    return numbered if numbered[0] in known else indexed
+
+
+def _period(text: str, expected: str) -> float:
+    try:
+        period = float(text)
+    except ValueError:
+        raise ValueError(expected) from None
+    if not 0 < period < np.inf:
+        raise ValueError(f"expected a positive period, got {text!r:.40}")
+    return period
+
+
+def _of_servos(name: str, swashplate: Swashplate | None) -> Derivation:
+    if swashplate is None:
+        raise ValueError(f"{name} needs the swashplate's geometry, expected signals.ccpm with it")
+    row = CCPM.index(name)
+    return Derivation((swashplate.servos,), lambda servos: unmix(swashplate, servos)[row])
+
+
+def euler_angles(q: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (3, N) [rad] of quaternions (4, N), w first, of any length but zero.
+
+    From the earth's axes to the body's by yaw, pitch, roll (3-2-1). Roll and yaw do not jump by a
+    turn. Source: J. Diebel, Representing attitude, Stanford, 2006, eqs 290 and 284.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w, x, y, z = q / np.linalg.norm(q, axis=0)
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([_unwrapped(roll, 2 * np.pi), pitch, _unwrapped(yaw, 2 * np.pi)])
+
+
+def body_velocity(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Velocities (3, N) along the body's axes from those along the earth's (3, N).
+
+    Args:
+        q: attitude (4, N), w first, from the earth's axes to the body's.
+        velocity: north, east, down.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = q / np.linalg.norm(q, axis=0)
+    w, r = q[0], q[1:]
+    # The rotation by the conjugate, v - 2 w (r x v) + 2 r x (r x v).
+    once = np.cross(r, velocity, axis=0)
+    return velocity - 2 * w * once + 2 * np.cross(r, once, axis=0)
+
+
+def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
+    # The finite ones alone: behind a NaN np.unwrap would give nothing else.
+    good = np.isfinite(values)
+    out = np.array(values, np.float64)
+    out[good] = np.unwrap(out[good], period=period)
+    return out
+
+
+def _euler(row: int) -> Callable[..., np.ndarray]:
+    return lambda q: euler_angles(q)[row]
+
+
+def _body_velocity(row: int) -> Callable[..., np.ndarray]:
+    return lambda q, velocity: body_velocity(q, velocity)[row]
+
+
+def _unwrap(period: float) -> Callable[..., np.ndarray]:
+    return lambda values: _unwrapped(values[0], period)
+
+
+@dataclass(frozen=True, eq=False)
+class DerivedLog(ChannelLog):
+    """A log whose derived channels can be asked for as its own."""
+
+    swashplate: Swashplate | None = None
+
+    def topic_of(self, name: str) -> Topic:
+        """The topic that holds a channel; of a derived one that whose clock it has.
+
+        Raises:
+            InputError: there is no such channel, or those it is computed from have several clocks.
+        """
+        # Of all topics, as `names` would have it, but without a tuple of thousands at every call.
+        if any(name in topic.columns for topic in self.topics):
+            return super().topic_of(name)
+        place = f"channel {shown(name)}"
+        try:
+            derived = derivation(name, frozenset(self.names), self.swashplate)
+        except ValueError as e:
+            raise wrong(self.path, str(e), place) from e
+        if derived is None:
+            return super().topic_of(name)
+        *others, last = [self._group(group, place) for group in derived.groups]
+        blocks = [_on_clock(last[0].times, topic.times, values) for topic, values in others]
+        values = derived.compute(*blocks, last[1])
+        return Topic(last[0].name, last[0].times, {name: values}, {}, last[0].clock)
+
+    def _group(self, names: Sequence[str], place: str) -> tuple[Topic, np.ndarray]:
+        """The topic of channels that were written together, and their samples (k, N)."""
+        topics = [super(DerivedLog, self).topic_of(name) for name in names]
+        for name, topic in zip(names, topics, strict=True):
+            if topic.name != topics[0].name:
+                problem = f"{shown(names[0])} and {shown(name)} are of different topics, expected"
+                raise wrong(self.path, f"{problem} channels of one", place)
+        values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
+        return topics[0], np.stack(values)
+
+
+def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Quaternions (4, M) of a clock (M,) at other times (N,): between two on a straight line."""
+    if clock.size < 2 or np.any(np.diff(clock) <= 0):
+        return np.full((len(q), times.size), np.nan)
+    # q and -q are one attitude, and the line between them leads through no attitude at all.
+    flips = np.where(np.sum(q[:, 1:] * q[:, :-1], axis=0) < 0, -1.0, 1.0)
+    q = q * np.concatenate([[1.0], np.cumprod(flips)])
+    between = np.stack([np.interp(times, clock, row, np.nan, np.nan) for row in q])
+    # In a gap the attitude is not known, and the velocity then counts as missing.
+    right = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
+    inside = (clock[right - 1] < times) & (times < clock[right])
+    between[:, inside & (clock[right] - clock[right - 1] > longest_gap(clock))] = np.nan
+    return between
+
+
+class DerivedTable:
+    """A table of rows whose derived columns can be asked for as its own."""
+
+    def __init__(self, table: Table, swashplate: Swashplate | None = None) -> None:
+        self.table, self.swashplate = table, swashplate
+        self.path, self.format, self.size = table.path, table.format, table.size
+        self.sha256, self.names = table.sha256, table.names
+
+    def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """The columns as float64 (N,), NaN where a cell is empty.
+
+        Raises:
+            InputError: a column is missing, or a name is none of a derived one.
+        """
+        derived = {name: d for name in names if (d := self._derivation(name)) is not None}
+        plain = [name for name in names if name not in derived]
+        plain += [n for d in derived.values() for group in d.groups for n in group]
+        columns = self.table.numbers(list(dict.fromkeys(plain)))
+        for name, d in derived.items():
+            groups = [np.stack([columns[n] for n in group]) for group in d.groups]
+            columns[name] = d.compute(*groups)
+        return {name: columns[name] for name in names}
+
+    def _derivation(self, name: str) -> Derivation | None:
+        try:
+            return derivation(name, self.names, self.swashplate)
+        except ValueError as e:
+            raise wrong(self.path, str(e), f"column {shown(name)}") from e
+
+    def survey(self) -> list[Survey]:
+        """The file's own columns."""
+        return self.table.survey()
+
+    def place(self, row: int) -> str:
+        """Where a row stands."""
+        return self.table.place(row)
+
+    def cell_text(self, name: str, row: int) -> str:
+        """What stands in a cell; of a derived column the number."""
+        if self._derivation(name) is None:
+            return self.table.cell_text(name, row)
+        return f"{self.numbers([name])[name][row]:g}"
+
+    def time_unit(self, name: str) -> str | None:
+        """The unit of a column of time stamps."""
+        return self.table.time_unit(name) if name in self.names else None
+
+
+def with_derived(
+    log: Table | ChannelLog, swashplate: Swashplate | None = None
+) -> DerivedTable | DerivedLog:
+    """A log whose derived channels can be asked for by name.
+
+    Args:
+        log: as `open_log` gives it.
+        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
+    """
+    if not isinstance(log, ChannelLog):
+        return DerivedTable(log, swashplate)
+    fields = {field.name: getattr(log, field.name) for field in dataclasses.fields(ChannelLog)}
+    return DerivedLog(**fields, swashplate=swashplate)
