@@ -5,7 +5,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report import files
@@ -176,8 +177,21 @@ def print_check(check: Check) -> None:
     for name, sd in check.noise.items():
         guess = " (guessed: too small where the log was smoothed; state the output's sd)"
         print(f"noise of {name}: {sd:.3g}{guess if name in check.guessed else ''}")
-    for note in check.notes:
+    for note in check.further_notes:
         print(f"! {note}")
+    _print_findings(check.findings)
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    """Whether the log is enough, a line each, what is worst first."""
+    if not findings:
+        return
+    print("\nIs this log enough?")
+    for f in findings:
+        print(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
+
+
+_MARKS = {"ok": " ", "doubt": "!", "refuse": "x"}
 
 
 def _print_verdict(verdict: Verdict) -> None:

@@ -36,6 +36,7 @@ from heli_jax.identification.unknowns.layout import (
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.other_hold import other_hold
 
@@ -83,7 +84,8 @@ def check(problem: Problem) -> Check:
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
     notes = excitation.notes(problem, runs, guess.noise.sd)
-    notes += feedback_notes(problem, feedback_of(problem))
+    feedback = feedback_of(problem)
+    notes += feedback_notes(problem, feedback)
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += tuple(of_disturbances(guess.layout, guess.e))
@@ -95,7 +97,8 @@ def check(problem: Problem) -> Check:
         if name not in flight.sd
     )
     sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
-    return Check(verdict, sds, tuple(notes), guessed)
+    findings = is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback)
+    return Check(verdict, sds, tuple(notes), guessed, findings)
 
 
 def _starts(
