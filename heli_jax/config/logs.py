@@ -48,6 +48,10 @@ def _read_flight(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
                 f"{nearest(name, naming.names(model.Params))}"
             )
+    if f.window == "auto" and f.hold_out:
+        raise InputError(
+            f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
+        )
     time = f.signals.time
     try:
         flight = read_flight(
@@ -57,7 +61,7 @@ def _read_flight(
             inputs=signals(model, "inputs", f.signals.inputs, f"{where}.signals", gain),
             outputs=signals(model, "outputs", f.signals.outputs, f"{where}.signals"),
             rate=f.rate,
-            window=f.window,
+            window=None if f.window == "auto" else f.window,
             known=f.known,
             hold_out=f.hold_out,
             name=f.name or f"flight {i + 1}",
@@ -68,6 +72,7 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
+    flight = dataclasses.replace(flight, choose_windows=f.window == "auto")
     return _with_notes(flight, _unstated_units(model, f.signals))
 
 

@@ -32,4 +32,5 @@ def part(flight: Flight, first: int, last: int, name: str = "", note: str = "") 
         t0=flight.t0 + first * flight.dt,
         name=name or flight.name,
         source=source,
+        choose_windows=False,
     )

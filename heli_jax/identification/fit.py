@@ -39,8 +39,9 @@ from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.other_hold import other_hold
+from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 
-__all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
+__all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit", "windows"]
 
 _FIRST_STEPS = 40
 """of filter error, until it is known that there is a disturbance to find"""
@@ -99,6 +100,21 @@ def check(problem: Problem) -> Check:
     sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
     findings = is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback)
     return Check(verdict, sds, tuple(notes), guessed, findings)
+
+
+def windows(problem: Problem, length: float | None = None) -> Ranking:
+    """What each window of the flights says of the free parameters, at the start values.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+        length: of a window [s]; unless given a twelfth of the longest flight, between 2 and 20 s.
+
+    Raises:
+        ValueError: the length fits no flight, no window may be used, or the simulation is not
+            finite at the start values.
+    """
+    guess = _first_guess(problem)
+    return rank_windows(problem, Solution(*guess[:4]), guess.e, length)
 
 
 def _starts(

@@ -21,6 +21,8 @@ _SEGMENTS = 8
 """half-overlapping segments make an average, two more for every further input"""
 _SHORTEST, _LONGEST = 64, 4096
 """samples of a segment"""
+_MANY, _LONG = 24, 400
+"""segments that are better, where each still has so many samples"""
 _CHANCE = 0.01
 """probability that any frequency of signals without coherence shows more"""
 _POWER = (0.05, 0.95)
@@ -64,14 +66,12 @@ def bands(flights: Sequence[Flight]) -> list[Finding]:
 
 def _pooled(flights: list[Flight], moving: list[str], outputs: list[str]) -> _Pooled | None:
     """None where the records are too short for an average."""
-    least = _SEGMENTS + 2 * (len(moving) - 1)
-    sizes = [f.n_samples for f in flights]
-    # The longest segments of which there are enough: low frequencies are what flying shows.
-    length = min(max(sizes), _LONGEST) // 2 * 2
-    while sum(_count(n, length) for n in sizes) < least:
-        length = length * 3 // 4 // 2 * 2
-        if length < _SHORTEST:
-            return None
+    more, sizes = 2 * (len(moving) - 1), [f.n_samples for f in flights]
+    # Many segments where they can be long still, since few show little of a disturbed machine; else
+    # as few as make an average.
+    length = _length(sizes, _MANY + more, _LONG) or _length(sizes, _SEGMENTS + more, _SHORTEST)
+    if length == 0:
+        return None
     parts = []
     for f in (f for f in flights if f.n_samples >= length):
         channels = [f.inputs[n] for n in moving] + [f.outputs[n] for n in outputs]
@@ -82,6 +82,14 @@ def _pooled(flights: list[Flight], moving: list[str], outputs: list[str]) -> _Po
     inner = slice(1, -1)
     hz, m = omega[inner] / (2.0 * np.pi), len(moving)
     return _Pooled(hz, both[inner, :, :m], both[inner, :, m:])
+
+
+def _length(sizes: list[int], segments: int, least: int) -> int:
+    """The samples of the longest segments of which there are enough; 0 where they are too short."""
+    length = min(max(sizes), _LONGEST) // 2 * 2
+    while length >= least and sum(_count(n, length) for n in sizes) < segments:
+        length = length * 7 // 8 // 2 * 2
+    return length if length >= least else 0
 
 
 def _count(samples: int, length: int) -> int:

@@ -152,7 +152,9 @@ def quantisation(
                 doubts.append((ratio, f"{label}: {sentence}"))
         doubts += [(0.0, f"{label}: {s}") for s in _coarse_inputs(flight)]
     if not doubts:
-        words = f"steps of the log are fine: rounding is at most {worst:.2g} of the noise."
+        words = "no output is logged in steps that show."
+        if worst > 0:
+            words = f"steps of the log are fine: rounding is at most {worst:.2g} of the noise."
         return [Finding("quantisation", "ok", words, worst, "rounding rms over noise sd, 1")]
     doubts.sort(key=lambda d: -d[0])
     return [
