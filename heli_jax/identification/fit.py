@@ -38,10 +38,22 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 
-__all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit", "windows"]
+__all__ = [
+    "Check",
+    "Estimate",
+    "Fit",
+    "Signals",
+    "StartRow",
+    "Status",
+    "check",
+    "findings",
+    "fit",
+    "windows",
+]
 
 _FIRST_STEPS = 40
 """of filter error, until it is known that there is a disturbance to find"""
@@ -100,6 +112,16 @@ def check(problem: Problem) -> Check:
     sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
     findings = is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback)
     return Check(verdict, sds, tuple(notes), guessed, findings)
+
+
+def findings(problem: Problem) -> tuple[Finding, ...]:
+    """Whether the flights are enough for what is asked, at the start values: as `check` says it.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+    """
+    guess = _first_guess(problem)
+    return is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback_of(problem))
 
 
 def windows(problem: Problem, length: float | None = None) -> Ranking:

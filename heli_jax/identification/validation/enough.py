@@ -35,7 +35,7 @@ def is_it_enough(
         *_of_feedback(problem, feedback),
         *saturation(flights),
         *quantisation(flights, at.noise.sd),
-        *missing_outputs(problem, at, e),
+        *missing_outputs(problem, at),
         *next_flight(problem, at, e),
     ]
     return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))

@@ -88,7 +88,8 @@ def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any])
     outputs, inputs = naming.names(problem.model.Outputs), naming.names(problem.model.Inputs)
     shown = []
     for k, eigenvalue in enumerate(eigenvalues):
-        if abs(eigenvalue) < 1e-9:
+        # Slower than the record is a drift, and a pair of integrators is no oscillation.
+        if abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
         best = (0.0, "", "")
         for j, u in enumerate(inputs):

@@ -29,6 +29,11 @@ _WORTH = 0.9
 """of an interval's width, below which an output is spoken of"""
 _DOUBT = 0.5
 """of an interval's width: an output that halves it is missed"""
+_KNOWN = 0.1
+"""relative sd of a parameter below which nothing is missed"""
+TYPICAL = {"rad": 0.01, "rad/s": 0.01, "m": 0.5, "m/s": 0.1, "m/s^2": 0.3}
+"""noise of small autopilots' sensors (attitude, gyro, GPS position and velocity, accelerometer),
+SI, by unit: for outputs of a unit that no measured output has"""
 _MOST_NAMED = 3
 """outputs that are named, those that narrow an interval most"""
 
@@ -41,17 +46,18 @@ class MissingOutput(NamedTuple):
     """of the noise that it is taken to have [SI]"""
     ratios: Float[np.ndarray, " q"]
     """sd of each parameter of interest with it, over that without; 0 where only it determines"""
+    before: Float[np.ndarray, " q"]
+    """relative sd of each without it"""
 
 
-def missing_outputs(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
+def missing_outputs(problem: Problem, at: Solution) -> list[Finding]:
     """What each output that the model has and the log lacks would do to the intervals.
 
     Args:
         problem: what is free.
         at: layout, data, noise and unknowns at the start values.
-        e: the evaluation there.
     """
-    looked = look_at_missing(problem, at, e)
+    looked = look_at_missing(problem, at)
     if looked is None:
         return []
     unknowns, missing = looked
@@ -82,16 +88,17 @@ def _finding(
     unit = naming.unit(problem.model.Outputs, m.name) or ""
     least = float(np.min(m.ratios))
     words = (
-        f"{m.name} is not among the outputs: with it (noise {m.sd:.2g} {unit}".rstrip()
-        + f", as large a part of the signal as that of the others) of the intervals "
-        f"{', '.join(parts)}; at the start values."
+        f"{m.name} is not among the outputs: with it (noise taken as {m.sd:.2g} {unit}".rstrip()
+        + f") of the intervals {', '.join(parts)}; at the start values."
     )
-    severity = "doubt" if least < _DOUBT else "ok"
+    # What is known well already need not be known better.
+    missed = bool(np.any((m.ratios < _DOUBT) & ~(m.before < _KNOWN)))
+    severity = "doubt" if missed else "ok"
     return Finding("missing output", severity, words, least, criterion)
 
 
 def look_at_missing(
-    problem: Problem, at: Solution, e: Evaluation
+    problem: Problem, at: Solution
 ) -> tuple[tuple[str, ...], list[MissingOutput]] | None:
     """The parameters of interest, and for each output that no flight has what it would do; None
     where the method's rows are not samples of one output each.
@@ -99,7 +106,6 @@ def look_at_missing(
     Args:
         problem: what is free.
         at: layout, data, noise and unknowns at the start values.
-        e: the evaluation there.
     """
     # The rows of a filter's predictions belong to all outputs together, which say each other's.
     if not at.layout.estimator.rows_are_samples:
@@ -113,7 +119,9 @@ def look_at_missing(
     noise = at.noise._replace(sd=tuple({**sd, **dict.fromkeys(lacking, 1.0)} for sd in at.noise.sd))
     noise = jax.tree.map(lambda v: np.asarray(v, z.dtype), noise)
     evaluation = evaluate(layout, data, noise, z)
-    sds = _noises(at, e, evaluation.simulated, lacking)
+    sds = _noises(problem, at, evaluation.simulated, lacking)
+    if not sds:
+        return at.layout.of_interest, []
     s = _weighed(sensitivity_at(problem, layout, evaluation), layout, data, evaluation, sds)
     return at.layout.of_interest, _ratios(layout, data, s, lacking, sds)
 
@@ -147,20 +155,26 @@ def _extended(problem: Problem, at: Solution, lacking: list[str]) -> tuple[Layou
 
 
 def _noises(
-    at: Solution, e: Evaluation, simulated: tuple[dict[str, np.ndarray], ...], lacking: list[str]
+    problem: Problem,
+    at: Solution,
+    simulated: tuple[dict[str, np.ndarray], ...],
+    lacking: list[str],
 ) -> dict[str, float]:
     """The noise that each missing output is taken to have; none of what stands still."""
-    # As large a part of its motion as that of the outputs that are measured, in the middle.
-    ratios = [
-        float(sd[n]) / float(np.std(run[n]))
-        for sd, run in zip(at.noise.sd, e.simulated, strict=True)
-        for n in run
-        if np.std(run[n]) > 0
-    ]
-    if not ratios:
-        return {}
-    motion = {n: float(np.sqrt(np.mean([np.var(run[n]) for run in simulated]))) for n in lacking}
-    return {n: float(np.median(ratios)) * size for n, size in motion.items() if size > 0}
+    record, by_unit = problem.model.Outputs, {}
+    for sd in at.noise.sd:
+        for n, size in sd.items():
+            by_unit.setdefault(naming.unit(record, n), []).append(float(size))
+    sds = {}
+    for n in lacking:
+        unit = naming.unit(record, n)
+        moves = any(np.std(run[n]) > 0 for run in simulated)
+        # A gyro has one noise in all its axes; of a unit that nothing measures yet that of small
+        # autopilots' sensors, and of any other it is not known what it would be measured with.
+        sd = float(np.median(by_unit[unit])) if unit in by_unit else TYPICAL.get(unit or "")
+        if sd is not None and moves:
+            sds[n] = sd
+    return sds
 
 
 def _weighed(
@@ -199,5 +213,5 @@ def _ratios(
         # What nothing determines before and after is as it was.
         ratio = np.where(np.isfinite(before), after / np.where(before > 0, before, 1.0), 0.0)
         ratio = np.where(np.isfinite(after), ratio, 1.0)
-        results.append(MissingOutput(name, sd, ratio))
+        results.append(MissingOutput(name, sd, ratio, before))
     return results

@@ -88,6 +88,7 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
     if plan is None:
         return []
     unit = naming.unit(problem.model.Inputs, plan.best.input) or ""
+    unit = "" if unit == "1" else unit
     flown = (
         f"{plan.best.words} of {plan.best.input}, amplitude {plan.amplitude:.3g} {unit}".rstrip()
         + f", for {plan.duration:.3g} s"

@@ -152,8 +152,12 @@ def rank_windows(
     windows, triangles = [], []
     reasons = Exclusions(problem.training)
     for span, rows in spans:
-        T = triangle(s, rows)
-        windows.append(_window(problem, span, expected_sd(s.unknowns, T), reasons))
+        excluded, T = reasons.of(*span), np.zeros((s.shared.shape[1],) * 2)
+        if np.isfinite(s.shared[rows]).all() and np.isfinite(s.own[rows]).all():
+            T = triangle(s, rows)
+        else:
+            excluded = excluded or "the simulation at the start values diverges"
+        windows.append(_window(problem, span, expected_sd(s.unknowns, T), excluded))
         triangles.append(T)
     order = sorted(range(len(windows)), key=lambda k: (windows[k].flight, windows[k].first))
     windows, triangles = [windows[k] for k in order], [triangles[k] for k in order]
@@ -172,11 +176,11 @@ class _Span(NamedTuple):
     last: int
 
 
-def _window(problem: Problem, span: _Span, sd: np.ndarray, reasons: Exclusions) -> Window:
+def _window(problem: Problem, span: _Span, sd: np.ndarray, excluded: str) -> Window:
     flight = problem.training[span.flight]
     label = labels(problem.training)[span.flight]
     start, end = span.first * flight.dt, (span.last - 1) * flight.dt
-    return Window(*span[:1], label, *span[1:], start, end, sd, reasons.of(*span))
+    return Window(*span[:1], label, *span[1:], start, end, sd, excluded)
 
 
 def _simulated(
