@@ -164,7 +164,7 @@ def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
         c = np.where(np.isnan(c), np.nan_to_num(partial_coherence(others[:, :, :0], u, v)), c)
         powers = [np.sum(np.abs(x) ** 2, axis=1) for x in (u, v)]
         # Where both have power: that is where each could be taken for the other.
-        weights = np.sqrt(np.prod([p / p.sum() for p in powers], axis=0))
+        weights = np.min([p / p.sum() for p in powers], axis=0)
         mean = float(np.average(c, weights=weights))
         excited = weights >= _LEAST_POWER * weights.max()
         band = _longest(pooled.hz, (c >= limit) & excited)
