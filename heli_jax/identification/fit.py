@@ -117,15 +117,16 @@ def check(problem: Problem) -> Check:
 def findings(problem: Problem) -> tuple[Finding, ...]:
     """Whether the flights are enough for what is asked, at the start values: as `check` says it.
 
-    What missing outputs would tell and what to fly next is compared for linear models alone: the
-    whole helicopter is compiled for each of both, which takes as long as many a fit.
+    What missing outputs would tell and what to fly next is compared for output error of linear
+    models alone: others are compiled for each of both, which takes as long as many a fit.
 
     Args:
         problem: model, vehicle, flights and what is free.
     """
     guess = _first_guess(problem)
     at, feedback = Solution(*guess[:4]), feedback_of(problem)
-    return is_it_enough(problem, at, guess.e, feedback, compare=problem.model.linear)
+    quick = problem.model.linear and at.layout.estimator.rows_are_samples
+    return is_it_enough(problem, at, guess.e, feedback, compare=quick)
 
 
 def windows(problem: Problem, length: float | None = None) -> Ranking:

@@ -180,7 +180,7 @@ def _window(problem: Problem, span: _Span, sd: np.ndarray, excluded: str) -> Win
     flight = problem.training[span.flight]
     label = labels(problem.training)[span.flight]
     start, end = span.first * flight.dt, (span.last - 1) * flight.dt
-    return Window(*span[:1], label, *span[1:], start, end, sd, excluded)
+    return Window(span.flight, label, span.first, span.last, start, end, sd, excluded)
 
 
 def _simulated(
