@@ -220,12 +220,14 @@ def _sensitivity(
     """The rows of all candidates, each a flight of m samples that begins as the i-th one does."""
     flight, numbers = problem.training[i], at.data.flights[i]
     linear, dtype = problem.model.linear, at.z.dtype
-    # Held between samples: steps are, and of a chirp it makes no difference to the comparison.
+    # Held between samples: steps are, and of a chirp it makes no difference to the comparison. About
+    # neutral, or about the sticks that the record begins with: a machine of a linear model is at
+    # rest with neutral sticks, and would answer to any others as to a step.
     parts, flights = [], []
     for candidate in candidates:
         inputs = {}
         for n, u in flight.inputs.items():
-            rest = np.full(m, float(np.mean(u)) if linear else float(u[0]))
+            rest = np.full(m, 0.0 if linear else float(u[0]))
             inputs[n] = rest + candidate.values if n == candidate.input else rest
         outputs = {n: np.zeros(m) for n in flight.outputs}
         flights.append(replace(flight, inputs=inputs, outputs=outputs, hold={}, hold_reason={}))

@@ -205,7 +205,8 @@ def _simulated(
     z = start_vector(layout, data, problem)
     z = jnp.concatenate([at.z[: at.layout.first_nuisance], z[layout.first_nuisance :]])
     e = evaluate(layout, data, noise, z)
-    if problem.model.linear:
+    # What diverges is left out window by window.
+    if problem.model.linear and np.isfinite(e.J).all():
         z = _best_states(layout, e, z)
         e = evaluate(layout, data, noise, z)
     s = sensitivity_at(problem, layout, e)
@@ -249,12 +250,13 @@ def _rows_of_spans(
     """Windows of whole cells, and the rows of each."""
     flight, k = _places(layout, data)
     # Half a window on where windows hold several cells; of one cell the second cut is.
-    step, spans = max(samples // cell // 2, 1) * cell, []
+    step, spans = max(samples // cell // 2, 1) * cell, {}
     for c, (i, first, last) in enumerate(cuts):
         for begin in range(0, last - first - samples + 1, step):
             rows = np.flatnonzero((flight == c) & (k >= begin) & (k < begin + samples))
-            spans.append((_Span(i, first + begin, first + begin + samples), rows))
-    return spans
+            # Two cuts may hold the same window.
+            spans.setdefault(_Span(i, first + begin, first + begin + samples), rows)
+    return list(spans.items())
 
 
 def _places(layout: Layout, data: Data) -> tuple[np.ndarray, np.ndarray]:
