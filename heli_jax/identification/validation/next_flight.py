@@ -220,9 +220,9 @@ def _sensitivity(
     """The rows of all candidates, each a flight of m samples that begins as the i-th one does."""
     flight, numbers = problem.training[i], at.data.flights[i]
     linear, dtype = problem.model.linear, at.z.dtype
-    # Held between samples: steps are, and of a chirp it makes no difference to the comparison. About
-    # neutral, or about the sticks that the record begins with: a machine of a linear model is at
-    # rest with neutral sticks, and would answer to any others as to a step.
+    # Held between samples: steps are, and of a chirp it makes no difference to the comparison. A
+    # linear model is at rest with neutral sticks alone, and would answer to others as to a step;
+    # another begins with the sticks that the record begins with.
     parts, flights = [], []
     for candidate in candidates:
         inputs = {}
