@@ -53,17 +53,14 @@ def logging_rate(
         flights: by what each is called.
         sd: by flight and output the noise that is assumed, SI.
     """
-    findings, fastest = [], None
+    findings: list[Finding] = []
+    every: list[Finding] = []
     for (label, flight), noise in zip(flights, sd, strict=True):
         modes = _modes_that_show(problem, flight, noise)
         found = [*_of_inputs(label, flight, modes), *_of_outputs(label, flight, modes)]
         findings += [f for f in found if f.severity != "ok"]
-        fastest = min(
-            [*([] if fastest is None else [fastest]), *found], key=_value, default=fastest
-        )
-    if findings or fastest is None:
-        return findings
-    return [fastest]
+        every += found
+    return findings if findings or not every else [min(every, key=_value)]
 
 
 def _value(finding: Finding) -> float:
