@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import interrupts, reading_progress, run_directory
+from heli_jax import cli_options, interrupts, reading_progress, run_directory
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,12 +81,15 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
     _add_config(check)
+    windows = command("windows", _windows, "which parts of a log say most, before any fit")
+    cli_options.add_windows_options(windows)
+    _add_config(windows)
     simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
     _add_config(simulate)
-    _add_simulate_options(simulate)
+    cli_options.add_simulate_options(simulate)
     sweep = command("sweep", _sweep, "run a design of many vehicles; results in a Zarr store")
     _add_config(sweep)
-    _add_sweep_options(sweep)
+    cli_options.add_sweep_options(sweep)
     info = command("info", _info, "signals, rates, duration and gaps of a log")
     _add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
@@ -108,46 +111,13 @@ def _add_config(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_simulate_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--out",
-        metavar="FILE",
-        help=".csv or .parquet (default: CSV on stdout); missing folders on its way are made",
-    )
-    command.add_argument(
-        "--view",
-        nargs="?",
-        const="",
-        metavar="HTML",
-        help="also a page with figures and the flight in 3D (default: beside --out)",
-    )
-
-
-def _add_sweep_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
-    command.add_argument(
-        "--resume", action="store_true", help="go on where the sweep in --out was ended"
-    )
-    command.add_argument(
-        "--devices", type=_count, metavar="N", help="processor cores or GPUs to use (default: all)"
-    )
-    command.add_argument("--no-figures", action="store_true", help="draw none: it takes seconds")
-    where = command.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers", type=_count, metavar="N", help="compute in N processes of a local dask cluster"
-    )
-    where.add_argument(
-        "--scheduler",
-        metavar="tcp://HOST:8786",
-        help="compute on the workers of this dask scheduler",
-    )
-
-
 def _add_info_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
     command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
     command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
-    command.add_argument("--flight", type=_count, metavar="N", help="this flight alone (from 1)")
+    command.add_argument(
+        "--flight", type=cli_options.count, metavar="N", help="this one alone (from 1)"
+    )
     command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
     command.add_argument("--json", action="store_true", help="everything, for other programs")
 
@@ -166,15 +136,11 @@ def _add_convert_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="[s] from the log's beginning"
     )
-    command.add_argument("--flight", type=_count, metavar="N", help="of a log of several (from 1)")
+    command.add_argument(
+        "--flight", type=cli_options.count, metavar="N", help="of a log of several (from 1)"
+    )
     command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
     command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
-
-
-def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
-    return int(text)
 
 
 def _say(text: str) -> None:
@@ -234,7 +200,18 @@ def _check(options: argparse.Namespace) -> int:
 
     check = workflow.run_check(workflow.load_config(options.config, options.set), progress=_say)
     output.print_check(check)
-    return DONE if check.verdict.identifiable else NOT_DETERMINED
+    hopeless = any(f.severity == "refuse" for f in check.findings)
+    return DONE if check.verdict.identifiable and not hopeless else NOT_DETERMINED
+
+
+def _windows(options: argparse.Namespace) -> int:
+    _prepare_jax()
+    from heli_jax import log_windows, workflow
+
+    experiment = workflow.load_config(options.config, options.set)
+    ranking = log_windows.rank_log(experiment, options.log, options.length, progress=_say)
+    log_windows.print_ranking(ranking)
+    return DONE
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report import files
@@ -45,14 +46,14 @@ def print_fit(run: FitRun) -> None:
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
     rows = [_row(name, e) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
-    _table((*head[:3], fit.interval, *head[4:]), rows)
+    print_table((*head[:3], fit.interval, *head[4:]), rows)
     if note := report_tables.prior_note(problem, fit):
         print(f"! {note}")
     for c in fit.verdict.combinations:
         print(_determined(c))
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
-        _table(table.head, table.rows)
+        print_table(table.head, table.rows)
         for sentence in supplementary.intervals.sentences:
             print(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
@@ -76,7 +77,7 @@ def print_fit(run: FitRun) -> None:
     print(f"acceptance card: {summary(card(problem, fit))}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
-        _table(compared.head, compared.rows)
+        print_table(compared.head, compared.rows)
         for sentence in supplementary.choice.sentences:
             print(sentence)
     if run.baseline is not None:
@@ -89,7 +90,7 @@ def _print_first_guess(guess: EquationErrorStart) -> None:
     print("Where the fit began, by equation error (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
         if table.rows:
-            _table(table.head, table.rows)
+            print_table(table.head, table.rows)
 
 
 def _determined(c: Combination) -> str:
@@ -138,7 +139,8 @@ def _row(name: str, e: Estimate) -> tuple[str, ...]:
     return (name, value + at_bound, sd, _range(e), e.unit, f"{e.prior_share:.2f}")
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    """A table on standard output, its columns as wide as they need."""
     # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -172,12 +174,25 @@ def print_check(check: Check) -> None:
         lacking = name in verdict.undetermined or name in verdict.without_effect
         expected = "not determined" if lacking else f"{100 * relative:.2g} %"
         rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
-    _table(("parameter", "expected sd", "prior share"), rows)
+    print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = " (guessed: too small where the log was smoothed; state the output's sd)"
         print(f"noise of {name}: {sd:.3g}{guess if name in check.guessed else ''}")
-    for note in check.notes:
+    for note in check.further_notes:
         print(f"! {note}")
+    _print_findings(check.findings)
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    """Whether the log is enough, a line each, what is worst first."""
+    if not findings:
+        return
+    print("\nIs this log enough?")
+    for f in findings:
+        print(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
+
+
+_MARKS = {"ok": " ", "doubt": "!", "refuse": "x"}
 
 
 def _print_verdict(verdict: Verdict) -> None:
@@ -290,7 +305,7 @@ def print_sweep(out: Path) -> None:
     # The last column only where the sweep compared single with double precision.
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
     width = len(head) if "float32_error" in totals else len(head) - 1
-    _table(head[:width], [row[:width] for row in rows])
+    print_table(head[:width], [row[:width] for row in rows])
     for name, worst_ones in totals["worst"].items():
         element = worst_ones[0]
         at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())

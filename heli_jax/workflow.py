@@ -16,7 +16,7 @@ from heli_jax import run_directory
 from heli_jax.config import Experiment
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import check, fit
+from heli_jax.identification.fit import check, findings, fit
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
@@ -125,6 +125,8 @@ def run_fit(
         progress(note)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
+    # Part of the report, which a script that asks for none need not wait for.
+    enough = findings(problem) if out is not None else ()
     try:
         fitted = fit(
             problem,
@@ -140,7 +142,7 @@ def run_fit(
         problem,
         fitted,
         _baseline(config, problem, fitted, progress),
-        _supplementary(config, problem, fitted, progress),
+        _supplementary(config, problem, fitted, progress)._replace(findings=enough),
         began=began,
     )
     if out is None:

@@ -9,6 +9,10 @@ from jaxtyping import Complex, Float
 # takes a second of every report, and the partial coherence needs the segments, not their averages.
 
 
+_ROUNDING = 1e-20
+"""of a signal's power: less is what rounding leaves where others explain all of it"""
+
+
 class Spectra(NamedTuple):
     """One-sided spectral densities of two signals, each (k,)."""
 
@@ -73,3 +77,39 @@ def _detrended(segments: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n
     t = np.linspace(-1.0, 1.0, segments.shape[-1])
     slopes = (segments @ t / (t @ t))[..., None]
     return segments - segments.mean(axis=-1, keepdims=True) - slopes * t
+
+
+def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
+
+    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
+
+    Args:
+        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
+        u: (k, segments)
+        y: (k, segments)
+
+    Source: Bendat and Piersol, Random Data (2010), chapter 7.
+    """
+    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
+    # the pilot moves two sticks together.
+    left_u, left_y = without(others, u), without(others, y)
+    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
+    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
+    enough = uu > _ROUNDING * np.sum(np.abs(u) ** 2, axis=1)
+    enough &= yy > _ROUNDING * np.sum(np.abs(y) ** 2, axis=1)
+    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
+
+
+def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """x (k, segments) less its projection on the others (k, segments, inputs).
+
+    Args:
+        others: Fourier transforms of segments at k frequencies.
+        x: the same of one signal.
+    """
+    if not others.shape[2]:
+        return x
+    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
+    gains = np.linalg.pinv(others) @ x[:, :, None]
+    return x - (others @ gains)[:, :, 0]

@@ -64,6 +64,10 @@ def _read_flight(
                 f"{where}.known: model {model.name} has no parameter {name!r}"
                 f"{nearest(name, naming.names(model.Params))}"
             )
+    if f.window == "auto" and f.hold_out:
+        raise InputError(
+            f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
+        )
     time = f.signals.time
     path = experiment.path.parent / f.log
     # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
@@ -84,7 +88,7 @@ def _read_flight(
             inputs={n: inputs[n] for n in named.inputs},
             outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
-            window=f.window,
+            window=None if f.window == "auto" else f.window,
             known=f.known,
             hold_out=f.hold_out,
             name=f.name or f"flight {i + 1}",
@@ -97,7 +101,13 @@ def _read_flight(
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
     notes = (*_unstated_units(model, everything), *named.notes)
-    first, *others = (with_notches(flight, f.notch or (), f"{where}.notch") for flight in flights)
+    flights = tuple(
+        dataclasses.replace(
+            with_notches(flight, f.notch or (), f"{where}.notch"), choose_windows=f.window == "auto"
+        )
+        for flight in flights
+    )
+    first, *others = flights
     cautions = filter_cautions(first.source, everything.outputs)
     cautions = (*cautions, *vibration_notes(experiment, first, f, where))
     return (_with_notes(first, notes, cautions), *others)

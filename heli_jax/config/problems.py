@@ -1,5 +1,6 @@
 """The problem that a configuration describes."""
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,7 +52,7 @@ def problem(experiment: Experiment) -> Problem:
         model, params = disturbed(experiment)
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     try:
-        return Problem(
+        whole = Problem(
             model,
             params,
             flights,
@@ -66,10 +67,32 @@ def problem(experiment: Experiment) -> Problem:
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
         )
+        return with_chosen_windows(whole)
     except ValueError as e:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
         place = path if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+
+
+def with_chosen_windows(problem: Problem) -> Problem:
+    """The problem with each flight of `window: auto` in its most telling windows.
+
+    Raises:
+        ValueError: no window of such a flight may be used.
+    """
+    chosen = tuple(f for f in problem.flights if f.choose_windows)
+    if not chosen:
+        return problem
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.fit import windows
+    from heli_jax.identification.validation.record_windows import window_flights
+
+    # By what these flights say alone: the others are fitted whatever they say.
+    asked = dataclasses.replace(problem, flights=chosen)
+    parts = window_flights(asked, windows(asked))
+    by_flight = {id(f): parts.get(i, ()) for i, f in enumerate(chosen)}
+    flights = [part for f in problem.flights for part in by_flight.get(id(f), (f,))]
+    return dataclasses.replace(problem, flights=tuple(flights))
 
 
 def _nuisance(config: FitConfig) -> Nuisance:

@@ -113,6 +113,17 @@ class AlsoConfig(_Strict):
     flight: Annotated[int, Field(ge=1)] | None = None
 
 
+def _window_choice(value: Any) -> Any:
+    # By hand: of a union pydantic would report every member.
+    if value is None or value == "auto":
+        return value
+    if isinstance(value, list | tuple) and len(value) == 2:
+        numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
+        if len(numbers) == 2 and all(math.isfinite(v) for v in numbers):
+            return value
+    raise ValueError(f"expected two finite numbers of seconds or auto, got {value!r:.60}")
+
+
 class FlightConfig(_Strict):
     log: str
     signals: SignalsConfig
@@ -121,7 +132,10 @@ class FlightConfig(_Strict):
     name: str | None = None
     rate: Positive | None = None
     # Increasing is checked where logs are read, for configurations and scripts alike.
-    window: tuple[Finite, Finite] | None = None
+    window: Annotated[
+        tuple[Finite, Finite] | Literal["auto"] | None, BeforeValidator(_window_choice)
+    ] = None
+    """[s] from the log's beginning; auto: the windows that say most of what is free"""
     gaps: Literal["fail", "split"] = "fail"
     """what to do about gaps too long to be bridged: refuse them, or make flights of the parts"""
     also: list[AlsoConfig] = []

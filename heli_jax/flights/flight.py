@@ -109,6 +109,7 @@ class Flight:
         hold: by input, what it does between samples: "zero-order" (it stays until the next
             sample), as all do that are not named, or "linear".
         hold_reason: by input, why the reader of a log took that hold, where the log decided.
+        choose_windows: whether its most telling windows are to be fitted in its place.
 
     Raises:
         ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
@@ -127,6 +128,7 @@ class Flight:
     source: Source | None = None
     hold: dict[str, str] = field(default_factory=dict)
     hold_reason: dict[str, str] = field(default_factory=dict)
+    choose_windows: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dt) and self.dt > 0):

@@ -36,10 +36,24 @@ from heli_jax.identification.unknowns.layout import (
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
+from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.other_hold import other_hold
+from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 
-__all__ = ["Check", "Estimate", "Fit", "Signals", "StartRow", "Status", "check", "fit"]
+__all__ = [
+    "Check",
+    "Estimate",
+    "Fit",
+    "Signals",
+    "StartRow",
+    "Status",
+    "check",
+    "findings",
+    "fit",
+    "windows",
+]
 
 _FIRST_STEPS = 40
 """of filter error, until it is known that there is a disturbance to find"""
@@ -83,7 +97,8 @@ def check(problem: Problem) -> Check:
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
     notes = [*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd)]
-    notes += feedback_notes(problem, feedback_of(problem))
+    feedback = feedback_of(problem)
+    notes += feedback_notes(problem, feedback)
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += tuple(of_disturbances(guess.layout, guess.e))
@@ -95,7 +110,38 @@ def check(problem: Problem) -> Check:
         if name not in flight.sd
     )
     sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
-    return Check(verdict, sds, tuple(notes), guessed)
+    findings = is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback)
+    return Check(verdict, sds, tuple(notes), guessed, findings)
+
+
+def findings(problem: Problem) -> tuple[Finding, ...]:
+    """Whether the flights are enough for what is asked, at the start values: as `check` says it.
+
+    What missing outputs would tell and what to fly next is compared for output error of linear
+    models alone: others are compiled for each of both, which takes as long as many a fit.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+    """
+    guess = _first_guess(problem)
+    at, feedback = Solution(*guess[:4]), feedback_of(problem)
+    quick = problem.model.linear and at.layout.estimator.rows_are_samples
+    return is_it_enough(problem, at, guess.e, feedback, compare=quick)
+
+
+def windows(problem: Problem, length: float | None = None) -> Ranking:
+    """What each window of the flights says of the free parameters, at the start values.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+        length: of a window [s]; unless given a twelfth of the longest flight, between 2 and 20 s.
+
+    Raises:
+        ValueError: the length fits no flight, no window may be used, or the simulation is not
+            finite at the start values.
+    """
+    guess = _first_guess(problem)
+    return rank_windows(problem, Solution(*guess[:4]), guess.e, length)
 
 
 def _starts(

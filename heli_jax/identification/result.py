@@ -12,7 +12,9 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
+from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:
@@ -79,6 +81,15 @@ class Check:
     notes: tuple[str, ...]
     guessed: tuple[str, ...] = ()
     """flights and outputs whose noise nobody stated"""
+    findings: tuple[Finding, ...] = ()
+    """whether the log is enough: bands, rates, outputs, feedback, what to fly next; worst first"""
+
+    @property
+    def further_notes(self) -> tuple[str, ...]:
+        """The notes without those that a finding says too."""
+        said = {f.sentence for f in self.findings}
+        slow = any(f.topic == "logging rate" and f.severity != "ok" for f in self.findings)
+        return tuple(n for n in self.notes if n not in said and not (slow and ALIASED in n))
 
 
 # Compared by identity (eq=False): a field-wise == of records of arrays has no single truth value.

@@ -11,7 +11,7 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
-from heli_jax.analysis.spectra import segment_transforms
+from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
@@ -25,8 +25,6 @@ SIZEABLE = 0.1
 """part of an output's power that the model puts down to an input, from which on it is asked for"""
 _MORE = 2
 """half-overlapping segments more for every further input: each takes a degree of freedom"""
-_ROUNDING = 1e-20
-"""of a signal's power: less is what rounding leaves where others explain all of it"""
 
 
 # Parameters of a model are a class of the user's own: they are annotated Any.
@@ -132,7 +130,7 @@ def _spectra(
 def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
     """Of input j, whose expected response is H (k,)."""
     others = np.delete(record.inputs, j, axis=2)
-    alone = _without(others, record.inputs[:, :, j])
+    alone = without(others, record.inputs[:, :, j])
     power = np.sum(np.abs(alone) ** 2, axis=1)
     # The power that the output owes to this input: where the model expects no response, noise may
     # have its way, and a plain mean over frequencies would be that of the noise.
@@ -153,37 +151,6 @@ def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
 def _mean(coherence: np.ndarray, weights: np.ndarray) -> float:
     seen = np.isfinite(coherence) & (weights > 0)
     return float(np.average(coherence[seen], weights=weights[seen])) if seen.any() else 0.0
-
-
-def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coherence (k,) of u and y where what the other inputs explain of both is taken out.
-
-    NaN where nothing is left of either. All are Fourier transforms of segments at k frequencies.
-
-    Args:
-        others: (k, segments, inputs); with no inputs the result is the ordinary coherence.
-        u: (k, segments)
-        y: (k, segments)
-
-    Source: Bendat and Piersol, Random Data (2010), chapter 7.
-    """
-    # A coherence with the other inputs left in would count theirs as noise, and as u's own where
-    # the pilot moves two sticks together.
-    left_u, left_y = _without(others, u), _without(others, y)
-    uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
-    uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
-    enough = uu > _ROUNDING * np.sum(np.abs(u) ** 2, axis=1)
-    enough &= yy > _ROUNDING * np.sum(np.abs(y) ** 2, axis=1)
-    return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
-
-
-def _without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """x (k, segments) less its projection on the others (k, segments, inputs)."""
-    if not others.shape[2]:
-        return x
-    # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
-    gains = np.linalg.pinv(others) @ x[:, :, None]
-    return x - (others @ gains)[:, :, 0]
 
 
 def _sampled(

@@ -19,15 +19,18 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.identification.validation.feedback import LEVEL
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.report.card import card
 from heli_jax.versions import versions
 
 
 class SupplementaryAnalyses(NamedTuple):
-    """What was asked for beside the fit: model selection, and intervals by other methods."""
+    """What belongs to a fit: model selection, intervals by other methods, what the log is worth."""
 
     choice: Choice | None = None
     intervals: Intervals | None = None
+    findings: tuple[Finding, ...] = ()
+    """whether the log is enough, as it was before the fit"""
 
 
 def fit_json(
@@ -68,6 +71,7 @@ def fit_json(
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
             "intervals": _intervals(supplementary.intervals),
+            "record": [f._asdict() for f in supplementary.findings],
             "log_likelihood": fit.log_likelihood,
             "unknowns": fit.unknowns,
             "aic": fit.aic,

@@ -99,7 +99,7 @@ def references_of(problem: Problem, unknowns: tuple[Unknown, ...]) -> np.ndarray
     return np.array(references)
 
 
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """The Jacobian without the priors of the parameters, taken apart."""
 
     sensitivity: np.ndarray
@@ -110,7 +110,7 @@ class _Rows(NamedTuple):
     """(w, k) the weak priors' rows, which only nuisances have"""
 
 
-def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> _Rows:
+def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndarray) -> Rows:
     # In double precision from here on, whatever the fit ran in: null directions are told by 1e-8.
     J = np.asarray(e.J, dtype=np.float64)
     q, p = len(layout.of_interest), len(layout.free)
@@ -122,7 +122,21 @@ def _split(layout: Layout, e: Evaluation, references: np.ndarray, signs: np.ndar
     factor = np.divide(references, slopes, out=np.zeros_like(slopes), where=slopes != 0)
     # A parameter of negative sign falls as its logarithm rises; the size is what counts.
     sensitivity = data[:, :q] * np.abs(factor) * np.sign(slopes) * signs
-    return _Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
+    return Rows(sensitivity, data[:, q:], J[J.shape[0] - count :, q:])
+
+
+def relative_rows(
+    problem: Problem, layout: Layout, e: Evaluation
+) -> tuple[tuple[Unknown, ...], Rows]:
+    """The parameters of interest, and the Jacobian's rows of the data in relative coordinates.
+
+    Args:
+        problem: bounds, priors and starts.
+        layout: what stands where in the Jacobian's columns.
+        e: the whitened residuals' Jacobian and the values there.
+    """
+    unknowns = unknowns_of(problem, layout, e)
+    return unknowns, _split(layout, e, references_of(problem, unknowns), _signs(unknowns))
 
 
 _NO_EFFECT = 1e-6
@@ -130,7 +144,7 @@ _NO_EFFECT = 1e-6
 disturbance that is not there, has no direction to be projected out."""
 
 
-def _with_weak_priors(rows: _Rows, S: np.ndarray, N: np.ndarray) -> np.ndarray:
+def _with_weak_priors(rows: Rows, S: np.ndarray, N: np.ndarray) -> np.ndarray:
     """What the data (S by the unknowns, N by the nuisances) say of the unknowns (any, q) where the
     nuisances are free but for their weak priors."""
     sensitivity = np.vstack([S, np.zeros((rows.weak.shape[0], S.shape[1]))])
@@ -208,9 +222,7 @@ def verdict_of(
             "the simulation is not finite at the given values: the model is unstable there over "
             "the length of this record; start elsewhere or use a shorter window"
         )
-    unknowns = unknowns_of(problem, layout, e)
-    references, signs = references_of(problem, unknowns), _signs(unknowns)
-    rows = _split(layout, e, references, signs)
+    unknowns, rows = relative_rows(problem, layout, e)
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     q = len(unknowns)
@@ -220,6 +232,7 @@ def verdict_of(
     sensitivity = _with_weak_priors(rows, S, N)
     without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, null_below)
     if reported is not None:
-        to_relative = np.asarray(e.slopes, np.float64) / references * signs
+        references = references_of(problem, unknowns)
+        to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
     return analyse(sensitivity, unknowns, _remedies(problem), null_below, without, reported)

@@ -13,6 +13,8 @@ from heli_jax.identification.validation.operating_point import modes_of_flight
 
 _AT_NYQUIST = 0.9
 """part of the Nyquist frequency from which on a mode is hardly shown by the samples"""
+ALIASED = "the Nyquist frequency of the sampling"
+"""what every sentence of `sampling` names"""
 _FEEBLE = 3.0
 """rms of a response over the noise below which an input hardly excites the model"""
 
@@ -85,7 +87,7 @@ def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
             sentences.append(
                 f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s"
                 f"{f' (linearised about {about})' if about else ''} lies "
-                f"{'at or past' if past else 'near'} the Nyquist frequency of the sampling "
+                f"{'at or past' if past else 'near'} {ALIASED} "
                 f"({nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, and "
                 "its aliases may be taken for slower dynamics."
             )

@@ -1,0 +1,72 @@
+"""Options of the commands that have many, and what reads their values."""
+
+import argparse
+import math
+
+
+def add_simulate_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax simulate`."""
+    command.add_argument(
+        "--out",
+        metavar="FILE",
+        help=".csv or .parquet (default: CSV on stdout); missing folders on its way are made",
+    )
+    command.add_argument(
+        "--view",
+        nargs="?",
+        const="",
+        metavar="HTML",
+        help="also a page with figures and the flight in 3D (default: beside --out)",
+    )
+
+
+def add_sweep_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax sweep`."""
+    command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+    command.add_argument(
+        "--resume", action="store_true", help="go on where the sweep in --out was ended"
+    )
+    command.add_argument(
+        "--devices", type=count, metavar="N", help="processor cores or GPUs to use (default: all)"
+    )
+    command.add_argument("--no-figures", action="store_true", help="draw none: it takes seconds")
+    where = command.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=count, metavar="N", help="compute in N processes of a local dask cluster"
+    )
+    where.add_argument(
+        "--scheduler",
+        metavar="tcp://HOST:8786",
+        help="compute on the workers of this dask scheduler",
+    )
+
+
+def count(text: str) -> int:
+    """An option's value that is a number from 1."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+    return int(text)
+
+
+def add_windows_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax windows`."""
+    command.add_argument(
+        "log", nargs="?", metavar="LOG", help="read as the configuration's first (default: its own)"
+    )
+    command.add_argument(
+        "--length",
+        type=seconds,
+        metavar="S",
+        help="of a window [s] (default: a twelfth)",
+    )
+
+
+def seconds(text: str) -> float:
+    """An option's value that is a time."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"expected a number of seconds above 0, got {text!r}")
+    return value

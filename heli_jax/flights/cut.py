@@ -1,0 +1,36 @@
+"""A part of a flight as a flight of its own."""
+
+import dataclasses
+
+from heli_jax.flights.flight import Flight
+
+
+def part(flight: Flight, first: int, last: int, name: str = "", note: str = "") -> Flight:
+    """The samples from `first` up to but not including `last`.
+
+    Args:
+        flight: the whole.
+        first: number of the first sample.
+        last: number after that of the last.
+        name: of the part; that of the whole unless given.
+        note: what its source says of it, beside what the reader noted.
+
+    Raises:
+        ValueError: there are no such samples.
+    """
+    if not 0 <= first < last <= flight.n_samples:
+        raise ValueError(
+            f"expected a part of samples 0 to {flight.n_samples}, got {first} to {last}"
+        )
+    source = flight.source
+    if source is not None and note:
+        source = dataclasses.replace(source, notes=(*source.notes, note))
+    return dataclasses.replace(
+        flight,
+        inputs={n: u[first:last] for n, u in flight.inputs.items()},
+        outputs={n: y[first:last] for n, y in flight.outputs.items()},
+        t0=flight.t0 + first * flight.dt,
+        name=name or flight.name,
+        source=source,
+        choose_windows=False,
+    )

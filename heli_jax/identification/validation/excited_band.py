@@ -1,0 +1,238 @@
+"""Which band each input excites, and which inputs move together there."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from heli_jax.analysis.spectra import partial_coherence, segment_transforms
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.validation.finding import Finding
+
+COHERENT = 0.6
+"""coherence from which on a response is taken for the input's: Tischler and Remple, Aircraft and
+Rotorcraft System Identification (2012)"""
+TOGETHER = 0.8
+"""coherence of two inputs, the others taken out, from which on they move together: the variance of
+what each does is 1 / (1 - 0.8) = 5 times as large as if the other were still"""
+_SEGMENTS = 8
+"""half-overlapping segments make an average, two more for every further input"""
+_SHORTEST, _LONGEST = 64, 4096
+"""samples of a segment"""
+_MANY, _LONG = 24, 400
+"""segments that are better, where each still has so many samples"""
+_CHANCE = 0.01
+"""probability that any frequency of signals without coherence shows more"""
+_POWER = (0.05, 0.95)
+"""the band of an input holds its power between these parts"""
+_LEAST_POWER = 1e-3
+"""of an input's largest power at one frequency: below that it does not excite"""
+
+
+class _Pooled(NamedTuple):
+    """Fourier transforms of the segments of all flights, or why there are none."""
+
+    hz: Float[np.ndarray, " k"]
+    inputs: Complex[np.ndarray, "k segments m"]
+    outputs: Complex[np.ndarray, "k segments p"]
+
+
+def bands(flights: Sequence[Flight]) -> list[Finding]:
+    """Which band each input excites, and which inputs move together.
+
+    Flights of one sample time are looked at together: what one of them tells apart is told apart.
+
+    Args:
+        flights: those that are fitted.
+    """
+    dt = flights[0].dt
+    alike = [f for f in flights if abs(f.dt / dt - 1.0) < 1e-9]
+    moving = [n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in alike)]
+    if not moving:
+        words = "no input moves: nothing is excited."
+        return [Finding("excited band", "refuse", words, 0.0, "inputs that move, 1")]
+    outputs = [
+        n
+        for n in alike[0].outputs
+        if all(n in f.outputs and np.isfinite(f.outputs[n]).all() for f in alike)
+    ]
+    pooled = _pooled(alike, moving, outputs)
+    if pooled is None:
+        return [*_short_bands(alike, moving), *_short_together(alike, moving)]
+    return [*_coherent_bands(pooled, moving, outputs), *_moving_together(pooled, moving)]
+
+
+def _pooled(flights: list[Flight], moving: list[str], outputs: list[str]) -> _Pooled | None:
+    """None where the records are too short for an average."""
+    more, sizes = 2 * (len(moving) - 1), [f.n_samples for f in flights]
+    # Many segments where they can be long still, since few show little of a disturbed machine; else
+    # as few as make an average.
+    length = _length(sizes, _MANY + more, _LONG) or _length(sizes, _SEGMENTS + more, _SHORTEST)
+    if length == 0:
+        return None
+    parts = []
+    for f in (f for f in flights if f.n_samples >= length):
+        channels = [f.inputs[n] for n in moving] + [f.outputs[n] for n in outputs]
+        omega, transforms = segment_transforms(np.stack(channels), f.dt, length)
+        parts.append(transforms)
+    both = np.concatenate(parts, axis=1)
+    # Without zero frequency, which the straight lines took, and Nyquist's.
+    inner = slice(1, -1)
+    hz, m = omega[inner] / (2.0 * np.pi), len(moving)
+    return _Pooled(hz, both[inner, :, :m], both[inner, :, m:])
+
+
+def _length(sizes: list[int], segments: int, least: int) -> int:
+    """The samples of the longest segments of which there are enough; 0 where they are too short."""
+    length = min(max(sizes), _LONGEST) // 2 * 2
+    while length >= least and sum(_count(n, length) for n in sizes) < segments:
+        length = length * 7 // 8 // 2 * 2
+    return length if length >= least else 0
+
+
+def _count(samples: int, length: int) -> int:
+    return 0 if samples < length else 1 + (samples - length) // (length - length // 2)
+
+
+def _chance(pooled: _Pooled, level: float) -> float:
+    """The coherence that counts: `level`, or more where few segments show that much by chance."""
+    k, segments, m = pooled.inputs.shape
+    # Of n independent segments a coherence of nothing exceeds c with probability (1 - c)^(n - 1);
+    # half-overlapping Hann windows are worth about 0.9 n, and each other input takes one.
+    free = max(0.9 * segments - m, 1.0)
+    return max(level, 1.0 - (_CHANCE / k) ** (1.0 / free))
+
+
+def _coherent_bands(pooled: _Pooled, moving: list[str], outputs: list[str]) -> list[Finding]:
+    limit, findings, seen = _chance(pooled, COHERENT), [], False
+    criterion = f"partial coherence with an output, {limit:.2f}"
+    for j, name in enumerate(moving):
+        others = np.delete(pooled.inputs, j, axis=2)
+        u = pooled.inputs[:, :, j]
+        power = np.sum(np.abs(u) ** 2, axis=1)
+        low, high = _power_band(pooled.hz, power)
+        begun = f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; "
+        best: tuple[float, str, float, float] | None = None
+        for i, output in enumerate(outputs):
+            c = np.nan_to_num(partial_coherence(others, u, pooled.outputs[:, :, i]))
+            good = (c >= limit) & (power >= _LEAST_POWER * power.max())
+            run = _longest(pooled.hz, good)
+            if run is not None and (best is None or run[1] / run[0] > best[3] / best[2]):
+                best = (float(np.max(c[good])), output, *run)
+        if best is None:
+            words = f"{begun}no output follows it alone with a coherence of {limit:.2f}."
+            findings.append(Finding("excited band", "ok", words, None, criterion))
+            continue
+        seen = True
+        peak, output, first, last = best
+        words = f"{begun}{output} follows it from {first:.2g} to {last:.2g} Hz."
+        findings.append(Finding("excited band", "ok", words, peak, criterion))
+    if not seen and outputs:
+        words = (
+            "no output follows any input coherently at any frequency: noise, disturbances or "
+            "something else moves the machine more than the sticks do."
+        )
+        findings.append(Finding("excited band", "doubt", words, None, criterion))
+    return findings
+
+
+def _power_band(hz: np.ndarray, power: np.ndarray) -> tuple[float, float]:
+    sums = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
+    first, last = (int(np.searchsorted(sums, p)) for p in _POWER)
+    return float(hz[min(first, hz.size - 1)]), float(hz[min(last, hz.size - 1)])
+
+
+def _longest(hz: np.ndarray, good: Bool[np.ndarray, " k"]) -> tuple[float, float] | None:
+    """The widest band (in octaves) without a hole; None where nothing is good."""
+    edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    if not begins.size:
+        return None
+    widest = int(np.argmax(hz[ends] / hz[begins]))
+    return float(hz[begins[widest]]), float(hz[ends[widest]])
+
+
+def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
+    limit, pairs = _chance(pooled, TOGETHER), []
+    for a, b in itertools.combinations(range(len(moving)), 2):
+        others = np.delete(pooled.inputs, [a, b], axis=2)
+        u, v = pooled.inputs[:, :, a], pooled.inputs[:, :, b]
+        c = partial_coherence(others, u, v)
+        # Where the others explain all of one, what is left is rounding: the pair by itself.
+        c = np.where(np.isnan(c), np.nan_to_num(partial_coherence(others[:, :, :0], u, v)), c)
+        powers = [np.sum(np.abs(x) ** 2, axis=1) for x in (u, v)]
+        # Where both have power: that is where each could be taken for the other.
+        weights = np.min([p / p.sum() for p in powers], axis=0)
+        mean = float(np.average(c, weights=weights))
+        excited = weights >= _LEAST_POWER * weights.max()
+        band = _longest(pooled.hz, (c >= limit) & excited)
+        pairs.append((mean, moving[a], moving[b], band))
+    return _pair_findings(pairs, limit)
+
+
+def _pair_findings(
+    pairs: list[tuple[float, str, str, tuple[float, float] | None]], limit: float
+) -> list[Finding]:
+    criterion = f"coherence of two inputs, {limit:.2f}"
+    if not pairs:
+        return []
+    pairs.sort(key=lambda p: -p[0])
+    findings = []
+    for mean, a, b, band in pairs:
+        if mean < limit:
+            continue
+        where = "" if band is None else f" from {band[0]:.2g} to {band[1]:.2g} Hz"
+        wider = (
+            f"intervals of what each does are {(1.0 - mean) ** -0.5:.2g} times as wide as if they "
+            "moved apart"
+            if mean < 1.0 - 1e-6
+            else "nothing in the record tells what each does"
+        )
+        words = (
+            f"{a} and {b} move together{where} (coherence {mean:.2f}, other inputs taken out): "
+            f"their effects cannot be told apart there, and {wider}; move one at a time."
+        )
+        findings.append(Finding("inputs together", "doubt", words, mean, criterion))
+    if findings:
+        return findings
+    mean, a, b, _ = pairs[0]
+    words = f"no two inputs move together (most {a} and {b}: coherence {mean:.2f})."
+    return [Finding("inputs together", "ok", words, mean, criterion)]
+
+
+def _short_bands(flights: list[Flight], moving: list[str]) -> list[Finding]:
+    """From the power of the inputs alone, of records too short for an average."""
+    longest = max(flights, key=lambda f: f.n_samples)
+    length = min(longest.n_samples, _LONGEST) // 2 * 2
+    findings = []
+    for name in (n for n in moving if np.ptp(longest.inputs[n]) > 0):
+        omega, U = segment_transforms(longest.inputs[name][None, :], longest.dt, length)
+        power = np.sum(np.abs(U[1:-1, :, 0]) ** 2, axis=1)
+        low, high = _power_band(omega[1:-1] / (2.0 * np.pi), power)
+        words = (
+            f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; the record is too "
+            "short to say where the response follows it."
+        )
+        findings.append(Finding("excited band", "ok", words))
+    return findings
+
+
+def _short_together(flights: list[Flight], moving: list[str]) -> list[Finding]:
+    """By correlation in time, the others taken out by least squares."""
+    u = np.concatenate([np.stack([f.inputs[n] for n in moving], axis=1) for f in flights])
+    which = np.repeat(np.arange(len(flights)), [f.n_samples for f in flights])
+    level = np.stack([which == i for i in range(len(flights))], axis=1).astype(float)
+    pairs = []
+    for a, b in itertools.combinations(range(len(moving)), 2):
+        both = u[:, [a, b]] - level @ np.linalg.lstsq(level, u[:, [a, b]], rcond=None)[0]
+        others = np.hstack([level, np.delete(u, [a, b], axis=1)])
+        left = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
+        sizes = np.sum(left**2, axis=0)
+        # Where the others explain all of one, what is left is rounding: the pair by itself.
+        if np.any(sizes <= 1e-12 * np.sum(both**2, axis=0)):
+            left, sizes = both, np.sum(both**2, axis=0)
+        squared = float((left[:, 0] @ left[:, 1]) ** 2 / max(float(np.prod(sizes)), 1e-300))
+        pairs.append((squared, moving[a], moving[b], None))
+    return _pair_findings(pairs, TOGETHER)

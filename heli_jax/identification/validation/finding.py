@@ -1,0 +1,17 @@
+"""What is found out about a record before any fit: one sentence with its number and criterion."""
+
+from typing import Literal, NamedTuple
+
+Severity = Literal["ok", "doubt", "refuse"]
+"""refuse: a fit of this record says nothing of what is asked"""
+
+
+class Finding(NamedTuple):
+    """One answer to "Is this log enough?". The names of the fields are keys of fit.json."""
+
+    topic: str
+    severity: Severity
+    sentence: str
+    value: float | None = None
+    criterion: str = ""
+    """what `value` is, and the limit that it is held against"""

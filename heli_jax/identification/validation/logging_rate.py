@@ -1,0 +1,200 @@
+"""Whether the log is fast enough for the dynamics, at the start values.
+
+Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
+aliases. An input that was sampled while it moved is known at its samples alone: between them a
+straight line misses a part (pi f / rate)^2 / 3 of a motion at f, a staircase pi f / rate of it. At
+twice the frequency nothing is left of the motion; at five times a line misses a seventh.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.analysis.linear import linearize
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.finding import Finding, Severity
+from heli_jax.identification.validation.operating_point import operating_point
+
+HOPELESS, ENOUGH = 2.0, 5.0
+"""samples in a period of a mode: below the first it is not seen, above the second it is"""
+_SHOWS = 3.0
+"""times the noise by which a mode moves an output, from which on it matters"""
+_REGULAR = 0.8
+"""part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
+_LEVELS, _STEPS = 10, 20
+"""distinct values and steps of a staircase at least: a commanded sequence of steps has fewer"""
+
+
+class _Mode(NamedTuple):
+    """A mode that shows in the record."""
+
+    eigenvalue: complex
+    input: str
+    output: str
+
+    @property
+    def hz(self) -> float:
+        """Its natural frequency."""
+        return abs(self.eigenvalue) / (2.0 * np.pi)
+
+
+def logging_rate(
+    problem: Problem, flights: Sequence[tuple[str, Flight]], sd: Sequence[Mapping[str, Any]]
+) -> list[Finding]:
+    """Rates of inputs and outputs against the fastest mode that matters.
+
+    Args:
+        problem: model and start values.
+        flights: by what each is called.
+        sd: by flight and output the noise that is assumed, SI.
+    """
+    findings: list[Finding] = []
+    every: list[Finding] = []
+    for (label, flight), noise in zip(flights, sd, strict=True):
+        modes = _modes_that_show(problem, flight, noise)
+        found = [*_of_inputs(label, flight, modes), *_of_outputs(label, flight, modes)]
+        findings += [f for f in found if f.severity != "ok"]
+        every += found
+    return findings if findings or not every else [min(every, key=_value)]
+
+
+def _value(finding: Finding) -> float:
+    assert finding.value is not None
+    return finding.value
+
+
+def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any]) -> list[_Mode]:
+    """Those whose part in the answer to a step of an input's size stands out of the noise."""
+    known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+    params = naming.replace(problem.start_params(), **known)
+    at = operating_point(
+        problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
+    )
+    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
+    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
+    if not all(np.isfinite(M).all() for M in (A, B, C)):
+        return []
+    eigenvalues, right = np.linalg.eig(A)
+    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
+    left = np.linalg.pinv(right)
+    outputs, inputs = naming.names(problem.model.Outputs), naming.names(problem.model.Inputs)
+    shown = []
+    for k, eigenvalue in enumerate(eigenvalues):
+        # Slower than the record is a drift, and a pair of integrators is no oscillation.
+        if abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
+            continue
+        best = (0.0, "", "")
+        for j, u in enumerate(inputs):
+            size = float(np.std(flight.inputs[u]))
+            for i, y in ((outputs.index(y), y) for y in flight.outputs):
+                residue = abs(C[i] @ right[:, k]) * abs(left[k] @ B[:, j])
+                part = residue / abs(eigenvalue) * size / float(noise[y])
+                best = max(best, (part, u, y))
+        if best[0] >= _SHOWS:
+            shown.append(_Mode(complex(eigenvalue), *best[1:]))
+    return shown
+
+
+def _of_inputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
+    findings = []
+    for name, u in flight.inputs.items():
+        rate = input_rate(flight, name, u)
+        felt = [mode for mode in modes if mode.input == name]
+        if rate is None or not felt:
+            continue
+        fastest = max(felt, key=lambda mode: mode.hz)
+        ratio = rate / fastest.hz
+        begun = (
+            f"{label}: {name} was sampled at {rate:.3g} Hz while it moved, and {fastest.output} "
+            f"answers up to {fastest.hz:.3g} Hz (a mode at the start values)"
+        )
+        findings.append(_judged(begun, ratio, fastest.hz))
+    return findings
+
+
+def _of_outputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
+    findings = []
+    # A fast decay without oscillation has no alias: outputs are held to what oscillates.
+    for mode in (m for m in modes if m.eigenvalue.imag > 0):
+        hz = mode.eigenvalue.imag / (2.0 * np.pi)
+        rate = max(output_rate(flight, y) for y in flight.outputs)
+        begun = (
+            f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} swings at {hz:.3g} Hz"
+        )
+        findings.append(_judged(begun, rate / hz, hz))
+    # The fastest alone: what is too slow for it is said once.
+    return [min(findings, key=_value)] if findings else []
+
+
+def _judged(begun: str, ratio: float, hz: float) -> Finding:
+    criterion = f"samples in a period of the fastest mode that shows, {ENOUGH:g} ({HOPELESS:g})"
+    severity: Severity = "ok"
+    ending = f": {ratio:.2g} samples in a period are enough."
+    if ratio < HOPELESS:
+        severity = "refuse"
+        ending = (
+            f": {ratio:.2g} samples in a period cannot show it, so this log cannot be fitted with "
+            f"this model; log at {HOPELESS * hz:.3g} Hz at least, better {ENOUGH * hz:.3g} Hz."
+        )
+    elif ratio < ENOUGH:
+        severity = "doubt"
+        ending = (
+            f": {ratio:.2g} samples in a period hardly show it, and what happened between them "
+            f"biases the estimates; log at {ENOUGH * hz:.3g} Hz."
+        )
+    return Finding("logging rate", severity, f"{begun}{ending}", ratio, criterion)
+
+
+def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float | None:
+    """The rate [Hz] at which an input was sampled while it moved; None where it does not move, or
+    is known between its samples because it was commanded in steps.
+
+    Args:
+        flight: says what the input does between samples, and who decided that.
+        name: of the input.
+        u: its samples.
+    """
+    if np.ptp(u) == 0:
+        return None
+    if flight.hold[name] == "linear":
+        return _corner_rate(flight.dt, u)
+    # Held because somebody said so: then it is known at all times.
+    if name not in flight.hold_reason:
+        return None
+    at = np.flatnonzero(np.diff(u) != 0)
+    if at.size < _STEPS or np.unique(u).size < _LEVELS:
+        return None
+    # A slow clock's staircase: all stairs of one length but for the sample that rounding adds. What
+    # a pilot or a generator commands in steps is held unequally.
+    stairs = np.diff(at)
+    usual = float(np.median(stairs))
+    regular = np.mean(np.abs(stairs - usual) <= max(1.0, 0.05 * usual))
+    if usual < 2 or regular < _REGULAR:
+        return None
+    return 1.0 / (usual * flight.dt)
+
+
+def _corner_rate(dt: float, u: np.ndarray) -> float:
+    """The rate of the samples between which an input follows straight lines."""
+    bends = np.abs(np.diff(u, 2))
+    corners = np.flatnonzero(bends > 1e-6 * np.ptp(u))
+    if corners.size < _STEPS:
+        return 1.0 / dt
+    usual = float(np.median(np.diff(corners)))
+    # A corner between two samples of the new clock bends at both of them.
+    pairs = np.mean(np.diff(corners) == 1)
+    if usual <= 1 and pairs < 0.6:
+        usual = float(np.median(np.diff(corners)[np.diff(corners) > 1]))
+    return 1.0 / (max(usual, 1.0) * dt)
+
+
+def output_rate(flight: Flight, name: str) -> float:
+    """The rate [Hz] of the samples of an output that are there."""
+    seen = np.flatnonzero(np.isfinite(flight.outputs[name]))
+    usual = float(np.median(np.diff(seen))) if seen.size > 1 else float(flight.n_samples)
+    return 1.0 / (usual * flight.dt)

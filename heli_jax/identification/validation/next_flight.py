@@ -1,0 +1,260 @@
+"""What to fly next: the manoeuvre that narrows the widest interval most, by Fisher's information.
+
+Candidates of the same duration and amplitude as the record are put into the model at the start
+values, one input moved at a time: doublets, 3-2-1-1 steps and a chirp, and the record once more for
+comparison (input design over a few manoeuvres that a pilot can fly: Mehra, 1974; Jategaonkar, 2006,
+chapter 2).
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.estimator import Evaluation, signal_numbers
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.identifiability.expected import (
+    Sensitivity,
+    expected_sd,
+    repeated,
+    sensitivity_at,
+    together,
+    triangle,
+)
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import (
+    Data,
+    Layout,
+    Noise,
+    Solution,
+    layout_of,
+)
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.simulation.inputs import chirp, multistep_3211
+
+_STEPS = (0.2, 0.5, 1.0)
+"""lengths of the shortest step of a candidate [s]"""
+_LONGEST = 20.0
+"""duration of a candidate at most [s]: of a longer record several in a row"""
+_BAND = (0.1, 5.0)
+"""of the chirp [Hz]"""
+_WORTH = 0.98
+"""of the sd that the same record again would leave: less is no reason to fly something else"""
+
+
+class Candidate(NamedTuple):
+    """One manoeuvre of one input."""
+
+    input: str
+    words: str
+    """as a pilot reads it: `3-2-1-1 steps of 0.5 s`"""
+    values: Float[np.ndarray, " m"]
+    """what is added to the input, SI"""
+
+
+class Plan(NamedTuple):
+    """What the candidates would do to the parameter with the widest interval."""
+
+    parameter: str
+    before: float
+    """its expected sd relative to its value (of its logarithm); inf where it is not determined"""
+    again: float
+    """with the same record once more"""
+    best: Candidate
+    after: float
+    """with the best candidate, flown for as long as the record"""
+    duration: float
+    """of the record, and of the flight that is compared [s]"""
+    amplitude: float
+    """of the best candidate, SI"""
+    left_out: tuple[str, ...]
+    """inputs that do not move in the record, of which no amplitude is known"""
+
+
+def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
+    """The manoeuvre that narrows the widest interval most, as a sentence.
+
+    Args:
+        problem: what is free.
+        at: layout, data, noise and unknowns at the start values.
+        e: the evaluation there.
+    """
+    plan = plan_next_flight(problem, at, e)
+    if plan is None:
+        return []
+    unit = naming.unit(problem.model.Inputs, plan.best.input) or ""
+    unit = "" if unit == "1" else unit
+    flown = (
+        f"{plan.best.words} of {plan.best.input}, amplitude {plan.amplitude:.3g} {unit}".rstrip()
+        + f", for {plan.duration:.3g} s"
+    )
+    criterion = f"sd with it over that with the same record again; {_WORTH:g}"
+    ratio = plan.after / plan.again if np.isfinite(plan.again) else 0.0
+    begun = f"what to fly next for {plan.parameter} ({_sd(plan.before)}, the widest): "
+    if not np.isfinite(plan.after):
+        words = f"{begun}none of the manoeuvres that were compared determines it."
+    elif ratio < _WORTH:
+        words = (
+            f"{begun}{flown}, would leave {_sd(plan.after)}; the same record again "
+            f"{_sd(plan.again)}."
+        )
+    else:
+        words = (
+            f"{begun}the same again, which would leave {_sd(plan.again)}; of the manoeuvres "
+            f"compared none does better ({flown}: {_sd(plan.after)})."
+        )
+    if plan.left_out:
+        words += f" Not compared: {', '.join(plan.left_out)}, which the record does not move."
+    return [Finding("next flight", "ok", words, ratio, criterion)]
+
+
+def _sd(relative: float) -> str:
+    return f"sd {100 * relative:.2g} %" if np.isfinite(relative) else "not determined"
+
+
+def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | None:
+    """Compare manoeuvres; None where nothing can be compared.
+
+    Args:
+        problem: what is free.
+        at: layout, data, noise and unknowns at the start values.
+        e: the evaluation there.
+    """
+    # A filter of a nonlinear model would be compiled for every candidate by itself.
+    if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
+        return None
+    flight = max(problem.training, key=lambda f: f.n_samples)
+    i = problem.training.index(flight)
+    # With windows one of them is simulated: no model that needs windows can be longer.
+    m = at.layout.windows[i][1]
+    m = min(m, max(round(_LONGEST / flight.dt), 3 * len(problem.free)))
+    candidates = _candidates(flight, m)
+    if not candidates:
+        return None
+    s, layout, data = _sensitivity(problem, at, i, candidates, m)
+    triangles = _by_flight(s, layout, data)
+    now = sensitivity_at(problem, at.layout, e)
+    R = triangle(now)
+    before = expected_sd(now.unknowns, R)
+    widest = int(np.argmax(before))
+    times = flight.n_samples / m
+    sds = [
+        float(expected_sd(now.unknowns, together(R, repeated(T, times)))[widest]) for T in triangles
+    ]
+    best = int(np.argmin(sds))
+    return Plan(
+        now.unknowns[widest].name,
+        float(before[widest]),
+        _again(now, at.layout, at.data, i, R, widest),
+        candidates[best],
+        sds[best],
+        flight.n_samples * flight.dt,
+        float(np.max(np.abs(candidates[best].values))),
+        tuple(n for n, u in flight.inputs.items() if np.ptp(u) == 0),
+    )
+
+
+def _again(
+    now: Sensitivity, layout: Layout, data: Data, i: int, R: np.ndarray, widest: int
+) -> float:
+    """The widest sd with the i-th flight flown once more."""
+    T = _by_flight(now, layout, data)[i]
+    return float(expected_sd(now.unknowns, together(R, T))[widest])
+
+
+def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[np.ndarray]:
+    """What each flight says by itself."""
+    flight = np.repeat(np.arange(len(layout.outputs)), [len(names) for names in layout.outputs])
+    rows = flight[signal_numbers(layout, data)]
+    samples = rows.size
+    # Of a filter the same number of rows follows once more, for its variances.
+    extra = np.full(len(s.shared) - samples, -1)
+    if not layout.estimator.rows_are_samples and extra.size >= samples:
+        extra[extra.size - samples :] = rows
+    elif layout.continuity is not None:
+        extra = np.repeat(
+            np.arange(len(layout.windows)),
+            [(count - 1) * len(layout.states) for count, _ in layout.windows],
+        )
+    rows = np.concatenate([rows, extra])
+    return [triangle(s, np.flatnonzero(rows == i)) for i in range(len(layout.outputs))]
+
+
+def _candidates(flight: Flight, m: int) -> list[Candidate]:
+    """Manoeuvres of m samples, of the amplitude that each input has in the record."""
+    candidates, rng = [], np.random.default_rng(0)
+    for name, u in flight.inputs.items():
+        amplitude = 0.5 * float(np.ptp(u))
+        if amplitude == 0:
+            continue
+        for step in _STEPS:
+            # At least one whole doublet in the candidate.
+            if 3 * step <= m * flight.dt:
+                doublets = amplitude * _doublets(m, flight.dt, step)
+                candidates.append(Candidate(name, f"doublets, {step:g} s a side", doublets))
+            if 8 * step <= m * flight.dt:
+                steps = amplitude * multistep_3211(m, flight.dt, rng, step, step)
+                candidates.append(Candidate(name, f"3-2-1-1 steps of {step:g} s", steps))
+        low, high = max(_BAND[0], 1.0 / (m * flight.dt)), min(_BAND[1], 0.1 / flight.dt)
+        if high > 2 * low:
+            words = f"a sine that rises from {low:.2g} to {high:.2g} Hz"
+            candidates.append(Candidate(name, words, amplitude * chirp(m, flight.dt, low, high)))
+    return candidates
+
+
+def _doublets(m: int, dt: float, step: float) -> Float[np.ndarray, " m"]:
+    """One side, the other, and as long of neutral, over and over."""
+    samples = max(1, round(step / dt))
+    phase = (np.arange(m) // samples) % 3
+    return np.where(phase == 0, 1.0, np.where(phase == 1, -1.0, 0.0))
+
+
+def _sensitivity(
+    problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
+) -> tuple[Sensitivity, Layout, Data]:
+    """The rows of all candidates, each a flight of m samples that begins as the i-th one does."""
+    flight, numbers = problem.training[i], at.data.flights[i]
+    linear, dtype = problem.model.linear, at.z.dtype
+    # Held between samples: steps are, and of a chirp it makes no difference to the comparison. A
+    # linear model is at rest with neutral sticks alone, and would answer to others as to a step;
+    # another begins with the sticks that the record begins with.
+    parts, flights = [], []
+    for candidate in candidates:
+        inputs = {}
+        for n, u in flight.inputs.items():
+            rest = np.full(m, 0.0 if linear else float(u[0]))
+            inputs[n] = rest + candidate.values if n == candidate.input else rest
+        outputs = {n: np.zeros(m) for n in flight.outputs}
+        flights.append(replace(flight, inputs=inputs, outputs=outputs, hold={}, hold_reason={}))
+        record: Any = problem.model.Inputs
+        parts.append(
+            numbers._replace(
+                inputs=record(**{n: jnp.asarray(inputs[n], dtype) for n in naming.names(record)}),
+                outputs={n: jnp.zeros(m, dtype) for n in numbers.outputs},
+            )
+        )
+    layout = replace(
+        layout_of(problem, tuple(flights)), windows=((1, m),) * len(parts), continuity=None
+    )
+    data = at.data._replace(flights=tuple(parts))
+    noise = Noise((at.noise.sd[i],) * len(parts), at.noise.log_variance_ratio)
+    own = _begins_as(at, i, linear)
+    z = jnp.concatenate([at.z[: at.layout.first_nuisance], *([own] * len(parts))])
+    return sensitivity_at(problem, layout, evaluate(layout, data, noise, z)), layout, data
+
+
+def _begins_as(at: Solution, i: int, linear: bool) -> jax.Array:
+    """The initial state of the i-th flight's first window, and no bias."""
+    layout, position = at.layout, at.layout.first_nuisance
+    for j in range(i):
+        position += layout.windows[j][0] * len(layout.states)
+        position += layout.constants(layout.outputs[j])
+    states = at.z[position : position + len(layout.states)]
+    # A linear machine begins at rest, wherever the record begins.
+    states = jnp.zeros_like(states) if linear else states
+    return jnp.concatenate([states, jnp.zeros(layout.constants(layout.outputs[i]), at.z.dtype)])

@@ -1,0 +1,271 @@
+"""Is this log enough: each defect is found where it is, and not where it is not."""
+
+import itertools
+from dataclasses import replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem
+from heli_jax.identification.fit import check
+from heli_jax.identification.validation import excited_band, signal_quality
+from heli_jax.identification.validation.logging_rate import input_rate
+from heli_jax.identification.validation.missing_outputs import look_at_missing
+from heli_jax.identification.validation.next_flight import plan_next_flight
+from heli_jax.identification.validation.signal_quality import quantisation, quantum, rails
+from heli_jax.naming import Scalar
+from tests.identification.start_values import at_start
+
+DT = 0.02
+
+
+class Params(NamedTuple):
+    k: Annotated[Scalar, "1/s^2", "stiffness"]
+    d: Annotated[Scalar, "1/s", "damping"]
+    b: Annotated[Scalar, "1/s^2", "the stick's effect"]
+
+
+class State(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "roll rate"]
+    phi: Annotated[Scalar, "rad", "bank angle"]
+
+
+class Inputs(NamedTuple):
+    u: Annotated[Scalar, "rad", "stick"]
+    v: Annotated[Scalar, "rad", "another stick, of half the effect"]
+
+
+def vector_field(q, x, i):
+    return State(p=-q.d * x.p - q.k * x.phi + q.b * (i.u + 0.5 * i.v), phi=x.p)
+
+
+def output(q, x, i):
+    return x
+
+
+SWING = Model("swing", vector_field, output, Params, State, Inputs, State, linear=True)
+TRUTH = Params(36.0, 2.0, 20.0)
+FREE = {"k": Free(36.0), "d": Free(2.0), "b": Free(20.0)}
+
+
+def response(u, v):
+    """phi and p by SciPy, from rest, for held inputs."""
+    both = []
+    for numerator in ([20.0], [20.0, 0.0]):
+        b, a, _ = scipy.signal.cont2discrete((numerator, [1.0, 2.0, 36.0]), DT)
+        both.append(scipy.signal.lfilter(np.ravel(b), a, u + 0.5 * v))
+    return both
+
+
+def steps(rng, n, low=10, high=60):
+    u, k = np.empty(n), 0
+    while k < n:
+        m = rng.integers(low, high)
+        u[k : k + m] = 0.2 * rng.uniform(-1.0, 1.0)
+        k += m
+    return u
+
+
+def flight(seed=0, n=1000, noise=0.005, outputs=("phi",), still=True):
+    rng = np.random.default_rng(seed)
+    u = steps(rng, n)
+    v = np.zeros(n) if still else steps(rng, n)
+    phi, p = response(u, v)
+    y = {"phi": phi + noise * rng.standard_normal(n), "p": p + 4 * noise * rng.standard_normal(n)}
+    sd = {"phi": noise, "p": 4 * noise}
+    return Flight(
+        dt=DT,
+        inputs={"u": u, "v": v},
+        outputs={o: y[o] for o in outputs},
+        sd={o: sd[o] for o in outputs},
+    )
+
+
+def problem(*flights, **more):
+    return Problem(SWING, TRUTH, flights, FREE, Nuisance(bias=False), **more)
+
+
+def expected(verdict):
+    return np.sqrt(np.diag(verdict.covariance))
+
+
+def test_rails_are_what_piles_up_at_both_ends():
+    t = np.arange(4000) * DT
+    y = np.sin(0.7 * t) + 0.02 * np.random.default_rng(0).standard_normal(t.size)
+    clipped = np.clip(y, -0.9, 0.8)
+    low, high = rails(clipped)
+    assert (low, high) == (np.mean(y <= -0.9), np.mean(y >= 0.8))
+    throttle = np.clip(steps(np.random.default_rng(1), 6000), -0.1, 0.12)
+    assert rails(throttle).high == pytest.approx(np.mean(throttle == 0.12))
+    # A sine in steps, steps between levels, rest at an end, noise: no rails.
+    for x in (
+        np.round(np.sin(0.7 * t), 1),
+        np.round(np.sin(0.7 * t), 3),
+        np.repeat([0.0, 1.0, -1.0, 1.0, -1.0, 0.0], 300),
+        np.maximum(np.sin(0.7 * t) * (np.abs(t - 40.0) < 20.0), 0.0),
+        np.r_[np.zeros(50), np.exp(-t), np.zeros(50)],
+    ):
+        assert rails(x) == (0.0, 0.0)
+    quiet = [rails(steps(np.random.default_rng(s), 1500)) for s in range(100)]
+    assert sum(max(r) > 0 for r in quiet) <= 1
+
+
+def test_steps_of_the_log_are_held_against_the_noise():
+    rng = np.random.default_rng(0)
+    y = np.sin(0.05 * np.arange(2000)) + 0.002 * rng.standard_normal(2000)
+    assert quantum(y) == 0.0
+    coarse = np.round(y / 0.04) * 0.04 * np.pi / 180
+    assert quantum(coarse) == pytest.approx(0.04 * np.pi / 180)
+    # Rounding's error, as it is: uniform within a step.
+    assert np.std(np.round(y / 0.04) * 0.04 - y) == pytest.approx(0.04 / 12**0.5, rel=0.05)
+    f = replace(flight(n=2000), outputs={"phi": np.round(y / 0.04) * 0.04}, sd={"phi": 0.002})
+    (found,) = quantisation([("one", f)], [{"phi": 0.002}])
+    assert found.severity == "doubt"
+    assert found.value == pytest.approx(0.04 / 12**0.5 / 0.002)
+    (fine,) = quantisation([("one", replace(f, outputs={"phi": y}))], [{"phi": 0.002}])
+    assert fine.severity == "ok"
+    few = replace(f, outputs={"phi": np.round(y)})
+    assert "of the noise" not in quantisation([("one", few)], [{"phi": 10.0}])[0].sentence
+    assert "3 distinct values" in quantisation([("one", few)], [{"phi": 10.0}])[0].sentence
+
+
+def pairs(findings):
+    return [f for f in findings if f.topic == "inputs together"]
+
+
+def test_sticks_that_move_together_are_named_with_their_coherence():
+    rng, f = np.random.default_rng(0), flight(3, 4000, still=False)
+    u, n = f.inputs["u"], 4000
+    mixed = 0.6 * u + 0.005 * rng.standard_normal(n)
+    (found,) = pairs(excited_band.bands([replace(f, inputs={"u": u, "v": mixed})]))
+    assert found.severity == "doubt"
+    _, c = scipy.signal.coherence(u, mixed, 1 / DT, nperseg=400)
+    power = scipy.signal.welch(u, 1 / DT, nperseg=400)[1]
+    other = scipy.signal.welch(mixed, 1 / DT, nperseg=400)[1]
+    weights = np.minimum(power / power.sum(), other / other.sum())
+    assert found.value == pytest.approx(np.average(c, weights=weights), abs=0.05)
+    assert "u and v move together" in found.sentence
+    alike = pairs(excited_band.bands([replace(f, inputs={"u": u, "v": u})]))
+    assert "nothing in the record tells" in alike[0].sentence
+    # A second flight in which one moves alone tells them apart.
+    alone = replace(f, inputs={"u": steps(rng, n), "v": np.zeros(n)})
+    assert pairs(excited_band.bands([replace(f, inputs={"u": u, "v": u}), alone]))[0].value < 0.8
+
+
+@pytest.mark.parametrize("n", [300, 600, 3000])
+def test_sticks_that_move_apart_are_no_alarm(n):
+    alarms = 0
+    for seed in range(25):
+        f = flight(seed, n, still=False)
+        alarms += pairs(excited_band.bands([f]))[0].severity != "ok"
+    assert alarms <= 1
+
+
+def test_the_band_that_a_stick_excites():
+    rng, n = np.random.default_rng(0), 6000
+    sos = scipy.signal.butter(6, [0.5, 2.0], "band", fs=1 / DT, output="sos")
+    u = scipy.signal.sosfilt(sos, rng.standard_normal(n))
+    phi, _ = response(u, np.zeros(n))
+    y = phi + 0.05 * np.std(phi) * rng.standard_normal(n)
+    f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
+    (found,) = [x for x in excited_band.bands([f]) if x.topic == "excited band"]
+    low, high = found.sentence.split("follows it from ")[1].removesuffix(" Hz.").split(" to ")
+    assert 0.2 < float(low) < 0.6
+    assert 1.8 < float(high) < 3.0
+    noise = replace(f, outputs={"phi": rng.standard_normal(n)})
+    assert excited_band.bands([noise])[1].severity == "doubt"
+
+
+def test_the_rate_of_an_input_that_moved_between_its_samples():
+    n, k = 4000, 10
+    t = np.arange(n) * 0.01
+    smooth = scipy.signal.chirp(t, 0.1, 40.0, 2.0)
+    stairs = np.repeat(smooth[::k], k)
+    line = np.interp(t, t[::k], smooth[::k])
+    rates = []
+    for u, hold, reason in (
+        (smooth, "linear", {"u": "moves"}),
+        (stairs, "zero-order", {"u": "jumps"}),
+        (line, "linear", {"u": "moves"}),
+        (stairs, "zero-order", {}),
+        (steps(np.random.default_rng(0), n), "zero-order", {"u": "jumps"}),
+        (np.repeat(np.tile([0.0, 1.0, -1.0, 0.0], 25), 40), "zero-order", {"u": "jumps"}),
+        (np.zeros(n), "zero-order", {"u": "never moves"}),
+    ):
+        f = Flight(
+            dt=0.01, inputs={"u": u}, outputs={"phi": smooth}, hold={"u": hold}, hold_reason=reason
+        )
+        rates.append(input_rate(f, "u", u))
+    assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
+
+
+def test_a_log_too_slow_for_the_machine_is_refused_in_words():
+    # The machine swings at 0.95 Hz: three samples a second are doubtful, 1.6 hopeless.
+    f = flight(1, 3000)
+    verdicts = {}
+    for every in (5, 16, 31):
+        u = scipy.signal.lfilter([0.05], [1.0, -0.95], f.inputs["u"])
+        slow = Flight(
+            dt=DT * every,
+            inputs={"u": u[::every], "v": np.zeros(u[::every].size)},
+            outputs={"phi": response(u, np.zeros(u.size))[0][::every]},
+            sd={"phi": 1e-3},
+            hold={"u": "linear"},
+            hold_reason={"u": "moves"},
+        )
+        found = [x for x in check(problem(slow)).findings if x.topic == "logging rate"]
+        verdicts[every] = found[0].severity
+        if every == 31:
+            assert "cannot be fitted" in found[0].sentence
+            assert found[0].value == pytest.approx(1 / (DT * 31) / (6.0 / 2 / np.pi), rel=0.05)
+    assert verdicts == {5: "ok", 16: "doubt", 31: "refuse"}
+
+
+def test_a_missing_output_costs_what_the_fit_with_it_would_gain():
+    f = flight(0)
+    without = problem(f)
+    at, _ = at_start(without)
+    looked = look_at_missing(without, at)
+    assert looked is not None
+    names, (m,) = looked
+    assert (names, m.name) == (("k", "d", "b"), "p")
+    _, p = response(f.inputs["u"], f.inputs["v"])
+    both = problem(replace(f, outputs={**f.outputs, "p": p}, sd={"phi": 0.005, "p": m.sd}))
+    ratio = expected(check(both).verdict) / expected(check(without).verdict)
+    # But for the weak priors' sizes, which the further output makes anew.
+    np.testing.assert_allclose(m.ratios, ratio, rtol=1e-4)
+
+
+def test_what_to_fly_next_does_what_is_promised():
+    # Steps of two seconds and more say little of the damping.
+    f = flight(0, 500)
+    slow = problem(
+        replace(f, inputs={"u": steps(np.random.default_rng(5), 500, 100, 200), "v": np.zeros(500)})
+    )
+    at, e = at_start(slow)
+    plan = plan_next_flight(slow, at, e)
+    assert plan is not None
+    assert plan.left_out == ("v",)
+    assert plan.after < plan.again < plan.before
+    now = expected(check(slow).verdict)
+    assert plan.before == pytest.approx(now.max(), rel=1e-6)
+    assert plan.again == pytest.approx(plan.before / 2**0.5, rel=1e-3)
+    u = plan.best.values
+    phi, _ = response(u, np.zeros(u.size))
+    flown = replace(slow.training[0], inputs={"u": u, "v": np.zeros(u.size)}, outputs={"phi": phi})
+    after = expected(check(problem(slow.training[0], flown)).verdict)
+    # But for the weak priors' sizes, which the second record makes anew.
+    assert plan.after == pytest.approx(after[int(np.argmax(now))], rel=1e-2)
+
+
+def test_findings_stand_once():
+    result = check(problem(flight(0, 1000, still=False)))
+    topics = {f.topic for f in result.findings}
+    assert {"excited band", "inputs together", "saturation", "quantisation"} <= topics
+    assert all(f.severity == "ok" for f in result.findings)
+    assert not {f.sentence for f in result.findings} & set(result.further_notes)
+    for a, b in itertools.pairwise(result.findings):
+        assert (a.severity, b.severity) != ("ok", "doubt")
+    assert signal_quality.saturation([("x", flight(0))])[0].severity == "ok"

@@ -1,0 +1,129 @@
+"""Windows of a record: the part that is excited is found, what is damaged is left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from heli_jax import Flight
+from heli_jax.cli import main
+from heli_jax.config import load
+from heli_jax.config import problem as configured
+from heli_jax.errors import InputError
+from heli_jax.flights.cut import part
+from heli_jax.identification.fit import check, windows
+from heli_jax.identification.validation.record_windows import window_flights
+from heli_jax.identification.validation.usable_windows import Exclusions
+from tests.identification.test_enough import DT, flight, problem, response, steps
+
+
+def excited(first, last, n=2000, seed=0):
+    """Forty seconds, the stick still but for one part."""
+    rng = np.random.default_rng(seed)
+    u = np.zeros(n)
+    u[first:last] = steps(rng, last - first)
+    phi, _ = response(u, np.zeros(n))
+    y = phi + 0.005 * rng.standard_normal(n)
+    return Flight(dt=DT, inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y}, sd={"phi": 0.005})
+
+
+@pytest.fixture(scope="module")
+def ranked():
+    return windows(problem(excited(800, 1200)), 4.0)
+
+
+def test_the_excited_part_is_found(ranked):
+    assert ranked.parameters == ("k", "d", "b")
+    # What is left of the motion after 24 s says a little of the damping.
+    for choice in ranked.taken:
+        assert choice.window.start < 25.0
+        assert choice.window.end > 16.0
+    assert ranked.taken[0].window.sd.max() < 0.2
+    assert ranked.taken[-1].efficiency >= 0.9
+    assert [c.efficiency for c in ranked.taken] == sorted(c.efficiency for c in ranked.taken)
+    still = [w for w in ranked.windows if w.end < 15.0]
+    assert still
+    assert all(w.sd[2] > 1.0 for w in still)
+    taken = [c.window for c in ranked.taken]
+    assert not any(a.overlaps(b) for a in taken for b in taken if a is not b)
+
+
+def test_the_expected_sd_is_that_of_a_check_of_the_window_alone(ranked):
+    whole = excited(800, 1200)
+    # One that begins at rest, as `check` begins.
+    [window] = [w for w in ranked.windows if w.first == 800]
+    alone = part(whole, window.first, window.last)
+    assert (alone.n_samples, alone.t0) == (200, pytest.approx(16.0))
+    sd = np.sqrt(np.diag(check(problem(alone)).verdict.covariance))
+    np.testing.assert_allclose(window.sd, sd, rtol=0.1)
+    (flights,) = window_flights(problem(whole), ranked).values()
+    assert [f.t0 for f in flights] == sorted(c.window.start for c in ranked.taken)
+
+
+def test_damaged_windows_are_left_out_with_the_reason(ranked):
+    f = excited(800, 1200)
+    y = f.outputs["phi"].copy()
+    y[900:950] = np.nan
+    damaged = windows(problem(replace(f, outputs={"phi": y})), 4.0)
+    for w in damaged.windows:
+        gap = max(min(w.last, 950) - max(w.first, 900), 0) * DT > 0.3
+        assert bool(w.excluded) == gap
+    assert "phi: a gap" in next(w.excluded for w in damaged.windows if w.excluded)
+    # A sensor at a fifth of the rate has no gaps.
+    y = np.full(2000, np.nan)
+    y[::5] = f.outputs["phi"][::5]
+    sparse = replace(f, outputs={"phi": f.outputs["phi"], "p": f.outputs["phi"]})
+    assert Exclusions((replace(sparse, outputs={"phi": y}, sd={}),)).of(0, 100, 300) == ""
+
+
+def test_the_same_record_gives_the_same_windows(ranked):
+    again = windows(problem(excited(800, 1200)), 4.0)
+    assert [c.window.first for c in again.taken] == [c.window.first for c in ranked.taken]
+    with pytest.raises(ValueError, match="at most the length of the longest flight"):
+        windows(problem(flight(0)), 100.0)
+    with pytest.raises(ValueError, match="expected 9 at least for 3 free"):
+        windows(problem(flight(0)), 0.1)
+
+
+CONFIG = """
+model: roll-on-stand
+vehicle: {vehicle}
+flights:
+  - log: bench.csv
+    window: auto
+    signals:
+      time: {{signal: t}}
+      inputs: {{x_roll: {{signal: stick, unit: m}}}}
+      outputs: {{roll: {{signal: roll, unit: rad, sd: 0.002}}}}
+fit:
+  free:
+    Ixx: {{start: 0.03}}
+    If: {{start: 2.0e-4}}
+"""
+
+
+def test_a_configuration_takes_the_windows(tmp_path, vehicles_folder, capsys):
+    rng = np.random.default_rng(0)
+    u = np.zeros(1500)
+    u[500:1000] = 1.5e-5 * steps(rng, 500)
+    t = np.arange(1500) * DT
+    rows = np.c_[t, u, 0.002 * rng.standard_normal(1500)]
+    np.savetxt(tmp_path / "bench.csv", rows, delimiter=",", header="t,stick,roll", comments="")
+    path = tmp_path / "bench.yaml"
+    path.write_text(CONFIG.format(vehicle=vehicles_folder / "bench-30.yaml"))
+    flights = configured(load(path)).flights
+    assert len(flights) >= 1
+    for f in flights:
+        assert not f.choose_windows
+        assert f.t0 > 7.0
+        assert f.source is not None
+        assert f"window: auto took {f.t0:.4g} s to" in f.source.notes[-1]
+    assert main(["windows", str(tmp_path / "bench.csv"), str(path), "--length", "5"]) == 0
+    out = capsys.readouterr().out
+    assert "sd Ixx" in out
+    assert "windows of 5 s say" in out
+    assert main(["windows", str(path), "--length", "90"]) == 2
+    with pytest.raises(InputError, match="auto chooses what to fit"):
+        configured(load(path, ["flights.0.hold_out=true"]))
+    assert main(["check", str(path), "--set", "flights.0.window=best"]) == 2
+    assert "two finite numbers of seconds or auto" in capsys.readouterr().err
