@@ -106,6 +106,11 @@ class Model(eqx.Module):
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
     """of a machine on a stand, the same machine in free flight"""
+    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
+    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
