@@ -112,6 +112,11 @@ class Model(eqx.Module):
     within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
     """of a model with sensors that show derivatives (`with_motion_sensors`), the model within, and
     what puts its devices around another one"""
+    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
+    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
