@@ -90,10 +90,10 @@ def noise_guesses_by_tau(
     """
     dt = min(float(f.dt) for f in data.flights)
     longest = max(float(f.dt) * next(iter(f.outputs.values())).shape[0] for f in data.flights)
-    ends = sorted((5.0 * dt, 0.2 * longest))
+    first, last = sorted((5.0 * dt, 0.2 * longest))
     decades = _DECADES if d.sigma in layout.disturbance else np.zeros(1)
     points = np.tile(np.asarray(z0), (_TAUS, decades.size, 1))
-    points[..., layout.disturbance_at(d.tau)] = np.linspace(*np.log(ends), _TAUS)[:, None]
+    points[..., layout.disturbance_at(d.tau)] = np.log(np.geomspace(first, last, _TAUS))[:, None]
     if d.sigma in layout.disturbance:
         points[..., layout.disturbance_at(d.sigma)] += decades
     flat = jnp.asarray(points.reshape(-1, points.shape[-1]), z0.dtype)

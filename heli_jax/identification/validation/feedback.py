@@ -153,7 +153,8 @@ def _delay(
     delay, variance, estimated = 0.0, 0.0, False
     own = dict(problem.model.delays).get(name)
     if own is not None and own not in found:
-        delay = float(flight.known.get(own, getattr(problem.vehicle, own)))
+        stated = flight.known.get(own)
+        delay = float(getattr(problem.vehicle, own) if stated is None else stated)
     for parameter in ("time_shift", own):
         value, sd = found.get(parameter or "", (0.0, None))
         if sd is not None:
