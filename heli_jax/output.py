@@ -166,6 +166,8 @@ def _escaped(text: str) -> str:
 def print_check(check: Check) -> None:
     """The identifiability at the initial guess, on standard output."""
     verdict = check.verdict
+    # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
+    print("At the start values (the fit judges at its estimates, which may differ):")
     _print_verdict(verdict)
     rows = []
     for i, name in enumerate(verdict.names):
