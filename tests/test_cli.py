@@ -334,6 +334,7 @@ def test_missing_samples(bench, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_comparison_by_configuration(bench, capsys):
     def as_in_test_choice(content):  # so that what was compiled for one serves the other
         content["simulate"]["duration"] = 40
@@ -355,6 +356,7 @@ def test_comparison_by_configuration(bench, capsys):
     assert "Which model" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_intervals_by_configuration(bench, capsys):
     out = bench.parent / "run"
     how = [

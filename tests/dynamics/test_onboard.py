@@ -265,6 +265,7 @@ def test_sensors_lag_and_feel():
     assert naming.unit(model.Outputs, "ax") == "m/s^2"
 
 
+@pytest.mark.slow
 def test_the_helicopter_feels_its_weight_and_its_lever(vehicles_folder):
     """In hover an accelerometer shows g upwards; turning it shows the centripetal acceleration."""
     x_cell = load_vehicle(vehicles_folder / "x-cell-60.yaml")

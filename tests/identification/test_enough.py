@@ -238,6 +238,7 @@ def test_a_missing_output_costs_what_the_fit_with_it_would_gain():
     np.testing.assert_allclose(m.ratios, ratio, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_to_fly_next_does_what_is_promised():
     # Steps of two seconds and more say little of the damping.
     f = flight(0, 500)

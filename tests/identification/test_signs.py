@@ -111,6 +111,7 @@ def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
     assert any("diverges at the start values" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_the_sign_may_be_kept():
     free = {"Ld": Free(10.0), "Nd": Free(1.0, sign="keep"), "Lr": Free(1.0, lower=0.0)}
     one = problem(free)

@@ -131,6 +131,7 @@ def test_two_flights_have_a_bias_and_a_start_each():
     assert verdict.text.count("the bias of p") == 1
 
 
+@pytest.mark.slow
 def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
     how = {"window": 2.0, "flights": 1}
     verdict = check(problem(BOUNDED, Nuisance(bias=False), continuity=0.01, **how)).verdict

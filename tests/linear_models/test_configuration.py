@@ -136,7 +136,7 @@ def test_what_cannot_be_ends_in_a_sentence(written, content, words):
         assert word in str(e.value)
 
 
-@pytest.mark.parametrize("command", ["simulate", "sweep"])
+@pytest.mark.parametrize("command", ["simulate", pytest.param("sweep", marks=pytest.mark.slow)])
 def test_a_model_with_a_delay_flies(written, tmp_path, capsys, command):
     sweep = {
         "design": "list",
