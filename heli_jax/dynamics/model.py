@@ -106,11 +106,6 @@ class Model(eqx.Module):
     """what trim solves for; None: by the names of its states and inputs, where it can fly"""
     without_stand: "Model | None" = eqx.field(static=True, default=None)
     """of a machine on a stand, the same machine in free flight"""
-    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
-    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
-    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
@@ -120,6 +115,11 @@ class Model(eqx.Module):
     """the parameters that are above zero whatever else may change its sign"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
+    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
+    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(
