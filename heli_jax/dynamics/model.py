@@ -112,11 +112,6 @@ class Model(eqx.Module):
     within: "tuple[Model, Callable[[Model], Model]] | None" = eqx.field(static=True, default=None)
     """of a model with sensors that show derivatives (`with_motion_sensors`), the model within, and
     what puts its devices around another one"""
-    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
-        static=True, default=None, kw_only=True
-    )
-    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
-    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     delays: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     """inputs that act late, each with the parameter that is its delay [s]"""
     delay_lines: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
@@ -129,6 +124,11 @@ class Model(eqx.Module):
     have to follow"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
+    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
+    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(

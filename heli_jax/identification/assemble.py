@@ -149,7 +149,6 @@ def assemble(
         optimum: where the optimiser ended, with the measurement noise there.
         run: how it came there.
     """
-    # The optimiser keeps only what it minimises; signals and Jacobian are those of its last point.
     e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
     optimum = unless_stuck(search.layout, optimum, e)
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
@@ -167,7 +166,8 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
-    missing = () if all_white else _missing(problem, signals, adequacy)
+    notes = (*notes, *closed_loop, *adequacy.sentences)
+    notes += () if all_white else tuple(_missing(problem, signals, adequacy))
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -193,7 +193,7 @@ def assemble(
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(*notes, *closed_loop, *adequacy.sentences, *missing, *held.notes),
+        notes=(*notes, *held.notes),
         reached=solution,
         feedback=found,
         seed=run.seed,
