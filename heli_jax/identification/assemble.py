@@ -166,8 +166,7 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
-    notes = (*notes, *closed_loop, *adequacy.sentences)
-    notes += () if all_white else tuple(_missing(problem, signals, adequacy))
+    missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -193,7 +192,7 @@ def assemble(
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(*notes, *held.notes),
+        notes=(*notes, *closed_loop, *adequacy.sentences, *missing, *held.notes),
         reached=solution,
         feedback=found,
         seed=run.seed,
