@@ -54,6 +54,7 @@ def told(note, name):
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero-order"])
+@pytest.mark.slow
 def test_check_tells_what_the_other_hold_would_change(held_inputs, hold):
     """As much as the fits of both holds differ by."""
     record = held_inputs.late_record(0, hold)
@@ -82,6 +83,7 @@ def test_a_fit_doubts_only_what_the_log_let_be_linear(held_inputs):
     assert told(note, "time_shift") == pytest.approx(-20.0, abs=4.0)
 
 
+@pytest.mark.slow
 def test_nothing_is_said_where_it_does_not_matter(held_inputs):
     """A slow stick in much noise: half a sample is nothing."""
     record = held_inputs.late_record(0, "linear")

@@ -145,6 +145,7 @@ def test_a_parameter_that_is_zero_is_determined():
     assert one.sd < 0.2
 
 
+@pytest.mark.slow
 def test_what_says_nothing_is_not_determined():
     # A record without motion but noise: every derivative is anybody's guess.
     rng = np.random.default_rng(1)

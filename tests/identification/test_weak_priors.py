@@ -115,6 +115,7 @@ def test_without_one_of_the_two_it_is_determined(off):
     assert found.estimates["L0"].prior_share < 1e-4
 
 
+@pytest.mark.slow
 def test_a_prior_determines_it_and_is_said_to():
     verdict = check(problem(BOUNDED._replace(prior=Prior(0.0, 0.1)))).verdict
     assert verdict.identifiable
@@ -141,6 +142,7 @@ def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
     assert "switch off nuisance.bias, fix L0" in verdict.text
 
 
+@pytest.mark.slow
 def test_what_no_output_shows_does_no_harm():
     """The free roll of the paper: bias and initial angle are one; on the stand they are two."""
     for model, stand in ((models.roll, False), (models.roll_on_stand, True)):
