@@ -91,7 +91,7 @@ def shown(gate: Gate) -> str:
     text = f"{gate.value:.3g}"
     if gate.what == _CORRELATED:
         # Two digits of what is missing to one, where three in all would say 1.
-        missing = 1.0 - min(abs(gate.value), 1.0 - 1e-5)
+        missing = max(1.0 - abs(gate.value), 2e-5)
         text = f"{gate.value:+.{max(3, math.ceil(1.0 - math.log10(missing)))}f}"
     return f"{text} {gate.unit}" if gate.unit else text
 
