@@ -6,9 +6,15 @@ Groechenig, 'Theory and practice of irregular sampling', 1994, with a penalty in
 limit of the band). These pass a low-pass filter, a sinc in a Kaiser window, evaluated at the new
 times.
 
+What a signal has near the old Nyquist frequency, as white noise has, cannot be told from what lost
+samples hide, and a fit through every sample would multiply it. How closely the samples are followed
+is therefore asked of the signal itself: some of them are hidden, and the closeness is taken that
+predicts those best, from straight lines between neighbours (noise) to all that the others say (a
+signal that ends below). Noise then passes as the low-pass filter lets it.
+
 At 200 Hz with a fifth of a step of jitter and 5 % of the samples lost, what lies between 26 and
-70 Hz is below -75 dB at 50 Hz. Above 70 % of the old Nyquist frequency lost samples cannot be made
-up for, and a part folds; even samples have no such limit.
+70 Hz of a signal without noise is below -74 dB at 50 Hz. Above 70 % of the old Nyquist frequency
+lost samples cannot be made up for, and a part folds; even samples have no such limit.
 """
 
 from typing import Any, cast
@@ -25,7 +31,10 @@ _TAPS = 32
 _TAPS_BETA = 8.0
 _PENALTY = 0.1
 """for what lies in the upper seventh of the old band: a lost sample is what makes it small"""
-_RIDGE = 1e-9
+_RIDGES = (1e-9, 1e-5, 1e-3, 3e-2, 1.0)
+"""of the difference from straight lines: the smallest leaves them wherever samples say so"""
+_HIDDEN, _TRIED = 17, 1 << 12
+"""one sample of so many is hidden, of at most so many, to choose among them"""
 _END, _END_RIDGE = 4, 1e-2
 _BLOCK, _OVERLAP = 1 << 15, 256
 _TABLE = 1 << 16
@@ -83,6 +92,7 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
     # The last even sample lies behind the last stamp, where the slope goes on.
     slope = (values[-1] - values[-2]) / (at[-1] - at[-2])
     line = np.interp(np.arange(count), np.r_[at, at[-1] + 1], np.r_[values, values[-1] + slope])
+    ridge = _best_ridge(at, values)
     for begin in range(0, count, _BLOCK):
         end = min(begin + _BLOCK, count)
         # A band of equations is solved for each block, so that its memory does not grow with the
@@ -92,12 +102,44 @@ def even_samples(seconds: np.ndarray, values: np.ndarray, usual: float) -> tuple
         # The small number keeps a stamp that lies on the block's last sample, whatever its
         # rounding.
         rows = slice(*np.searchsorted(at, [first, last - 1 + 1e-9]))
-        block = _fitted(at[rows] - first, values[rows], line[first:last])
+        block = _fitted(at[rows] - first, values[rows], line[first:last], ridge)
         even[begin:end] = block[begin - first : end - first]
     return step, even
 
 
-def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
+def _best_ridge(at: np.ndarray, values: np.ndarray) -> float:
+    """The one of `_RIDGES` that predicts hidden samples best.
+
+    Args:
+        at: where the samples stand (N,), in steps.
+        values: the samples (N,).
+    """
+    # From the middle, where the machine is most likely at work; the ends are pulled to the line
+    # whatever the ridge.
+    first = max(0, (at.size - _TRIED) // 2)
+    at, values = at[first : first + _TRIED], values[first : first + _TRIED]
+    at = at - np.floor(at[0])
+    hidden = np.zeros(at.size, bool)
+    # Not every so-many-th: a periodic pattern would be blind to motion of that period.
+    hidden[np.random.default_rng(0).permutation(at.size)[: at.size // _HIDDEN]] = True
+    hidden[: 2 * _END] = hidden[-2 * _END :] = False
+    if not hidden.any():
+        return _RIDGES[-1]
+    shown = ~hidden
+    line = np.interp(np.arange(int(np.ceil(at[-1])) + 1), at[shown], values[shown])
+    half = _TAPS // 2
+    columns = np.floor(at[hidden]).astype(np.int64)[:, None] + 1 + np.arange(_TAPS) - half
+    weights = _sinc(at[hidden][:, None] - columns)
+    weights /= weights.sum(1, keepdims=True)
+    errors = []
+    for ridge in _RIDGES:
+        even = _fitted(at[shown], values[shown], line, ridge)
+        near = even[np.clip(columns, 0, even.size - 1)]
+        errors.append(float(np.mean((np.sum(weights * near, axis=1) - values[hidden]) ** 2)))
+    return _RIDGES[int(np.argmin(errors))]
+
+
+def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray, ridge: float) -> np.ndarray:
     """Even samples (K,) of the signal through `values` (N,) at `at` (N,) in steps.
 
     What is looked for is the difference from straight lines (K,), so that a gap is bridged by one.
@@ -131,9 +173,8 @@ def _fitted(at: np.ndarray, values: np.ndarray, line: np.ndarray) -> np.ndarray:
     for lag in range(middle + 1):
         band[lag, : padded.size - lag] += energy[middle + lag]
     # Within a gap a slow signal costs neither misfit nor penalty, and the matrix would be singular.
-    # The ridge is far too small to be seen elsewhere, and draws the difference from the line to
-    # zero.
-    band[0] += _RIDGE
+    # The ridge draws the difference from the line to zero.
+    band[0] += ridge
     # At the ends samples stand on one side alone, and their noise would grow outward.
     band[0, : half + _END] += _END_RIDGE
     band[0, -half - _END :] += _END_RIDGE

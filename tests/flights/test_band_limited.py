@@ -59,3 +59,19 @@ def test_missing_samples_are_bridged_while_few():
     far = np.abs(times - 2.15) > 1.0
     np.testing.assert_allclose(y[far], np.sin(2 * np.pi * times[far]), atol=2e-3)
     assert np.all(np.isnan(decimate(t, np.full(2000, np.nan), times)))
+
+
+@pytest.mark.parametrize(("jitter", "lost"), [(0.2, 0.05), (0.0, 0.2), (0.45, 0.2)])
+def test_noise_passes_as_the_filter_lets_it(jitter, lost):
+    """White noise of sd 1 at 200 Hz has 0.47 at 50 Hz: lost samples may not multiply it."""
+    rng = np.random.default_rng(5)
+    t = (np.arange(6000) + jitter * rng.uniform(-1.0, 1.0, 6000)) / 200.0
+    t = t[rng.random(6000) > lost]
+    noise = rng.standard_normal(t.size)
+    at = t[0] + 0.02 + np.arange(1450) / 50.0
+    found = decimate(t, noise, at)
+    assert 0.4 < np.nanstd(found) < 0.6
+    assert np.nanmax(np.abs(found)) < 3.0
+    # A slow motion below it comes through as it is, within what noise is left.
+    moved = decimate(t, np.sin(2.0 * np.pi * t) + 0.01 * noise, at)
+    assert np.nanstd(moved - np.sin(2.0 * np.pi * at)) < 0.008
