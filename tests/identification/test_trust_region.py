@@ -8,7 +8,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from heli_jax.identification.estimation.trust_region import arrived, shortened
+from heli_jax.identification.estimation.trust_region import (
+    LevenbergMarquardt,
+    arrived,
+    within_radius,
+)
 
 RNG = np.random.default_rng(0)
 J = RNG.standard_normal((12, 4)) * [1.0, 1e-4, 30.0, 1e3]
@@ -20,7 +24,7 @@ class State(NamedTuple):
 
     y_eval: Any
     f_info: Any
-    num_steps_since_acceptance: Any
+    search_state: Any
 
 
 def at(r, J=J):
@@ -42,7 +46,8 @@ def test_a_search_has_arrived_within_a_hundredth_of_a_standard_deviation(scale):
     assert not arrived(at(residual(1.1e-4, scale=scale)), ALL, one)
     # Residuals are handed over divided by their norm.
     r = residual(0.9e-4, scale=scale) / 5.0
-    assert arrived(at(r), ALL, jnp.asarray(5.0)) and not arrived(at(r), ALL, jnp.asarray(6.0))
+    assert arrived(at(r), ALL, jnp.asarray(5.0))
+    assert not arrived(at(r), ALL, jnp.asarray(6.0))
 
 
 def test_unknowns_that_do_not_count_are_projected_out():
@@ -66,26 +71,59 @@ def test_what_is_no_number_has_not_arrived():
     assert not arrived(at(np.full(12, np.nan)), ALL, jnp.asarray(1.0))
 
 
-def after(r, tried, following, cost, refused=True):
-    y = np.array([1.0, 2.0, 3.0, 4.0])
-    state = State(jnp.asarray(y + following), at(r), jnp.asarray(int(refused)))
-    new = shortened(state, jnp.asarray(y), jnp.asarray(y + tried), jnp.asarray(cost))
-    return np.asarray(new.y_eval) - y
+SEARCH = LevenbergMarquardt(1e-9, jnp.asarray(1e-9), ALL).search
+Y = np.array([1.0, 2.0, 3.0, 4.0])
+
+
+def begun():
+    return SEARCH.init(jnp.asarray(Y), None)
+
+
+def judged(r, step, cost, region=None, first=False):
+    """What the trust region says of a step to where half the sum of squares is `cost`."""
+    reached = at(np.full(12, np.sqrt(cost / 6.0)))
+    region = begun() if region is None else region
+    step_size, accept, _, new = SEARCH.step(
+        jnp.asarray(first), jnp.asarray(Y), jnp.asarray(Y + step), at(r), reached, region
+    )
+    assert step_size == new.step_size
+    return bool(accept), new
+
+
+def cut(r, step, region):
+    """What is left of the next step."""
+    state = State(jnp.asarray(Y + step), at(r), region)
+    return np.asarray(within_radius(state, jnp.asarray(Y)).y_eval) - Y
 
 
 def test_the_step_after_a_refused_one_is_shorter():
     r = residual(1.0)
-    tried = -np.linalg.lstsq(J, r, rcond=None)[0]
-    begin, slope = 0.5 * r @ r, r @ J @ tried
+    step = -np.linalg.lstsq(J, r, rcond=None)[0]
+    begin, slope = 0.5 * r @ r, r @ J @ step
+    assert cut(r, 1e9 * step, begun()) == pytest.approx(1e9 * step)
     # The parabola through cost and slope here, and the cost there, has its lowest point at a third.
-    cost = begin + 0.5 * slope * (2.0 - 3.0)
-    assert after(r, tried, tried, cost) == pytest.approx(tried / 3.0)
+    accept, region = judged(r, step, begin - 0.5 * slope)
+    assert not accept
+    assert region.step_size < begun().step_size
+    assert cut(r, step, region) == pytest.approx(step / 3.0)
+    # Not in a direction that the data leave open: there is no size of that.
+    assert cut(r, 0.3 * step, region) == pytest.approx(0.3 * step)
     # Near the ends of what is sensible, and where there is no number at all.
-    assert after(r, tried, tried, begin + 1e-9 * slope) == pytest.approx(0.5 * tried)
+    assert cut(r, step, judged(r, step, begin)[1]) == pytest.approx(0.5 * step)
     for much in (1e6, np.inf, np.nan):
-        assert after(r, tried, tried, begin - much * slope) == pytest.approx(0.1 * tried)
-    # Damping may have shortened it by itself; then it stays, in the direction that it has.
-    turned = 0.01 * tried * [1.0, 2.0, 1.0, 1.0]
-    assert after(r, tried, turned, cost) == pytest.approx(turned)
-    # A step that was accepted has no say in the next.
-    assert after(r, tried, 7.0 * tried, cost, refused=False) == pytest.approx(7.0 * tried)
+        assert cut(r, step, judged(r, step, begin - much * slope)[1]) == pytest.approx(0.1 * step)
+
+
+def test_the_radius_grows_with_steps_that_do_as_predicted():
+    r = residual(1.0)
+    step = -np.linalg.lstsq(J, r, rcond=None)[0]
+    begin, slope = 0.5 * r @ r, r @ J @ step
+    _, region = judged(r, step, begin - 0.5 * slope)
+    part = step / 3.0
+    predicted = slope / 3.0 + 0.5 * np.sum((J @ part) ** 2)
+    accept, grown = judged(r, part, begin + predicted, region)
+    assert accept
+    assert cut(r, 9.0 * part, grown) == pytest.approx(3.0 * part)
+    accept, same = judged(r, part, begin + 0.5 * predicted, region)
+    assert accept
+    assert cut(r, 9.0 * part, same) == pytest.approx(part)

@@ -148,7 +148,7 @@ def _advance(constants: _Constants, state: _State, R: Float[Array, "k k"]) -> _S
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
     rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
-    new = trust_region.shortened(new, xi, state.solver.y_eval, 0.5 * jnp.sum(jnp.square(rows.r)))
+    new = trust_region.within_radius(new, xi)
     new = trust_region.within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     norm = constants.scaling.residual_norm
