@@ -10,9 +10,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from heli_jax.identification.estimation import trust_region
 from heli_jax.identification.estimation.estimator import measured_count
 from heli_jax.identification.estimation.residual import ResidualAndJacobian, differentiate
-from heli_jax.identification.estimation.trust_region import LevenbergMarquardt, within_reach
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
 
@@ -33,14 +33,12 @@ _COLUMN = 300.0
 then a hundred-thousandth of J'J; a step that fails raises it tenfold."""
 
 _TIKHONOV_SD = 100.0
-"""sd, in the coordinates of the free parameters (logarithms), of the Tikhonov regularisation that
-ties them to the start: a factor of e^100 is no prior, but it tells one end of a valley from the
-other"""
+"""sd, in the free parameters' coordinates (logarithms), of the Tikhonov regularisation that ties
+them to the start: a factor of e^100 is no prior, but tells one end of a valley from the other"""
 
 _TIKHONOV_SDS_LINEAR = 1e6
 """the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
 that the data would give it at the start if all else were known"""
-
 _REACH = 3.0
 """of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
 _MANY_STEPS = 60
@@ -107,12 +105,11 @@ _OPTIONS: dict[str, Any] = {"jac": "bwd"}
 """a Jacobian of numbers, which can be handed from step to step"""
 
 
-def _solver(constants: _Constants) -> LevenbergMarquardt:
-    # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
-    # and smaller gains drown in the rounding of the sum of squares. In the optimiser's units a
-    # standard deviation is 1 / (column norm * residual norm).
+def _solver(constants: _Constants) -> trust_region.LevenbergMarquardt:
+    # A step below a thousandth of a standard deviation, 1 / (column norm * residual norm), is the
+    # last: smaller gains drown in the rounding of the sum of squares.
     atol = 1e-3 / (_COLUMN * constants.scaling.residual_norm)
-    return LevenbergMarquardt(1e-9, atol, constants.convergence_mask)
+    return trust_region.LevenbergMarquardt(1e-9, atol, constants.convergence_mask)
 
 
 def _compressed(
@@ -151,8 +148,11 @@ def _advance(constants: _Constants, state: _State, R: Float[Array, "k k"]) -> _S
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
     rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
-    new = within_reach(new, xi, constants.reach, constants.scaling.unit)
+    new = trust_region.within_radius(new, xi)
+    new = trust_region.within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
+    norm = constants.scaling.residual_norm
+    done |= trust_region.arrived(new.f_info, constants.convergence_mask, norm)
     fine = result == optx.RESULTS.successful
     stepped = _State(xi, new, done | ~fine, done & fine)
     # Side by side a run that is done stays, while the slowest goes on.

@@ -1,7 +1,7 @@
 """optimistix's Levenberg-Marquardt with a trust region that opens faster and knows rounding."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,11 +15,37 @@ _ROUNDING = 1e-12
 """Part of the sum of squares below which a change is rounding."""
 
 
-class _TrustRegion(optx.ClassicalTrustRegion):
-    """optimistix's trust region, but a step whose gain would drown in rounding is accepted.
+_GROWTH = 3.0
+"""times the change of the residuals by a step that did as predicted may the next one make"""
+_ARRIVED = 1e-4
+"""of joint standard deviations, squared: no interval shows a hundredth of one, and steps that
+shrink by a fifth each take ten more to come to a thousandth"""
 
-    Otherwise such a step, which is the last, is rejected at random and the search lingers.
+
+class _Region(NamedTuple):
+    """How far to go next."""
+
+    step_size: Float[Array, ""]
+    """one over the damping"""
+    radius: Float[Array, ""]
+    """by how much the residuals may change; inf as long as no step was refused"""
+
+
+class _TrustRegion(optx.ClassicalTrustRegion):
+    """optimistix's trust region, but a step whose gain would drown in rounding is accepted, and
+    after one that is refused there is a radius as well as more damping.
+
+    Otherwise a step of negligible gain, which is the last, is rejected at random and the search
+    lingers. Damping alone does nothing until it comes to the size of what the data say: a search
+    that goes well has next to none, and tenfold of that would try a refused step again, time after
+    time. The radius is of the residuals' change, which directions that the data leave open do not
+    make.
     """
+
+    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> _Region:
+        """As optimistix: without a radius."""
+        begin = super().init(y, f_info_struct)
+        return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
 
     def step(
         self,
@@ -39,13 +65,21 @@ class _TrustRegion(optx.ClassicalTrustRegion):
             f_info, f_eval_info: residuals and Jacobian at each.
             state: the step size so far.
         """
-        size, accept, result, new = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         cost = f_info.as_min()
         gain = self.predict_reduction(y_eval - y, f_info)
         change = f_eval_info.as_min() - cost
         # Both: a small predicted gain alone would also let a step pass that raises the cost.
         negligible = (gain > -_ROUNDING * cost) & (change < _ROUNDING * cost)
-        return size, accept | negligible, result, new
+        accept |= negligible
+        moved = f_info.jac.mv(y_eval - y)
+        slope = jnp.sum(f_info.residual * moved)
+        # Where the parabola by slope and cost is lowest, within a tenth and a half (More, 1978).
+        part = -slope / (2.0 * (change - slope))
+        part = jnp.where(jnp.isfinite(part), jnp.clip(part, 0.1, 0.5), 0.1)
+        grown = jnp.where(change < self.high_cutoff * gain, _GROWTH * _norm2(moved), 0.0)
+        radius = jnp.where(accept, jnp.maximum(state.radius, grown), part * _norm2(moved))
+        return size, accept, result, _Region(size, radius)
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
@@ -101,6 +135,48 @@ def within_reach(
     # rather than shortened.
     nearer = jnp.clip(state.y_eval, y - reach, y + reach)
     return eqx.tree_at(lambda s: s.y_eval, state, nearer)
+
+
+def within_radius(state: Any, y: Float[Array, " q"]) -> Any:
+    """The solver's state, its next point no further from y than its radius.
+
+    Args:
+        state: after a step.
+        y: the unknowns at the last point that was accepted.
+    """
+    step = state.y_eval - y
+    size, radius = _norm2(state.f_info.jac.mv(step)), state.search_state.radius
+    nearer = y + step * jnp.minimum(1.0, radius / jnp.where(size > 0, size, 1.0))
+    # Where there is no radius the point is the solver's own, to the last digit.
+    return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
+
+
+def arrived(
+    f_info: Any, convergence_mask: Bool[Array, " q"], residual_norm: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a full Gauss-Newton step would take next to nothing off the sum of squares.
+
+    That gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations.
+    Unlike the length of a step it asks for no unit, and a direction that the data leave all but
+    open is not polished.
+
+    Args:
+        f_info: residuals and Jacobian at the last point that was accepted.
+        convergence_mask: the unknowns that count; the others go where they like.
+        residual_norm: by which the residuals are divided, those of a variance of 1.
+    """
+    J = f_info.jac.as_matrix()
+    counts = convergence_mask & jnp.any(J != 0, axis=0)
+    # In a triangle each unknown is freed of those before it: first the ones that do not count, then
+    # the ones that do. A column of zeros, that of an unknown that stays put, has no direction.
+    order = jnp.argsort(jnp.where(convergence_mask, jnp.where(counts, 1, 2), 0))
+    R = jnp.linalg.qr(jnp.concatenate([J[:, order], f_info.residual[:, None]], axis=1), mode="r")
+    gain = jnp.sum(jnp.where(counts[order], jnp.square(R[:-1, -1]), 0.0))
+    return gain * residual_norm**2 < _ARRIVED
+
+
+def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(jnp.square(v)))
 
 
 def _norm(convergence_mask: Bool[Array, " q"]) -> Callable[[Array], Array]:
