@@ -17,7 +17,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, zeros
-from heli_jax.dynamics.onboard.delays import ORDER, line_rates, line_states
+from heli_jax.dynamics.onboard.delays import ORDER, line_end, line_rates, line_states
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
 from heli_jax.naming import Record
 
@@ -247,9 +247,7 @@ class _Filtered(Device):
             for state, speed, section in _named(n, sections):
                 value = self._behind(s, state, speed, section, value)
             if n in self.delays:
-                # Legendre polynomials are one at the far end of the line: the sum is the value
-                # there.
-                value = sum(getattr(s, state) for state in line_states(n, self.orders[n]))
+                value = line_end([getattr(s, state) for state in line_states(n, self.orders[n])])
             logged[n] = value
         return naming.replace(y, **logged)
 
