@@ -130,7 +130,14 @@ def _add_convert_options(command: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="NAME",
-        help="'vehicle_attitude.*' (default all)",
+        help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)",
+    )
+    command.add_argument("--preset", metavar="NAME", help="its signals, by its names and in SI")
+    command.add_argument(
+        "--config",
+        metavar="CONFIG",
+        help="the signals of its first flight, by the model's names and in SI; or its swashplate, "
+        "for --signals ccpm.roll",
     )
     command.add_argument("--rate", type=float, metavar="HZ", help="resample to this rate")
     command.add_argument(
@@ -328,10 +335,13 @@ def _convert(options: argparse.Namespace) -> int:
     out = Path(options.out)
     convert.require_output(out, options.log)
     run_directory.require_place(out, f"{out}")
-    window = None if options.window is None else tuple(options.window)
-    selection = convert.Selection(
-        options.signals, options.rate, window, options.flight, options.time, options.time_unit
-    )
+    selection = cli_options.selection(options)
+    if options.config is not None:
+        _prepare_jax()
+        from heli_jax import workflow
+        from heli_jax.config.logs import as_configured
+
+        selection = as_configured(workflow.load_config(options.config), selection)
     converted = convert.convert_log(options.log, selection)
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)

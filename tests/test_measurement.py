@@ -10,6 +10,7 @@ from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.config.logs import read_flights
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.errors import InputError
+from heli_jax.flights.open_log import open_log
 from heli_jax.flights.vibration import folded, lines, notched
 from heli_jax.identification.fit import cautions
 from heli_jax.linear_models.read import linear_model
@@ -151,6 +152,26 @@ def test_settings_of_firmwares():
     logged = logged_filters("Rotorflight 4.6.0", newer, "gyroADC[0]")
     assert logged.unknown == ("gyro_lpf1_static_hz = 150 of type 7",)
     assert len(logged.filters) == 2
+
+
+def test_a_log_that_is_asked_for_its_filters_is_parsed_once(load, tmp_path, monkeypatch):
+    opened = []
+
+    def counted(path, number=None):
+        opened.append(str(path))
+        return open_log(path, number)
+
+    for module in ("heli_jax.config.opened_logs", "heli_jax.flights.sources"):
+        monkeypatch.setattr(f"{module}.open_log", counted)
+    logs = [flight(filter="from log") | {"window": window} for window in ([0, 4], [5, 9])]
+    experiment = load(*logs)
+    first, second = read_flights(experiment)
+    assert len(opened) == 1
+    assert (first.n_samples, second.n_samples) == (801, 801)
+    # Kept until then, and written anew since: read anew.
+    write_log(tmp_path / "flight.log", np.cos(TIMES), (("INS_GYRO_FILTER", 20.0), ("X", 1.0)))
+    assert read_flights(experiment)[0].outputs["p"][0] == 1.0
+    assert len(opened) == 3
 
 
 def test_lines_are_found_named_and_unfolded():
