@@ -102,18 +102,41 @@ def folded(hz: float, rate: float) -> float:
     return abs(hz - rate * round(hz / rate))
 
 
+def settling(frequencies: Sequence[float], q: float) -> float:
+    """How long notches take to forget how they began, to 5 % [s].
+
+    Args:
+        frequencies: centres of the notches [Hz].
+        q: centre over width.
+    """
+    # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
+    return 3.0 * q / (np.pi * min(frequencies))
+
+
 def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """A record (N,) without some frequencies: a causal notch for each, settled at the first sample.
 
+    Behind missing samples the notches begin anew, and what they give until they have settled is
+    missing as well.
+
     Args:
-        x: samples (N,), without gaps.
+        x: samples (N,), NaN where one is missing.
         dt: time between them [s].
         frequencies: centres of the notches [Hz], below half the rate.
         q: centre over width.
     """
     from scipy.signal import iirnotch, lfilter, lfilter_zi
 
-    for hz in frequencies:
-        b, a = iirnotch(hz, q, 1.0 / dt)
-        x = lfilter(b, a, x, zi=lfilter_zi(b, a) * x[0])[0]
+    x = np.array(x)
+    coefficients = [iirnotch(hz, q, 1.0 / dt) for hz in frequencies]
+    unsettled = int(np.ceil(settling(frequencies, q) / dt))
+    # Where samples begin and end to be there: pairs of first and last + 1.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
+    for first, last in edges.reshape(-1, 2):
+        for b, a in coefficients:
+            part = x[first:last]
+            x[first:last] = lfilter(b, a, part, zi=lfilter_zi(b, a) * part[0])[0]
+        # At the record's beginning inputs and outputs begin alike.
+        if first:
+            x[first : min(first + unsettled, last)] = np.nan
     return x
