@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
     _add_config(check)
+    check.add_argument("--json", action="store_true", help="everything, for other programs")
     windows = command("windows", _windows, "which parts of a log say most, before any fit")
     cli_options.add_windows_options(windows)
     _add_config(windows)
@@ -204,9 +205,19 @@ def _fit_code(fitted: "Fit") -> int:
 def _check(options: argparse.Namespace) -> int:
     _prepare_jax()
     from heli_jax import output, workflow
+    from heli_jax.report import files
 
-    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=_say)
-    output.print_check(check)
+    notes: list[str] = []
+
+    def said(note: str) -> None:
+        notes.append(note)
+        _say(note)
+
+    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=said)
+    if options.json:
+        print(files.as_json(files.check_json(check, notes)))
+    else:
+        output.print_check(check)
     hopeless = any(f.severity == "refuse" for f in check.findings)
     return DONE if check.verdict.identifiable and not hopeless else NOT_DETERMINED
 

@@ -9,6 +9,7 @@ its centre. In the firmware they are digital; docs/onboard.md says how far apart
 
 import functools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -283,6 +284,17 @@ def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str
     """Each section with the names of its state and of the state that is its rate."""
     for i, section in enumerate(sections):
         yield f"{name}_filter{i + 1}", f"{name}_filter{i + 1}_rate", section
+
+
+def states_behind(model: Model) -> frozenset[str]:
+    """The states of a model that are filters and delay lines behind its outputs.
+
+    Args:
+        model: any.
+    """
+    names = "|".join(map(re.escape, naming.names(model.Outputs)))
+    pattern = re.compile(rf"({names})_(filter\d+(_rate)?|late\d+)")
+    return frozenset(n for n in naming.names(model.State) if pattern.fullmatch(n))
 
 
 @functools.cache
