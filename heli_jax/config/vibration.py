@@ -12,7 +12,7 @@ from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.onto_grid import FEWEST
-from heli_jax.flights.vibration import Line, lines, notched, settling
+from heli_jax.flights.vibration import line_words, lines, notched, settling
 
 _Q = 10.0
 """of the notches: a rotor whose speed wanders by two percent stays within"""
@@ -98,18 +98,9 @@ def vibration_notes(
     for name, y in flight.outputs.items():
         found = lines(y, flight.dt, rotor, rates.get(name))
         if found:
-            told = "; ".join(_words(line, rotor) for line in found[:_NAMED])
+            told = "; ".join(line_words(line, rotor) for line in found[:_NAMED])
             notes.append(f"{name} vibrates: {told}")
     return tuple(notes)
-
-
-def _words(line: Line, rotor: float | None) -> str:
-    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g}% of its variance"
-    if line.aliased:
-        return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
-    if line.harmonic:
-        return f"{share} ({line.harmonic}/rev of the rotor)"
-    return f"{share} ({'no harmonic of the rotor' if rotor else 'of unknown origin'})"
 
 
 def _rotor_hz(
