@@ -57,10 +57,11 @@ def rotor_lines(log: ChannelLog) -> RotorLines | None:
     Args:
         log: one flight.
     """
-    for name in fitting_presets(log.format, log.names):
-        found = _by_preset(with_derived(log), preset(name))
-        if found is not None:
-            return found
+    with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
+        for name in fitting_presets(log.format, log.names):
+            found = _by_preset(with_derived(log), preset(name))
+            if found is not None:
+                return found
     return None
 
 
@@ -109,7 +110,9 @@ def _evenly(channel: Channel, start: float, end: float) -> tuple[np.ndarray, flo
     times, values = channel.times[inside], channel.values[inside]
     if times.size < 64 or np.any(np.diff(times) <= 0):
         return None
-    # By the mean step, of which jitter is a small part; `lines` puts up with a few lost samples.
-    step = float(np.median(np.diff(times)))
-    even = np.arange(times[0], times[-1], step)
+    step, length = float(np.median(np.diff(times))), float(times[-1] - times[0])
+    # Mostly gaps, which straight lines would fill, or hardly begun.
+    if length > 2 * step * times.size or length < 0.5 * (end - start):
+        return None
+    even = times[0] + step * np.arange(int(length / step))
     return np.interp(even, times, values), step
