@@ -318,13 +318,11 @@ def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:
         check: what is known before a fit.
         log_notes: what the reader of each log assumed, a sentence each.
     """
-    verdict = check.verdict
+    verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
     # Of a parameter that is not determined the number would be no expectation.
     lacking = {*verdict.undetermined, *verdict.without_effect}
-    expected = {
-        name: None if name in lacking else math.sqrt(verdict.covariance[i, i])
-        for i, name in enumerate(verdict.names)
-    }
+    pairs = zip(verdict.names, sd, strict=True)
+    expected = {name: None if name in lacking else value for name, value in pairs}
     return _plain(
         {
             "identifiable": verdict.identifiable,
