@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
     _add_config(check)
+    check.add_argument("--json", action="store_true", help="everything, for other programs")
     windows = command("windows", _windows, "which parts of a log say most, before any fit")
     cli_options.add_windows_options(windows)
     _add_config(windows)
@@ -130,7 +131,14 @@ def _add_convert_options(command: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="NAME",
-        help="'vehicle_attitude.*' (default all)",
+        help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)",
+    )
+    command.add_argument("--preset", metavar="NAME", help="its signals, by its names and in SI")
+    command.add_argument(
+        "--config",
+        metavar="CONFIG",
+        help="the signals of its first flight, by the model's names and in SI; or its swashplate, "
+        "for --signals ccpm.roll",
     )
     command.add_argument("--rate", type=float, metavar="HZ", help="resample to this rate")
     command.add_argument(
@@ -197,9 +205,19 @@ def _fit_code(fitted: "Fit") -> int:
 def _check(options: argparse.Namespace) -> int:
     _prepare_jax()
     from heli_jax import output, workflow
+    from heli_jax.report import files
 
-    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=_say)
-    output.print_check(check)
+    notes: list[str] = []
+
+    def said(note: str) -> None:
+        notes.append(note)
+        _say(note)
+
+    check = workflow.run_check(workflow.load_config(options.config, options.set), progress=said)
+    if options.json:
+        print(files.as_json(files.check_json(check, notes)))
+    else:
+        output.print_check(check)
     hopeless = any(f.severity == "refuse" for f in check.findings)
     return DONE if check.verdict.identifiable and not hopeless else NOT_DETERMINED
 
@@ -328,10 +346,13 @@ def _convert(options: argparse.Namespace) -> int:
     out = Path(options.out)
     convert.require_output(out, options.log)
     run_directory.require_place(out, f"{out}")
-    window = None if options.window is None else tuple(options.window)
-    selection = convert.Selection(
-        options.signals, options.rate, window, options.flight, options.time, options.time_unit
-    )
+    selection = cli_options.selection(options)
+    if options.config is not None:
+        _prepare_jax()
+        from heli_jax import workflow
+        from heli_jax.config.logs import as_configured
+
+        selection = as_configured(workflow.load_config(options.config), selection)
     converted = convert.convert_log(options.log, selection)
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)

@@ -2,6 +2,12 @@
 
 import argparse
 import math
+from typing import TYPE_CHECKING
+
+from heli_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from heli_jax.flights.convert import Selection
 
 
 def add_simulate_options(command: argparse.ArgumentParser) -> None:
@@ -38,6 +44,34 @@ def add_sweep_options(command: argparse.ArgumentParser) -> None:
         "--scheduler",
         metavar="tcp://HOST:8786",
         help="compute on the workers of this dask scheduler",
+    )
+
+
+def selection(options: argparse.Namespace) -> "Selection":
+    """What `heli-jax convert` takes of a log.
+
+    Raises:
+        InputError: options that exclude one another, or no such preset.
+    """
+    from heli_jax.flights import convert, named
+
+    if options.preset is not None and (options.signals or options.config is not None):
+        other = "--signals" if options.signals else "--config"
+        raise InputError(f"--preset: names the columns, expected it without {other}")
+    by_preset = None
+    if options.preset is not None:
+        try:
+            by_preset = named.by_preset(options.preset)
+        except ValueError as e:
+            raise InputError(f"--preset: {e}") from e
+    return convert.Selection(
+        options.signals,
+        options.rate,
+        None if options.window is None else tuple(options.window),
+        options.flight,
+        options.time,
+        options.time_unit,
+        by_preset,
     )
 
 

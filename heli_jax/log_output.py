@@ -13,6 +13,8 @@ from typing import Any
 
 from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
+from heli_jax.flights.rotor_lines import LEAST, RotorLines
+from heli_jax.flights.vibration import SMALLEST, line_words
 
 # The width of a terminal that nobody has widened.
 _WIDTH = 80
@@ -21,6 +23,8 @@ _MOST_CHANNELS = 150
 _MOST_LINES = 10
 """of gaps, and of notes"""
 _MOST_FILTERS = 40
+_MOST_VIBRATIONS = 3
+"""of a channel"""
 _NUMBER = 10
 """columns of the screen for a number"""
 
@@ -64,6 +68,7 @@ def _flight_content(flight: LogInfo) -> dict[str, Any]:
     whole |= {"duration": flight.duration, "notes": flight.notes}
     # A table of rows is shown as a log of one topic, so that a script needs to know one shape.
     topics = flight.topics or (TopicInfo("", flight.n_rows, flight.time, flight.columns),)
+    whole["vibration"] = _vibration_content(flight.vibration)
     whole["topics"] = [_topic_content(topic) for topic in topics]
     return whole | {"filters": dict(flight.filters), "parameters": dict(flight.parameters)}
 
@@ -108,6 +113,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"
+    yield from _vibration_lines(flight.vibration)
     yield from _topic_lines(flight.topics)
     yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
     yield from _setting_lines(flight)
@@ -140,6 +146,38 @@ def _gap_words(clock: TimeInfo) -> str:
         return "no gaps"
     longest = max(gap.length for gap in clock.gaps)
     return f"{len(clock.gaps)} gaps, the longest {longest:.4g} s"
+
+
+def _vibration_lines(found: RotorLines | None) -> Iterator[str]:
+    if found is None:
+        return
+    if not found.signals:
+        yield f"rotor: {found.channel} is not steady for {LEAST:g} s, no lines are named"
+        return
+    yield (
+        f"rotor: {found.hz:.4g} Hz by {found.channel}, steady from {found.start:.4g} s to "
+        f"{found.end:.4g} s"
+    )
+    quiet = [each.channel for each in found.signals if not each.lines]
+    for each in found.signals:
+        for line in each.lines[:_MOST_VIBRATIONS]:
+            yield f"  {each.channel}: {line_words(line, found.hz)}"
+    if quiet:
+        yield f"  no line above {100 * SMALLEST:g}% of the variance: {', '.join(quiet)}"
+
+
+def _vibration_content(found: RotorLines | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    signals = [
+        {
+            "signal": each.signal,
+            "channel": each.channel,
+            "lines": [line._asdict() | {"aliased": line.aliased} for line in each.lines],
+        }
+        for each in found.signals
+    ]
+    return found._asdict() | {"signals": signals}
 
 
 def _topic_lines(topics: Sequence[TopicInfo]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from heli_jax import run_directory
 from heli_jax.config import Experiment
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import check, findings, fit
+from heli_jax.identification.fit import check, findings, fit, rates
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
@@ -113,7 +113,8 @@ def run_fit(
         began: when the work began, by `time.perf_counter` [s]; now unless given.
 
     Raises:
-        InputError: a log or something of the configuration is wrong, or `out` exists.
+        InputError: a log or something of the configuration is wrong, a log is too slow for the
+            model at its start values (docs/enough.md), or `out` exists.
     """
     began = time.perf_counter() if began is None else began
     if out is not None:
@@ -125,6 +126,10 @@ def run_fit(
         progress(note)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
+    for finding in rates(problem):
+        # Its estimates would look like any others, so what `check` refuses is not fitted.
+        if finding.severity == "refuse":
+            raise InputError(f"{config.path}: fit: {finding.sentence}")
     # Part of the report, which a script that asks for none need not wait for.
     enough = findings(problem) if out is not None else ()
     try:

@@ -1,5 +1,7 @@
 """What a configuration says of filters, delays and vibration between motion and log."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -8,8 +10,11 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax.config.firmware_filters import logged_filters
 from heli_jax.config.logs import read_flights
+from heli_jax.config.vibration import with_notches
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.errors import InputError
+from heli_jax.flights import Flight, Source
+from heli_jax.flights.open_log import open_log
 from heli_jax.flights.vibration import folded, lines, notched
 from heli_jax.identification.fit import cautions
 from heli_jax.linear_models.read import linear_model
@@ -153,6 +158,26 @@ def test_settings_of_firmwares():
     assert len(logged.filters) == 2
 
 
+def test_a_log_that_is_asked_for_its_filters_is_parsed_once(load, tmp_path, monkeypatch):
+    opened = []
+
+    def counted(path, number=None):
+        opened.append(str(path))
+        return open_log(path, number)
+
+    for module in ("heli_jax.config.opened_logs", "heli_jax.flights.sources"):
+        monkeypatch.setattr(f"{module}.open_log", counted)
+    logs = [flight(filter="from log") | {"window": window} for window in ([0, 4], [5, 9])]
+    experiment = load(*logs)
+    first, second = read_flights(experiment)
+    assert len(opened) == 1
+    assert (first.n_samples, second.n_samples) == (801, 801)
+    # Kept until then, and written anew since: read anew.
+    write_log(tmp_path / "flight.log", np.cos(TIMES), (("INS_GYRO_FILTER", 20.0), ("X", 1.0)))
+    assert read_flights(experiment)[0].outputs["p"][0] == 1.0
+    assert len(opened) == 3
+
+
 def test_lines_are_found_named_and_unfolded():
     rng = np.random.default_rng(3)
     slow = np.sin(2 * np.pi * 0.4 * TIMES) + 0.05 * rng.standard_normal(TIMES.size)
@@ -193,6 +218,27 @@ def test_notches_on_both_sides_bias_nothing(load, tmp_path):
         load(shaken | {"notch": 24.2})
     with pytest.raises(InputError, match=r"vibration\.unit"):
         read_flights(load(flight() | {"vibration": {"rotor": 24.2, "unit": "kg"}}))
+
+
+def test_a_notch_begins_anew_behind_missing_samples():
+    x = np.sin(2 * np.pi * 0.4 * TIMES) + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES)
+    b, a = scipy.signal.iirnotch(24.2, 10.0, 1 / DT)
+    whole = scipy.signal.lfilter(b, a, x, zi=scipy.signal.lfilter_zi(b, a) * x[0])[0]
+    y = np.where((TIMES > 4.0) & (TIMES < 4.2), np.nan, x)
+    gap = Flight(DT, {"lat": x}, {"p": y}, source=Source("flight.log", "0"))
+    clean = with_notches(gap, [24.2], "notch")
+    np.testing.assert_array_equal(clean.inputs["lat"], whole)
+    got = clean.outputs["p"]
+    # Its free motion is down to a twentieth after three time constants, Q/(pi f).
+    settled = 30.0 / (np.pi * 24.2) < TIMES - 4.2
+    assert np.array_equal(np.isfinite(got), (TIMES <= 4.0) | settled)
+    np.testing.assert_array_equal(got[TIMES <= 4.0], whole[TIMES <= 4.0])
+    np.testing.assert_allclose(got[settled], whole[settled], atol=0.05 * 0.4)
+    np.testing.assert_allclose(got[TIMES > 6.0], whole[TIMES > 6.0], atol=1e-3)
+    assert "79 of 1961 samples are left out" in clean.source.notes[-1]
+    slow = replace(gap, outputs={"p": np.where(np.arange(2000) % 10, np.nan, x)})
+    with pytest.raises(InputError, match="which leaves 1 of its 200 samples; expected a window"):
+        with_notches(slow, [24.2], "notch")
 
 
 def test_a_fit_repeats_the_cautions_once(load):

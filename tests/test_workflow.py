@@ -171,3 +171,30 @@ def test_a_unit_that_nobody_stated_is_told(config, tmp_path, capsys):
     with_units = heli_jax.run_fit(config)
     assert with_units.problem.flights[0].source.notes == ()
     assert with_units.fit.estimates == saved.estimates
+
+
+def test_what_check_refuses_is_not_fitted(config, tmp_path, capsys):
+    """Of a roll that swings at a third of a hertz nothing is left at half a hertz."""
+    rows = (config.parent / "bench.csv").read_text().splitlines()
+    (tmp_path / "bench.csv").write_text("\n".join([rows[0], *rows[1::100]]) + "\n")
+    path = tmp_path / "slow.yaml"
+    path.write_text(config.read_text().replace("unit: m}", "unit: m, hold: linear}"))
+    assert main(["fit", str(path), "--out", str(tmp_path / "fit")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "slow.yaml: fit: flight 1: x_roll was sampled at 0.5 Hz while it moved" in said
+    assert "so this log cannot be fitted with this model; log at" in said
+    assert not (tmp_path / "fit").exists()
+
+
+def test_a_check_for_other_programs(config, capsys):
+    assert main(["check", str(config), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    check = heli_jax.run_check(config)
+    assert (found["identifiable"], found["refused"]) == (True, False)
+    assert [(f["topic"], f["sentence"]) for f in found["record"]] == [
+        (f.topic, f.sentence) for f in check.findings
+    ]
+    sd = found["expected_relative_sd"]
+    np.testing.assert_allclose(list(sd.values()), np.sqrt(np.diag(check.verdict.covariance)))
+    assert list(sd) == ["Ixx", "If"]
+    assert found["noise_sd"] == {"flight 1/roll": 0.002}

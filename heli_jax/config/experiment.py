@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 from heli_jax import models, naming
 from heli_jax.config.measurement import with_measurement
 from heli_jax.config.onboard import with_onboard
+from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
@@ -29,10 +30,13 @@ class Experiment(NamedTuple):
     """the file it came from; its folder is where relative paths begin"""
     model: Model
     vehicle: Vehicle
+    logs: OpenedLogs
+    """those that were opened for the model's sake, until the flights are read"""
 
 
 def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Experiment:
-    """Read and validate a configuration, its model and its vehicle; no log is opened yet.
+    """Read and validate a configuration, its model and its vehicle; a log is opened where its
+    settings are part of the model, no other yet.
 
     Args:
         path: the configuration (YAML); paths in it begin at its folder.
@@ -53,25 +57,26 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
             _override(content, text)
     config = _validated(content, str(path))
     # The model before the vehicle, since its Params say which constants a vehicle may have.
-    model = _model(config, path)
+    logs = OpenedLogs()
+    model = _model(config, path, logs)
     vehicle = _vehicle(config, path, model)
-    return Experiment(config, path, model, vehicle)
+    return Experiment(config, path, model, vehicle, logs)
 
 
-def _model(config: Config, path: Path) -> Model:
+def _model(config: Config, path: Path, logs: OpenedLogs) -> Model:
     folder = path.absolute().parent
     if isinstance(config.model, LinearConfig):
         if config.corrections is not None:
             # Corrections are of the equations of the whole helicopter; the entries of a linear
             # model are what its file says.
             raise InputError(f"{path}: corrections: a linear model takes none")
-        return _started(config, path, _linear(config.model, path).model)
+        return _started(config, path, _linear(config.model, path).model, logs)
     model = models.by_name(config.model, f"{path}: model", folder)
     # Looked up without corrections first: a name that no model has is an error of `model`.
     if config.corrections is not None:
         where = f"{path}: corrections"
         model = models.by_name(config.model, where, folder, corrections=config.corrections)
-    return _started(config, path, model)
+    return _started(config, path, model, logs)
 
 
 def _linear(model: LinearConfig, path: Path) -> LinearModel:
@@ -82,13 +87,13 @@ def _linear(model: LinearConfig, path: Path) -> LinearModel:
         raise InputError(f"{path}: model.linear: {e}") from e
 
 
-def _started(config: Config, path: Path, model: Model) -> Model:
+def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Model:
     """The model with the configuration's devices around it, and its initial state."""
     # The devices first: their states can be named in the initial state as those of the bare model
     # are.
     model = with_onboard(model, config.onboard, path)
     # Behind all of them, since it is what the autopilot did to what its sensors had.
-    model = with_measurement(model, config.flights, path)
+    model = with_measurement(model, config.flights, path, logs)
     if not config.initial_state:
         return model
     for name in config.initial_state:
@@ -117,7 +122,7 @@ def in_wind(experiment: Experiment) -> Experiment:
         corrections=config.corrections,
         wind=True,
     )
-    return experiment._replace(model=_started(config, path, model))
+    return experiment._replace(model=_started(config, path, model, experiment.logs))
 
 
 def _override(content: dict[str, Any], text: str) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 from heli_jax import naming, units
@@ -19,9 +18,10 @@ from heli_jax.config.vibration import vibration_notes, with_notches
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
-from heli_jax.flights.derived import with_derived
+from heli_jax.flights.convert import Selection
+from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.open_log import open_log
+from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.table import Table
 
 
@@ -42,11 +42,13 @@ def read_flights(
     config, path = experiment.config, experiment.path
     if not config.flights:
         raise InputError(f"{path}: flights: expected at least one log, got none")
-    return tuple(
+    flights = tuple(
         flight
         for i, f in enumerate(config.flights)
         for flight in _read_flight(experiment, i, f, gain, moving_inputs)
     )
+    experiment.logs.close()
+    return flights
 
 
 def _read_flight(
@@ -63,8 +65,10 @@ def _read_flight(
     # window is otherwise told before minutes of reading.
     asked = f.signals.preset is not None or f.signals.ccpm is not None
     swashplate = None if f.signals.ccpm is None else f.signals.ccpm.swashplate()
-    log = with_derived(open_log(path, f.flight), swashplate) if asked else None
-    named = _resolved(experiment, f, f"{where}.signals", log)
+    logs = experiment.logs
+    opened = logs.open(path, f.flight) if asked else logs.get(path, f.flight)
+    log = None if opened is None else with_derived(opened, swashplate)
+    named = _resolved(experiment, f, f"{where}.signals", log if asked else None)
     # Of all logs together: what one lacks may stand in another.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
@@ -83,7 +87,7 @@ def _read_flight(
             name=f.name or f"flight {i + 1}",
             moving_inputs=moving,
             number=f.flight,
-            also=tuple(_also(experiment.path.parent, a, inputs, outputs) for a in f.also),
+            also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
         )
     except InputError:
         raise  # it names the log and the line already
@@ -138,12 +142,17 @@ def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
 
 
 def _also(
-    folder: Path, also: AlsoConfig, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal]
+    experiment: Experiment,
+    also: AlsoConfig,
+    inputs: Mapping[str, Signal],
+    outputs: Mapping[str, Signal],
 ) -> Also:
     """A further log, its signals with units as `signals` checked them."""
     align, time = also.align, also.signals.time
+    path = experiment.path.parent / also.log
+    opened = experiment.logs.get(path, also.flight)
     return Also(
-        str(folder / also.log),
+        str(path),
         align.same,
         align.to,
         {n: inputs[n] for n in also.signals.inputs},
@@ -151,7 +160,56 @@ def _also(
         None if time is None else Signal(time.signal, time.unit, "s"),
         also.flight,
         align.reverse,
+        None if opened is None else with_derived(opened),
     )
+
+
+def as_configured(experiment: Experiment, selection: Selection) -> Selection:
+    """What is taken of a log where a configuration's first flight says what its signals are.
+
+    Args:
+        experiment: the configuration.
+        selection: goes before what the configuration says of rate, flight and clock. Without
+            signals of its own the columns are the model's inputs and outputs, in SI.
+
+    Raises:
+        InputError: the configuration has no flight.
+    """
+    config, path = experiment.config, experiment.path
+    if not config.flights:
+        raise InputError(f"{path}: flights: expected at least one log, got none")
+    first = config.flights[0]
+    time, ccpm = first.signals.time, first.signals.ccpm
+    return dataclasses.replace(
+        selection,
+        rate=first.rate if selection.rate is None else selection.rate,
+        flight=first.flight if selection.flight is None else selection.flight,
+        time=time.signal if selection.time is None and time is not None else selection.time,
+        time_unit=time.unit if selection.time is None and time is not None else selection.time_unit,
+        named=None if selection.signals else _columns(experiment),
+        swashplate=None if ccpm is None else ccpm.swashplate(),
+    )
+
+
+def _columns(experiment: Experiment) -> NamedBy:
+    """What names columns after the inputs and outputs of the first flight."""
+    config, path = experiment.config, experiment.path
+    first, where = config.flights[0], f"{path}: flights[0]"
+    gain = config.fit is not None and config.fit.nuisance.input_gain
+
+    def named(log: DerivedTable | DerivedLog) -> Named:
+        own = _resolved(experiment, first, f"{where}.signals", log)
+        everything = _with_also(own, first, where)
+        inputs, outputs = _of_model(experiment.model, everything, f"{where}.signals", gain)
+        both = {n: inputs[n] for n in own.inputs} | {n: outputs[n] for n in own.outputs}
+        constants = [n for n, signal in both.items() if signal.constant is not None]
+        notes = [f"{n} is a constant of {path}, and no column" for n in constants]
+        notes += [f"what {path} takes from {also.log} is left out" for also in first.also]
+        notes += [*_unstated_units(experiment.model, own), *own.notes]
+        signals = {n: signal for n, signal in both.items() if n not in constants}
+        return Named(signals, tuple(notes))
+
+    return named
 
 
 def _read_one(path: Any, **request: Any) -> tuple[Flight, ...]:

@@ -1,6 +1,5 @@
 """What stands between motion and log according to the flights' outputs: filters and delays."""
 
-import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,23 +8,27 @@ from typing import Any
 from heli_jax import naming
 from heli_jax.config.firmware_filters import LoggedFilters, logged_filters
 from heli_jax.config.onboard import FROM_LOG
+from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, with_filters
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Source
-from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.log import ChannelLog
 
 type _Channel = tuple[tuple[Filter, ...], float]
 
 
-def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) -> Model:
+def with_measurement(
+    model: Model, flights: Sequence[FlightConfig], path: Path, logs: OpenedLogs
+) -> Model:
     """The model with the filters and delays that the flights state for their outputs.
 
     Args:
         model: with the devices of `onboard` around it.
         flights: of the configuration.
         path: the configuration; logs are found from its folder.
+        logs: those that are open; one whose settings are asked for is among them then.
 
     Raises:
         InputError: two flights state different ones, a log does not say what it is asked, or the
@@ -36,7 +39,7 @@ def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) 
         for part, name, output in _outputs(flight):
             if name not in naming.names(model.Outputs):
                 continue  # refused where the log is read, with the names that there are
-            channel = _channel(part, i, name, output, path)
+            channel = _channel(part, f"flights[{i}].signals.outputs.{name}", output, path, logs)
             first, at = channels.setdefault(name, (channel, i))
             # One model serves all flights, so that one program does.
             if first != channel:
@@ -63,43 +66,24 @@ def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
             yield part, name, output
 
 
-def _channel(part: Any, i: int, name: str, output: OutputConfig, path: Path) -> _Channel:
+def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: OpenedLogs) -> _Channel:
     """The filters and the delay of one output."""
     filters: list[Filter] = []
     for config in output.filter or ():
         if config.kind != FROM_LOG:
             filters.append(config.filter)
             continue
-        log = str((path.parent / part.log).absolute())
-        logged = logged_filters(*_settings(log, part.flight, _version(log)), output.signal)
+        log = logs.open(path.parent / part.log, part.flight)
+        # A table has no settings.
+        settings = (log.firmware, log.parameters) if isinstance(log, ChannelLog) else ("", {})
+        logged = logged_filters(*settings, output.signal)
         if logged is None:
             raise InputError(
-                f"{path}: flights[{i}].signals.outputs.{name}.filter: {part.log} does not say "
-                f"how {output.signal} was filtered, expected a filter such as "
-                "{kind: biquad, hz: 30}"
+                f"{path}: {where}.filter: {part.log} does not say how {output.signal} was "
+                "filtered, expected a filter such as {kind: biquad, hz: 30}"
             )
         filters += logged.filters
     return tuple(filters), output.delay or 0.0
-
-
-def _version(log: str) -> tuple[int, int]:
-    """By which a log that was written anew is known."""
-    try:
-        stat = Path(log).stat()
-    except OSError:  # the reader says what is wrong with it
-        return 0, 0
-    return stat.st_mtime_ns, stat.st_size
-
-
-# Of the last log only: its outputs are asked for one after the other, and it may take seconds to
-# read.
-@functools.lru_cache(maxsize=1)
-def _settings(log: str, number: int | None, version: tuple[int, int]) -> tuple[str, Any]:
-    """Firmware and settings of a log."""
-    opened = chosen_flights(log, open_flights(log), number)
-    if not isinstance(opened, tuple):
-        return "", {}
-    return opened[0].firmware, opened[0].parameters
 
 
 def _words(channel: _Channel) -> str:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,10 +11,13 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.vibration import Line, lines, notched
+from heli_jax.flights.onto_grid import FEWEST
+from heli_jax.flights.vibration import line_words, lines, notched, settling
 
 _Q = 10.0
 """of the notches: a rotor whose speed wanders by two percent stays within"""
+_LEFT = 0.5
+"""part of an output's samples that notches have to leave"""
 _NAMED = 3
 """lines that are told of an output"""
 
@@ -31,7 +34,8 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
         where: what a sentence about a wrong one begins with.
 
     Raises:
-        InputError: a frequency that the samples do not have, or an output with missing samples.
+        InputError: a frequency that the samples do not have, or an output with so many gaps that
+            the notches hardly ever settle.
     """
     if not frequencies:
         return flight
@@ -41,22 +45,37 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
                 f"{where}: expected less than half the rate of {1 / flight.dt:.4g} Hz, got "
                 f"{hz:g} Hz"
             )
-    for name, y in flight.outputs.items():
-        if np.isnan(y).any():
-            raise InputError(
-                f"{where}: output {name} has missing samples, which a notch would spread; expected "
-                "a window without them, or no notch"
-            )
     inputs, outputs = (
         {n: notched(x, flight.dt, frequencies, _Q) for n, x in signals.items()}
         for signals in (flight.inputs, flight.outputs)
     )
+    lost = _lost(flight, outputs, settling(frequencies, _Q), where)
     source = flight.source
     if source is not None:
         listed = ", ".join(f"{hz:g}" for hz in frequencies)
         note = f"inputs and outputs notched at {listed} Hz (Q {_Q:g})"
-        source = dataclasses.replace(source, notes=(*source.notes, note))
+        source = dataclasses.replace(source, notes=(*source.notes, note, *lost))
     return dataclasses.replace(flight, inputs=inputs, outputs=outputs, source=source)
+
+
+def _lost(
+    flight: Flight, outputs: Mapping[str, np.ndarray], settled: float, where: str
+) -> tuple[str, ...]:
+    """What notches that begin anew behind missing samples cost, a sentence for each output."""
+    notes = []
+    for name, y in flight.outputs.items():
+        there, left = int(np.isfinite(y).sum()), int(np.isfinite(outputs[name]).sum())
+        if left == there:
+            continue
+        words = f"behind missing samples of {name} notches take {settled:.2g} s to settle"
+        if left < max(FEWEST, _LEFT * there):
+            raise InputError(
+                f"{where}: {words}, which leaves {left} of its {there} samples; expected a window "
+                "with fewer gaps, `gaps: split` where they are long, a rate as low as that of the "
+                "slowest output, or no notch"
+            )
+        notes.append(f"{words}, and {there - left} of {there} samples are left out for it")
+    return tuple(notes)
 
 
 def vibration_notes(
@@ -79,18 +98,9 @@ def vibration_notes(
     for name, y in flight.outputs.items():
         found = lines(y, flight.dt, rotor, rates.get(name))
         if found:
-            told = "; ".join(_words(line, rotor) for line in found[:_NAMED])
+            told = "; ".join(line_words(line, rotor) for line in found[:_NAMED])
             notes.append(f"{name} vibrates: {told}")
     return tuple(notes)
-
-
-def _words(line: Line, rotor: float | None) -> str:
-    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g}% of its variance"
-    if line.aliased:
-        return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
-    if line.harmonic:
-        return f"{share} ({line.harmonic}/rev of the rotor)"
-    return f"{share} ({'no harmonic of the rotor' if rotor else 'of unknown origin'})"
 
 
 def _rotor_hz(

@@ -10,9 +10,12 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.ccpm import Swashplate
+from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
 from heli_jax.flights.describe import describe_table
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.named import NamedBy
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
@@ -34,12 +37,15 @@ class Selection:
     """What is taken of a log.
 
     Attributes:
-        signals: names of channels, in which * stands for anything; all where there are none.
+        signals: names of channels, in which * stands for anything, and of derived ones; all
+            channels where there are none.
         rate: to resample to [Hz]; without it the samples stay as they are.
         window: first and last time [s] from the log's beginning.
         flight: which flight of a file that holds several, from 1.
         time: of a table the column of time stamps; guessed where it is not given.
         time_unit: of these stamps; guessed likewise.
+        named: what names the columns in place of `signals`, which are then in SI.
+        swashplate: of the channels `ccpm.collective`, `ccpm.roll` and `ccpm.pitch`.
     """
 
     signals: Sequence[str] = ()
@@ -48,6 +54,8 @@ class Selection:
     flight: int | None = None
     time: str | None = None
     time_unit: str | None = None
+    named: NamedBy | None = None
+    swashplate: Swashplate | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +81,22 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     """
     # Before the log is opened, which may take minutes.
     _check(str(path), selection)
-    log = open_log(path, selection.flight)
-    notes: list[str] = []
-    if not isinstance(log, ChannelLog):
-        log = _as_channels(log, selection, notes)
+    log = with_derived(open_log(path, selection.flight), selection.swashplate)
+    # Asked before a table has lost the form of one, by which a preset may know it.
+    named = None if selection.named is None else selection.named(log)
+    notes = [] if named is None else list(named.notes)
+    if isinstance(log, DerivedTable):
+        log = with_derived(_as_channels(log.table, selection, notes), selection.swashplate)
+        assert isinstance(log, DerivedLog)
     elif selection.time or selection.time_unit:
         raise wrong(log.path, "its topics have clocks of their own, expected no time to be stated")
     notes += log.notes
-    names = _names(log, selection.signals)
-    clocks = _clocks(log, names, selection, notes)
+    if named is None:
+        names = _names(log, selection.signals)
+    else:
+        names = list(dict.fromkeys(signal.name for signal in named.signals.values()))
+    required = bool(selection.signals) if named is None else named.required
+    clocks = _clocks(log, names, selection.window, required, notes)
     names = [name for name in names if log.topic_of(name).name in clocks]
     # Nothing is resampled that was not asked to be: a copy at the log's own samples loses nothing.
     if selection.rate is None:
@@ -93,8 +108,12 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
             # A table has a value in every row; a fit takes slow outputs as missing in between.
             if selection.rate * clock.usual > _INTERPOLATED:
                 notes.append(f"{clock.words}: interpolated, so its noise is no longer white")
-    notes += _missing(columns)
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
+    if named is not None:
+        taken = {n: s for n, s in named.signals.items() if s.name in columns}
+        units = {n: s.si for n, s in taken.items()}
+        columns = {TIME: columns[TIME], **{n: s.to_si(columns[s.name]) for n, s in taken.items()}}
+    notes += _missing(columns)
     return Converted(columns, {TIME: "s"} | units, tuple(notes))
 
 
@@ -132,7 +151,7 @@ def _as_channels(table: Table, selection: Selection, notes: list[str]) -> Channe
     return ChannelLog(table.path, table.format, table.size, table.sha256, (topic,))
 
 
-def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
+def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
     """The channels that are asked for, in the order of the patterns; without any, all but the
     clocks themselves."""
     if not patterns:
@@ -152,6 +171,8 @@ def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
             # The brackets of gyroADC[0] are meant as they stand.
             literal = pattern.replace("[", "[[]")
             matches = [n for n in log.names if fnmatch.fnmatchcase(n, literal)]
+            if not matches and log.is_derived(pattern):
+                matches = [pattern]
             if not matches:
                 known = {n[:60] for n in log.names}
                 problem = f"no channel {shown(pattern)}{nearest(pattern[:60], known)}"
@@ -167,11 +188,15 @@ def _names(log: ChannelLog, patterns: Sequence[str]) -> list[str]:
 
 
 def _clocks(
-    log: ChannelLog, names: Sequence[str], selection: Selection, notes: list[str]
+    log: ChannelLog,
+    names: Sequence[str],
+    window: tuple[float, float] | None,
+    required: bool,
+    notes: list[str],
 ) -> dict[str, TopicClock]:
     """The clocks of the topics that hold the channels, by the topics' names.
 
-    A topic that has none is an error where its channels are asked for, otherwise a note.
+    A topic that has none is an error where its channels are required, otherwise a note.
     """
     clocks, problems = {}, []
     for topic in dict.fromkeys(log.topic_of(name) for name in names):
@@ -179,11 +204,11 @@ def _clocks(
         times, _ = log.channel(next(iter(topic.columns)))
         elapsed = times - log.first_time
         try:
-            clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, selection.window)
+            clocks[topic.name] = topic_clock(log.path, topic.name, elapsed, window)
         except InputError as e:
             # Who asks for a signal has to hear that it cannot be had. Who asks for all wants what
             # there is.
-            if selection.signals:
+            if required:
                 raise
             problems.append(e)
             notes.append(f"left out: {str(e).removeprefix(f'{log.path}, ')}")
@@ -193,7 +218,7 @@ def _clocks(
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
         # Only where nothing is asked for: who names a short topic wants just that.
-        if not selection.signals and span < _SHARE * max(spans.values()):
+        if not required and span < _SHARE * max(spans.values()):
             del clocks[name]
             notes.append(f"left out: topic {shown(name)}, which covers {span:.3g} s")
     return clocks

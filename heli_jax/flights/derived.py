@@ -38,10 +38,12 @@ class Derivation:
         groups: the channels it is computed from. The last group has the clock of the result, and
             all of a group have one clock.
         compute: the samples (N,) from those of the groups, (k, N) each, all on one clock.
+        unit: of the result; that of the last group's channels where it is empty.
     """
 
     groups: tuple[tuple[str, ...], ...]
     compute: Callable[..., np.ndarray]
+    unit: str = ""
 
 
 def derivation(
@@ -69,7 +71,7 @@ def derivation(
     arguments = [argument.strip() for argument in match[2].split(",")]
     expected = f"expected {', '.join(FORMS)}, got {shown(name)}"
     if function == "euler" and len(arguments) in (1, 4) and part in EULER:
-        return Derivation((_quaternion(arguments, known),), _euler(EULER.index(part)))
+        return Derivation((_quaternion(arguments, known),), _euler(EULER.index(part)), "rad")
     if function == "body_velocity" and len(arguments) in (4, 7) and part in BODY:
         *q, north, east, down = arguments
         groups = (_quaternion(q, known), (north, east, down))
@@ -115,7 +117,7 @@ def _of_servos(name: str, swashplate: Swashplate | None) -> Derivation:
     if swashplate is None:
         raise ValueError(f"{name} needs the swashplate's geometry, expected signals.ccpm with it")
     row = CCPM.index(name)
-    return Derivation((swashplate.servos,), lambda servos: unmix(swashplate, servos)[row])
+    return Derivation((swashplate.servos,), lambda servos: unmix(swashplate, servos)[row], "1")
 
 
 def euler_angles(q: np.ndarray) -> np.ndarray:
@@ -173,6 +175,13 @@ class DerivedLog(ChannelLog):
 
     swashplate: Swashplate | None = None
 
+    def is_derived(self, name: str) -> bool:
+        """Whether a name is that of a derived channel, well formed or not."""
+        try:
+            return derivation(name, frozenset(self.names), self.swashplate) is not None
+        except ValueError:
+            return True
+
     def topic_of(self, name: str) -> Topic:
         """The topic that holds a channel; of a derived one that whose clock it has.
 
@@ -192,7 +201,10 @@ class DerivedLog(ChannelLog):
         *others, last = [self._group(group, place) for group in derived.groups]
         blocks = [_on_clock(last[0].times, topic.times, values) for topic, values in others]
         values = derived.compute(*blocks, last[1])
-        return Topic(last[0].name, last[0].times, {name: values}, {}, last[0].clock)
+        # Angles are in rad whatever the log states; a velocity or a heading keeps its unit.
+        stated = last[0].units.get(derived.groups[-1][0], "")
+        units = {name: derived.unit or stated}
+        return Topic(last[0].name, last[0].times, {name: values}, units, last[0].clock)
 
     def _group(self, names: Sequence[str], place: str) -> tuple[Topic, np.ndarray]:
         """The topic of channels that were written together, and their samples (k, N)."""

@@ -20,6 +20,7 @@ from heli_jax.flights.grid import (
 )
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
 from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
@@ -104,7 +105,8 @@ class LogInfo:
 
     `time` is None where no column looks like a clock; an autopilot's log has `topics` with clocks
     of their own, whose channels are `columns` too, and `duration` [s] from the first sample to the
-    last. `filters` are those of the `parameters` that say how the firmware filtered its signals.
+    last. `filters` are those of the `parameters` that say how the firmware filtered its signals,
+    `vibration` the lines in its signals where it has the rotor's speed.
     """
 
     path: str
@@ -121,6 +123,7 @@ class LogInfo:
     parameters: Mapping[str, str | int | float] = field(default_factory=dict)
     filters: Mapping[str, str | int | float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    vibration: RotorLines | None = None
 
 
 def describe_log(
@@ -192,6 +195,7 @@ def _describe_channels(log: ChannelLog) -> LogInfo:
         parameters=log.parameters,
         filters={k: v for k, v in log.parameters.items() if _FILTER.search(k)},
         notes=log.notes,
+        vibration=rotor_lines(log),
     )
 
 

@@ -23,6 +23,8 @@ _MOST_ROWS = 10**8
 """at 1 kHz more than a day; a few bytes can claim any number of equal rows"""
 _MOST_CELLS = 3 * 10**8
 """of the columns that are read: 2.4 GB of numbers"""
+_AT_ONCE = 10**7
+"""cells that are decoded before their rows are counted"""
 
 
 def open_parquet(path: Path) -> "ParquetTable":
@@ -110,13 +112,24 @@ class ParquetTable:
         return numbers
 
     def survey(self) -> list[Survey]:
-        """Every column; what is not a number counts as text."""
-        data = self._read(None)
-        columns = (data.column(i) for i in range(data.num_columns))
-        return [
-            Survey(name, _floats(x) if _is_number(x.type) else None, len(x) - x.null_count)
-            for name, x in zip(data.column_names, columns, strict=True)
-        ]
+        """Every column; what is not a number counts as text. Lists and records within cells are
+        not read, so that all of their cells count as filled."""
+        nested = [_is_nested(f.type) for f in self._schema]
+        flat = [f.name for f, is_nested in zip(self._schema, nested, strict=True) if not is_nested]
+        data = self._read(flat if any(nested) else None)
+        # By name: two columns may have the same, and come in an order of their own.
+        columns: dict[str, list[pa.ChunkedArray]] = {}
+        for name, x in zip(data.column_names, data.columns, strict=True):
+            columns.setdefault(name, []).append(x)
+        surveys = []
+        for name, is_nested in zip(self.names, nested, strict=True):
+            if is_nested:
+                surveys.append(Survey(name, None, self._file.metadata.num_rows))
+                continue
+            x = columns[name].pop(0)
+            values = _floats(x) if _is_number(x.type) else None
+            surveys.append(Survey(name, values, len(x) - x.null_count))
+        return surveys
 
     def place(self, row: int) -> str:
         """`row 1` is the first."""
@@ -131,36 +144,46 @@ class ParquetTable:
         """`s`, `ms`, `us` or `ns` for a column of time stamps or durations."""
         import pyarrow as pa
 
-        kind = self._schema.field(name).type
+        # By place: of two columns of one name the first, where `field` would refuse the name.
+        kind = self._schema.field(self.names.index(name)).type
         if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
             return str(kind.unit)
         return None
 
-    def _require_few(self, names: Sequence[str] | None) -> None:
-        """Refuse to read more values than memory is for, lists within cells counted too."""
-        metadata, cells = self._file.metadata, 0
-        for i in range(metadata.num_row_groups):
-            group = metadata.row_group(i)
-            for j in range(group.num_columns):
-                chunk = group.column(j)
-                # num_values counts what lists within cells hold; a column of nulls may claim none.
-                if names is None or chunk.path_in_schema in names:
-                    cells += max(chunk.num_values, group.num_rows)
-        if cells > _MOST_CELLS:
-            problem = f"expected at most {_MOST_CELLS} values in the columns read, got {cells}"
-            raise wrong(self.path, f"{problem}; read fewer columns, or resample the log")
-
     def _read(self, names: Sequence[str] | None) -> "pa.Table":
+        """The columns, none of them of lists or records; all of the file without names."""
         import pyarrow as pa
 
+        n_rows, count = self._file.metadata.num_rows, len(names or self.names)
+        if n_rows * count > _MOST_CELLS:
+            problem = f"expected at most {_MOST_CELLS} values in the columns read, got"
+            words = f"{problem} {n_rows * count}; read fewer columns, or resample the log"
+            raise wrong(self.path, words)
+        columns = None if names is None else list(names)
+        # In pieces that are counted: a damaged column can claim, and decode to, any number of
+        # rows. What the metadata say of a single column is not asked, since of some damage to it
+        # pyarrow ends the whole process.
+        rows, batches = 0, []
         try:
-            self._require_few(names)
-            data = self._file.read(columns=None if names is None else list(names))
-            data.validate(full=True)  # a damaged page can decode to lengths that do not fit
-            return data
+            pieces = self._file.iter_batches(max(_AT_ONCE // max(count, 1), 1), columns=columns)
+            for piece in pieces:
+                rows += piece.num_rows
+                if rows > n_rows:
+                    break
+                piece.validate(full=True)  # a damaged page can decode to lengths that do not fit
+                batches.append(piece)
         # UnicodeDecodeError: of a damaged name, which pyarrow reads as UTF-8.
         except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
             raise wrong(self.path, "is no whole Parquet file") from e
+        if rows != n_rows:
+            raise wrong(self.path, "is no whole Parquet file")
+        return pa.Table.from_batches(batches)
+
+
+def _is_nested(kind: "pa.DataType") -> bool:
+    import pyarrow as pa
+
+    return pa.types.is_nested(kind)
 
 
 def _is_text(kind: "pa.DataType") -> bool:

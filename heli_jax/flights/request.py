@@ -12,9 +12,10 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import HOLDS, Signal
+from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.origins import scale_problem
 from heli_jax.flights.repeats import REPEATS
-from heli_jax.flights.table import column, wrong
+from heli_jax.flights.table import Table, column, wrong
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Also:
         time: the column of time stamps of a table.
         number: which flight of a file that holds several, from 1.
         reverse: whether `to` has the opposite sign.
+        log: the log itself, where it is open already.
     """
 
     path: str
@@ -40,6 +42,7 @@ class Also:
     time: Signal | None = None
     number: int | None = None
     reverse: bool = False
+    log: ChannelLog | Table | None = None
 
 
 @dataclass(frozen=True)

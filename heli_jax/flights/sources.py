@@ -134,7 +134,7 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Besi
     options = ReadOptions(number=also.number)
     # Apart from the others, since it may well be one of them.
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    other = _open(alone)
+    other = _open(alone, also.log)
     reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
     (twin,) = _clocked(other, alone).values()
     try:

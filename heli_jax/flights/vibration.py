@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-_SEGMENT = 4.0
+SEGMENT = 4.0
 """s: lines of a quarter of a hertz, which a rotor's speed keeps to for so long"""
 _STANDS_OUT = 20.0
 """times the median of its surroundings: noise does so once in a million bins"""
 _SURROUNDINGS = 15
 """bins to either side of which the median is taken"""
-_SMALLEST = 0.01
+SMALLEST = 0.01
 """share of the variance below which a line biases nothing"""
 _SLOWEST = 4.0
 """Hz: below are the machine's own motion and the sticks', whose doublets have lines too"""
@@ -49,22 +49,18 @@ def lines(
         rotor_hz: turns per second of the rotor.
         logged_hz: rate at which the log took it, where frequencies folded; 1/dt unless given.
     """
-    # Imported here, as everywhere in the readers: it takes a third of a second.
-    from scipy.ndimage import median_filter
-    from scipy.signal import detrend, welch
-
-    n = min(x.size, max(64, round(_SEGMENT / dt)))
+    n = min(x.size, max(64, round(SEGMENT / dt)))
     there = np.isfinite(x)
     if np.count_nonzero(there) < max(64, x.size // 2):
         return ()
     times = np.arange(x.size)
-    x = detrend(np.interp(times, times[there], x[there]))
-    hz, power = welch(x, 1.0 / dt, "hann", nperseg=n, detrend="linear")
+    x = _detrended(np.interp(times, times[there], x[there])[None])[0]
+    hz, power = _welch(x, dt, n)
     # Of the whole record: what is slower than a segment is part of the variance as well.
     total = float(np.var(x)) / float(hz[1])
     if not total > 0:
         return ()
-    around = median_filter(power, 2 * _SURROUNDINGS + 1, mode="nearest")
+    around = _running_median(power, _SURROUNDINGS)
     peak = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
     found = np.flatnonzero(peak & (power[1:-1] > _STANDS_OUT * around[1:-1])) + 1
     rate = 1.0 / dt if logged_hz is None else logged_hz
@@ -73,10 +69,57 @@ def lines(
         # Two bins to either side: as wide as the window makes a line.
         part = slice(max(i - 2, 0), i + 3)
         share = float(np.sum(power[part] - around[part])) / total
-        if share >= _SMALLEST:
+        if share >= SMALLEST:
             name = _harmonic(float(hz[i]), rate, rotor_hz, 1.5 * float(hz[1]))
             result.append(Line(float(hz[i]), share, *name))
     return tuple(sorted(result, key=lambda line: -line.share))
+
+
+def line_words(line: Line, rotor_hz: float | None) -> str:
+    """A line in words: `24.2 Hz has 12% of its variance (1/rev of the rotor)`.
+
+    Args:
+        line: of a signal.
+        rotor_hz: turns per second of the rotor, where they are known.
+    """
+    share = f"{line.hz:.3g} Hz has {100 * line.share:.2g}% of its variance"
+    if line.aliased:
+        return f"{share} ({line.harmonic}/rev of the rotor, {line.of_hz:.4g} Hz, aliased)"
+    if line.harmonic:
+        return f"{share} ({line.harmonic}/rev of the rotor)"
+    return f"{share} ({'no harmonic of the rotor' if rotor_hz else 'of unknown origin'})"
+
+
+# The next three by NumPy: scipy.signal takes a second to import, and `info` has 0.7 s.
+
+
+def _detrended(rows: np.ndarray) -> np.ndarray:
+    """Each row (k, n) without its straight line of least squares."""
+    t = np.arange(rows.shape[1]) - 0.5 * (rows.shape[1] - 1)
+    level = rows.mean(axis=1, keepdims=True)
+    return rows - level - np.outer(rows @ t / (t @ t), t)
+
+
+def _welch(x: np.ndarray, dt: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies [Hz] and power density of x (N,): the mean of detrended Hann segments of n
+    samples, each half over the one before (Welch, 1967)."""
+    # Strided and not copied: a long record has as many segments.
+    segments = np.lib.stride_tricks.sliding_window_view(x, n)[:: n - n // 2]
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
+    power = np.zeros(n // 2 + 1)
+    for segment in segments:
+        power += np.abs(np.fft.rfft(window * _detrended(segment[None])[0])) ** 2
+    power *= dt / (len(segments) * (window @ window))
+    # Of both signs of a frequency; zero and the Nyquist frequency have one.
+    power[1 : None if n % 2 else -1] *= 2.0
+    return np.fft.rfftfreq(n, dt), power
+
+
+def _running_median(x: np.ndarray, to_either_side: int) -> np.ndarray:
+    """Of the neighbours of each value; the ends are repeated."""
+    padded = np.pad(x, to_either_side, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * to_either_side + 1)
+    return np.median(windows, axis=1)
 
 
 def _harmonic(hz: float, rate: float, rotor_hz: float | None, width: float) -> tuple[int, float]:
@@ -102,18 +145,41 @@ def folded(hz: float, rate: float) -> float:
     return abs(hz - rate * round(hz / rate))
 
 
+def settling(frequencies: Sequence[float], q: float) -> float:
+    """How long notches take to forget how they began, to 5 % [s].
+
+    Args:
+        frequencies: centres of the notches [Hz].
+        q: centre over width.
+    """
+    # Their free motion decays by exp(-omega t / (2 q)), by 1/20 in three time constants.
+    return 3.0 * q / (np.pi * min(frequencies))
+
+
 def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """A record (N,) without some frequencies: a causal notch for each, settled at the first sample.
 
+    Behind missing samples the notches begin anew, and what they give until they have settled is
+    missing as well.
+
     Args:
-        x: samples (N,), without gaps.
+        x: samples (N,), NaN where one is missing.
         dt: time between them [s].
         frequencies: centres of the notches [Hz], below half the rate.
         q: centre over width.
     """
     from scipy.signal import iirnotch, lfilter, lfilter_zi
 
-    for hz in frequencies:
-        b, a = iirnotch(hz, q, 1.0 / dt)
-        x = lfilter(b, a, x, zi=lfilter_zi(b, a) * x[0])[0]
+    x = np.array(x)
+    coefficients = [iirnotch(hz, q, 1.0 / dt) for hz in frequencies]
+    unsettled = int(np.ceil(settling(frequencies, q) / dt))
+    # Where samples begin and end to be there: pairs of first and last + 1.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
+    for first, last in edges.reshape(-1, 2):
+        for b, a in coefficients:
+            part = x[first:last]
+            x[first:last] = lfilter(b, a, part, zi=lfilter_zi(b, a) * part[0])[0]
+        # At the record's beginning inputs and outputs begin alike.
+        if first:
+            x[first : min(first + unsettled, last)] = np.nan
     return x

@@ -39,6 +39,7 @@ from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 
@@ -52,6 +53,7 @@ __all__ = [
     "check",
     "findings",
     "fit",
+    "rates",
     "windows",
 ]
 
@@ -127,6 +129,16 @@ def findings(problem: Problem) -> tuple[Finding, ...]:
     at, feedback = Solution(*guess[:4]), feedback_of(problem)
     quick = problem.model.linear and at.layout.estimator.rows_are_samples
     return is_it_enough(problem, at, guess.e, feedback, compare=quick)
+
+
+def rates(problem: Problem) -> tuple[Finding, ...]:
+    """Of the findings those on logging rates alone, which need no simulation.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+    """
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    return tuple(logging_rate(problem, flights, first_noise(problem, problem.training).sd))
 
 
 def windows(problem: Problem, length: float | None = None) -> Ranking:

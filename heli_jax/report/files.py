@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Check
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.identification.validation.feedback import LEVEL
@@ -309,6 +311,34 @@ def _source(flight: Flight) -> dict[str, Any]:
     }
 
 
+def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:
+    """What `heli-jax check` found as plain data; what is not a finite number is null.
+
+    Args:
+        check: what is known before a fit.
+        log_notes: what the reader of each log assumed, a sentence each.
+    """
+    verdict, sd = check.verdict, np.sqrt(np.diag(check.verdict.covariance))
+    # Of a parameter that is not determined the number would be no expectation.
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    pairs = zip(verdict.names, sd, strict=True)
+    expected = {name: None if name in lacking else value for name, value in pairs}
+    return _plain(
+        {
+            "identifiable": verdict.identifiable,
+            "refused": any(f.severity == "refuse" for f in check.findings),
+            "expected_relative_sd": expected,
+            "prior_share": verdict.prior_share,
+            "verdict": _verdict(verdict),
+            "noise_sd": check.noise,
+            "noise_guessed": list(check.guessed),
+            "record": [f._asdict() for f in check.findings],
+            "notes": list(check.further_notes),
+            "log_notes": list(log_notes),
+        }
+    )
+
+
 def _plain(value: Any) -> Any:
     """Only what JSON has; a number that is not finite becomes null."""
     if isinstance(value, dict):
@@ -328,8 +358,13 @@ def _plain(value: Any) -> Any:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write plain data, readable and strict (no NaN)."""
+    path.write_text(as_json(content) + "\n", encoding="utf-8")
+
+
+def as_json(content: dict[str, Any]) -> str:
+    """Plain data as text, readable and strict (no NaN)."""
     # Python would write NaN, which JSON does not have and other languages refuse to read.
-    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return json.dumps(content, indent=2, allow_nan=False)
 
 
 def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Flight, Signal, Source, read_flight, require_moving_inputs
+from heli_jax.flights.describe import describe_log
 
 STICK = Signal("stick", "mm", "m")
 PHI = Signal("phi", "deg", "rad")
@@ -296,3 +297,19 @@ def test_moving_inputs_of_a_flight_made_by_hand():
     flight = Flight(0.1, {"x_roll": still}, {}, source=Source("bench.csv", "0"))
     with pytest.raises(InputError, match=r"^bench\.csv, input 'x_roll': .*nothing"):
         require_moving_inputs(flight)
+
+
+def test_a_parquet_file_of_lists_is_described(tmp_path):
+    path = tmp_path / "lists.parquet"
+    t = np.arange(4.0)
+    lists = pa.array([[1.0], [], [2.0, 3.0], [4.0]])
+    names = ["a", "b", "a", "each"]
+    pq.write_table(pa.table([t, t + 1, t + 2, lists], names=names), path)
+    columns = describe_log(path).columns
+    assert [(c.name, c.kind, c.count) for c in columns] == [
+        ("a", "number", 4),
+        ("b", "number", 4),
+        ("a", "number", 4),
+        ("each", "text", 4),
+    ]
+    np.testing.assert_allclose([c.mean for c in columns[:3]], [1.5, 2.5, 3.5])

@@ -9,12 +9,14 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem
+from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, signal_quality
-from heli_jax.identification.validation.logging_rate import input_rate
+from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
 from heli_jax.identification.validation.missing_outputs import look_at_missing
 from heli_jax.identification.validation.next_flight import plan_next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, quantum, rails
+from heli_jax.models import with_filters
 from heli_jax.naming import Scalar
 from tests.identification.start_values import at_start
 
@@ -271,3 +273,15 @@ def test_findings_stand_once():
     for a, b in itertools.pairwise(result.findings):
         assert (a.severity, b.severity) != ("ok", "doubt")
     assert signal_quality.saturation([("x", flight(0))])[0].severity == "ok"
+
+
+def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
+    f = flight(1, 1500)
+    u = scipy.signal.lfilter([0.05], [1.0, -0.95], f.inputs["u"])
+    inputs, sd = {"u": u, "v": f.inputs["v"]}, {"p": 1e-7}
+    outputs = {"p": response(*inputs.values())[1]}
+    moved = Flight(DT, inputs, outputs, sd=sd, hold={"u": "linear"}, hold_reason={"u": "moves"})
+    filtered = with_filters(SWING, {"p": [Filter("pt1", 40.0)]}, {"p": 0.004})
+    asked = Problem(filtered, TRUTH, (moved,), FREE, Nuisance(bias=False))
+    (finding,) = logging_rate(asked, [("flight", moved)], [sd])
+    assert finding.severity == "ok", finding.sentence

@@ -282,9 +282,17 @@ def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
         value: the signal now.
         delay: [s].
     """
-    # Shifted Legendre polynomials are all one at the far end of the delay, where the signal is as
-    # it was one delay ago: the sum of the coefficients is its value there.
-    return jnp.where(delay == 0, value, sum(past))
+    return jnp.where(delay == 0, value, line_end(past))
+
+
+def line_end(past: Sequence[Any]) -> Any:
+    """The signal at the far end of a delay line of one state at least, one delay ago.
+
+    Args:
+        past: the states of the line, in the signal's unit.
+    """
+    # Shifted Legendre polynomials are all one there: the sum of the coefficients is the value.
+    return sum(past)
 
 
 _UNREAD = 0.02

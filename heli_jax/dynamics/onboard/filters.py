@@ -9,6 +9,7 @@ its centre. In the firmware they are digital; docs/onboard.md says how far apart
 
 import functools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, zeros
-from heli_jax.dynamics.onboard.delays import ORDER, line_rates, line_states
+from heli_jax.dynamics.onboard.delays import ORDER, line_end, line_rates, line_states
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
 from heli_jax.naming import Record
 
@@ -247,9 +248,7 @@ class _Filtered(Device):
             for state, speed, section in _named(n, sections):
                 value = self._behind(s, state, speed, section, value)
             if n in self.delays:
-                # Legendre polynomials are one at the far end of the line: the sum is the value
-                # there.
-                value = sum(getattr(s, state) for state in line_states(n, self.orders[n]))
+                value = line_end([getattr(s, state) for state in line_states(n, self.orders[n])])
             logged[n] = value
         return naming.replace(y, **logged)
 
@@ -285,6 +284,17 @@ def _named(name: str, sections: tuple[_Section, ...]) -> Iterator[tuple[str, str
     """Each section with the names of its state and of the state that is its rate."""
     for i, section in enumerate(sections):
         yield f"{name}_filter{i + 1}", f"{name}_filter{i + 1}_rate", section
+
+
+def states_behind(model: Model) -> frozenset[str]:
+    """The states of a model that are filters and delay lines behind its outputs.
+
+    Args:
+        model: any.
+    """
+    names = "|".join(map(re.escape, naming.names(model.Outputs)))
+    pattern = re.compile(rf"({names})_(filter\d+(_rate)?|late\d+)")
+    return frozenset(n for n in naming.names(model.State) if pattern.fullmatch(n))
 
 
 @functools.cache

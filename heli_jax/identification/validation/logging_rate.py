@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.finding import Finding, Severity
@@ -83,10 +84,16 @@ def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any])
     # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
     left = np.linalg.pinv(right)
     outputs, inputs = naming.names(problem.model.Outputs), naming.names(problem.model.Inputs)
+    behind = states_behind(problem.model)
+    machine = [n not in behind for n in naming.names(problem.model.State)]
     shown = []
     for k, eigenvalue in enumerate(eigenvalues):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
         if abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
+            continue
+        # A filter's own mode has no part in the machine. Its constants are known, and it is no
+        # motion that a log would have to show.
+        if np.linalg.norm(right[machine, k]) < 1e-6 * np.linalg.norm(right[:, k]):
             continue
         best = (0.0, "", "")
         for j, u in enumerate(inputs):

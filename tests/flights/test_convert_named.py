@@ -1,0 +1,74 @@
+"""Derived channels, presets and configurations as what `heli-jax convert` writes."""
+
+import numpy as np
+import pytest
+
+from heli_jax.cli import main
+from heli_jax.config import load
+from heli_jax.config.logs import as_configured
+from heli_jax.flights.convert import Selection, convert_log
+from heli_jax.flights.named import by_preset
+
+from .test_convert_and_info import refused, table_of
+from .test_presets import ARDUPILOT, PHI, STICK, P, ardupilot_log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return ardupilot_log(tmp_path_factory.mktemp("named") / "flight.bin")
+
+
+def test_derived_channels(tmp_path):
+    path, out = tmp_path / "log.csv", tmp_path / "out.csv"
+    angle = np.linspace(0.0, 0.6, 60)
+    # Half the angle about the axis of roll; a heading that passes north.
+    w, x, heading = np.cos(angle / 2), np.sin(angle / 2), (350 + np.arange(60)) % 360
+    rows = zip(np.arange(60) / 50, w, x, heading, strict=True)
+    lines = [f"{t:.2f},{float(a)!r},{float(b)!r},0,0,{c}" for t, a, b, c in rows]
+    path.write_text("\n".join(["t,q[0],q[1],q[2],q[3],heading", *lines]))
+    names = ["euler(q).roll", "unwrap(heading, 360)", "q*"]
+    assert main(["convert", str(path), str(out), "--signals", *names]) == 0
+    columns = table_of(out)
+    assert list(columns) == ["time", *names[:2], "q[0]", "q[1]", "q[2]", "q[3]"]
+    np.testing.assert_allclose(columns["euler(q).roll"], angle, atol=1e-12)
+    np.testing.assert_array_equal(columns["unwrap(heading, 360)"], 350 + np.arange(60))
+    assert convert_log(path, Selection(names)).units["euler(q).roll"] == "rad"
+
+
+def test_the_signals_of_a_preset(log):
+    converted = convert_log(log, Selection(named=by_preset("ardupilot-helicopter"), rate=100.0))
+    assert {"roll_rate", "roll"} < set(converted.columns)
+    np.testing.assert_allclose(converted.columns["roll_rate"], P, atol=1e-6)
+    np.testing.assert_allclose(converted.columns["roll"], PHI, atol=1e-6)
+    assert converted.units["roll_rate"] == "rad/s"
+    assert any("the log has no" in note and "north" in note for note in converted.notes)
+
+
+def test_the_signals_of_a_configuration(log, tmp_path):
+    out = tmp_path / "out.csv"
+    assert main(["convert", str(log), str(out), "--config", str(ARDUPILOT)]) == 0
+    columns = table_of(out)
+    assert set(columns) == {"time", "lat", "p", "phi"}
+    np.testing.assert_allclose(columns["p"], P, atol=1e-6)
+    selection = as_configured(load(ARDUPILOT), Selection(["ccpm.roll", "RATE.R"], 100.0))
+    unmixed = convert_log(log, selection).columns
+    np.testing.assert_array_equal(unmixed["ccpm.roll"], columns["lat"])
+    # Of two servos that stand 60 degrees from the nose, in whole microseconds.
+    lift = 0.002 * np.round(STICK * 0.75**0.5 / 0.002) / 0.75**0.5
+    np.testing.assert_allclose(unmixed["ccpm.roll"], lift, atol=1e-12)
+
+
+def test_names_that_are_refused(log, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    refused(capsys, ["convert", log, out, "--signals", "ccpm.roll"], "geometry", "signals.ccpm")
+    refused(capsys, ["convert", log, out, "--signals", "euler(ATT.Roll)"], "expected euler(Q).roll")
+    refused(capsys, ["convert", log, out, "--preset", "px4"], "no preset 'px4'; known are")
+    refused(
+        capsys,
+        ["convert", log, out, "--preset", "px4-helicopter"],
+        "holds no channel of preset px4-helicopter",
+        "preset ardupilot-helicopter",
+    )
+    wrong = ["--preset", "rotorflight", "--signals", "ATT.*"]
+    refused(capsys, ["convert", log, out, *wrong], "expected it without --signals")
+    assert not out.exists()
