@@ -1,11 +1,13 @@
 """What feedback does to estimates: bias against loop gain and gusts.
 
-    .venv/bin/python experiments/closed_loop.py [RUNS]
+    .venv/bin/python experiments/closed_loop.py [RUNS] [delay]
 
 A roll machine, p' = Lp p + Lda da + gusts, flown by a pilot who holds the bank angle with a delay
 of 0.1 s and adds test steps. Each record is fitted by output error and by filter error with a
 disturbance on roll; the table has the mean relative error of Lp and Lda over the runs, and in how
-many of them the loop was detected. (The frequency domain belongs beside them once it is there.)
+many of them the loop was detected. With `delay` the aileron acts 60 ms after the stick, and the
+fits have that delay free as well, from the five starts that a free delay has. (The frequency domain
+belongs beside them once it is there.)
 """
 
 import sys
@@ -18,6 +20,7 @@ import scipy.linalg
 from heli_jax import Flight, Free, Model, Problem, fit
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.model import Axis
+from heli_jax.dynamics.onboard.delays import with_delays
 from heli_jax.identification.validation.feedback import feedback
 from heli_jax.naming import Scalar, asdict
 from heli_jax.simulation.inputs import random_steps
@@ -65,10 +68,18 @@ ROLL = Model(
 )
 DISTURBED = with_disturbance(ROLL, "roll")
 TRUTH = {"Lp": -4.0, "Lda": 25.0}
+DELAY = "delay_da"
+ACTS = 3
+"""samples after which the aileron moves, with `delay`"""
+DELAYED = with_delays(ROLL, inputs=["da"])
+DELAYED_DISTURBED = with_disturbance(DELAYED, "roll")
 
 
-def record(gain: float, gust: float, seed: int) -> Flight:
-    """A record flown with the pilot's gain [rad/rad] in gusts of a standard deviation [rad/s^2]."""
+def record(gain: float, gust: float, seed: int, acts: int = 0) -> Flight:
+    """A record flown with the pilot's gain [rad/rad] in gusts of a standard deviation [rad/s^2].
+
+    The aileron acts so many samples after the stick.
+    """
     rng = np.random.default_rng(seed)
     # States, the stick held, and the gust as it is over one sample.
     A = np.zeros((4, 4))
@@ -83,20 +94,24 @@ def record(gain: float, gust: float, seed: int) -> Flight:
         seen = states[max(k - LATE, 0)]
         da = steps[k] - gain * (seen[1] + 0.2 * seen[0])
         sticks.append(da)
-        x = over @ np.array([*x, da, w])
+        x = over @ np.array([*x, sticks[max(k - acts, 0)], w])
         w = keeps * w + gust * np.sqrt(1.0 - keeps**2) * rng.standard_normal()
     motion = np.array(states)
     outputs = {n: motion[:, i] + SD[n] * rng.standard_normal(N) for i, n in enumerate(("p", "phi"))}
     return Flight(dt=DT, inputs={"da": np.array(sticks)}, outputs=outputs, sd=SD)
 
 
-def estimates(flight: Flight) -> dict[str, dict[str, float]]:
-    """By method the relative errors of both parameters; NaN where it did not converge."""
+def estimates(flight: Flight, truth: dict[str, float]) -> dict[str, dict[str, float]]:
+    """By method the relative errors of all parameters; NaN where it did not converge."""
     free = {"Lp": Free(-2.0), "Lda": Free(10.0)}
+    bare, disturbed, values = ROLL, DISTURBED, asdict(Params())
+    if DELAY in truth:
+        bare, disturbed, values = DELAYED, DELAYED_DISTURBED, {**values, DELAY: 0.03}
+        free[DELAY] = Free(0.03)
     problems: dict[str, Any] = {
-        "output error": Problem(ROLL, Params(), [flight], free),
+        "output error": Problem(bare, bare.Params(**values), [flight], free),
         "filter error": Problem(
-            DISTURBED, DISTURBED.Params(**asdict(Params())), [flight], free, method="filter-error"
+            disturbed, disturbed.Params(**values), [flight], free, method="filter-error"
         ),
     }
     errors = {}
@@ -105,18 +120,19 @@ def estimates(flight: Flight) -> dict[str, dict[str, float]]:
         fine = result.status == "converged"
         errors[method] = {
             n: result.estimates[n].value / true - 1.0 if fine else float("nan")
-            for n, true in TRUTH.items()
+            for n, true in truth.items()
         }
     return errors
 
 
-def row(gain: float, gust: float, runs: int) -> str:
-    flights = [record(gain, gust, seed) for seed in range(runs)]
+def row(gain: float, gust: float, runs: int, truth: dict[str, float]) -> str:
+    acts = ACTS if DELAY in truth else 0
+    flights = [record(gain, gust, seed, acts) for seed in range(runs)]
     closed = sum(any(f.present for f in feedback(flight)) for flight in flights)
-    found = [estimates(flight) for flight in flights]
+    found = [estimates(flight, truth) for flight in flights]
     cells = []
     for method in ("output error", "filter error"):
-        for name in TRUTH:
+        for name in truth:
             e = 100.0 * np.array([one[method][name] for one in found])
             fine = e[np.isfinite(e)]
             spread = f"{fine.mean():+.1f} ± {fine.std() / max(fine.size, 1) ** 0.5:.1f} %"
@@ -124,14 +140,16 @@ def row(gain: float, gust: float, runs: int) -> str:
     return f"| {gain:g} | {gust:g} | {closed} of {runs} | " + " | ".join(cells) + " |"
 
 
-def main(runs: int) -> None:
+def main(runs: int, *, delay: bool) -> None:
+    truth = TRUTH | ({DELAY: ACTS * DT} if delay else {})
+    names = [f"{method} {name}" for method in ("OE", "FE") for name in truth]
     print(f"{runs} records of {N * DT:g} s each; mean error and its standard error.\n")
-    print("| gain | gusts [rad/s²] | loop detected | OE Lp | OE Lda | FE Lp | FE Lda |")
-    print("|" + "---|" * 7)
+    print("| gain | gusts [rad/s²] | loop detected | " + " | ".join(names) + " |")
+    print("|" + "---|" * (3 + len(names)))
     for gust in GUSTS:
         for gain in GAINS:
-            print(row(gain, gust, runs), flush=True)
+            print(row(gain, gust, runs, truth), flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 6)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 6, delay="delay" in sys.argv[2:])

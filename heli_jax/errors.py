@@ -17,7 +17,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     # 0.5 in place of difflib's 0.6: names of constants are short, and one wrong letter of two is
     # half.
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    # A name that is wrong in its case alone is meant: 'MA' is as near to 'Mq' as to 'Ma' otherwise.
+    alike = [k for k in known if k.lower() == name.lower()]
+    close = alike or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if not close:
         # Case counts above: only if nothing is near is 'HELICOPTER' compared without it.
         lower = {k.lower(): k for k in known}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.summaries import precision_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +41,8 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
 
     An output of the same name as a state or input, whose values it would repeat or replace, is
     `NAME_output`; an input likewise `NAME_input`. Of a batch of runs each signal has further
-    dimensions `run_0`, `run_1` ... before time.
+    dimensions `run_0`, `run_1` ... before time. The attribute `precision` is the type that the run
+    was computed in; where that is below float64, `precision_note` says what it costs.
 
     Raises:
         ValueError: the runs of a batch differ in their times.
@@ -63,7 +65,11 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
             variables[unique] = ([*batch, "time"], np.asarray(values), attributes)
     status = (batch, np.asarray(run.status), {"meaning": "index into trajectory.STATUS"})
     coordinates = {"time": ("time", first, {"units": "s"}), "status": status}
-    return xr.Dataset(variables, coordinates)
+    # A file of it does not say in which precision its numbers were computed: single ones may have
+    # been widened since.
+    precision, cost = precision_of(run)
+    attributes = {"precision": precision} | ({"precision_note": cost} if cost else {})
+    return xr.Dataset(variables, coordinates, attributes)
 
 
 # arviz is an extra, so its class cannot be named here.

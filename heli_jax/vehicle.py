@@ -244,7 +244,7 @@ def vehicle_from_mapping(
     for name, entry in content.items():
         if name not in known:
             raise InputError(f"{where}: unknown constant {name!r}{nearest(str(name), known)}")
-        constants[name] = _constant(entry, name, naming.unit(params, name), where)
+        constants[name] = constant(entry, name, naming.unit(params, name), where)
     lacking = [n for n in known if n not in constants and n not in naming.defaults(params)]
     missing = [n for n in lacking if n not in may_lack]
     if missing:
@@ -261,7 +261,18 @@ def vehicle_from_mapping(
     return Vehicle(params(**values), constants, where)
 
 
-def _constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
+def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
+    """A number of a file, or {value, unit, source}, in SI.
+
+    Args:
+        entry: as YAML has it.
+        name: of the number.
+        si: its SI unit; None where it has none, and the file's is taken as it is.
+        where: what errors name, such as the file.
+
+    Raises:
+        InputError: no finite number, an unknown key, or a unit of another kind.
+    """
     place = f"{where}: {name}"
     unit, source = si or "1", ""
     if isinstance(entry, Mapping):

@@ -190,7 +190,8 @@ def reading_notes(problem: Problem) -> list[str]:
             if flight.hold[name] == "linear"
         ]
     notes += problem.first_guess.sentences if problem.first_guess is not None else ()
-    return notes
+    # Several flights may be windows of one log: what is the same for all of them is said once.
+    return list(dict.fromkeys(notes))
 
 
 def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) -> Baseline | None:

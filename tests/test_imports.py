@@ -32,7 +32,7 @@ ALLOWED = {
     "yaml_file": {"errors", "regular_file"},
     "numbers": set(),
     "summaries": {"naming", "numbers"},
-    "exports": {"naming"},
+    "exports": {"naming", "summaries"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
     "flights": {"errors", "regular_file", "units", "summaries", "yaml_file"},
     "dynamics": {"vehicle", "naming", "numerics", "units", "errors"},

@@ -7,18 +7,34 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 from heli_jax.errors import nearest
 
 
+def _has_unit(value: Any) -> bool:
+    """Whether this is one number with its unit, and not one for each of several by name."""
+    return isinstance(value, dict) and "value" in value
+
+
 def _size_choice(value: Any) -> Any:
-    """One number above zero, or one for each of several disturbances by name."""
-    given = value.values() if isinstance(value, dict) else [value]
-    for number in given:
-        # In Python true is the number 1. Infinity has no spread to draw from, and no time constant.
-        real = isinstance(number, int | float) and not isinstance(number, bool)
-        if not (real and 0 < number < float("inf")):
-            raise ValueError(
-                "expected a number above zero, or of several disturbances one for each by name, "
-                f"got {number!r:.60}"
-            )
-    return {str(k): float(v) for k, v in value.items()} if isinstance(value, dict) else float(value)
+    """One number above zero, or one for each of several disturbances by name; in SI, or as {value,
+    unit}."""
+    if isinstance(value, dict) and not _has_unit(value):
+        return {str(k): _size(v) for k, v in value.items()}
+    return _size(value)
+
+
+def _size(value: Any) -> Any:
+    number = value["value"] if _has_unit(value) else value
+    # In Python true is the number 1. Infinity has no spread to draw from, and no time constant.
+    real = isinstance(number, int | float) and not isinstance(number, bool)
+    if not (real and 0 < number < float("inf")):
+        raise ValueError(
+            "expected a number above zero (SI, or {value, unit}), or of several disturbances one "
+            f"for each by name, got {number!r:.60}"
+        )
+    # Its unit is checked where the model is known, which has the unit of what is pushed.
+    return value if _has_unit(value) else float(value)
+
+
+def _plain(value: Any) -> str:
+    return f"{value['value'] if _has_unit(value) else value:g}"
 
 
 def _on_choice(value: Any) -> Any:
@@ -47,8 +63,8 @@ class DisturbanceConfig(BaseModel):
     # constant.
     poles: Literal[1, 2] = 1
     sigma_w: Annotated[Any, BeforeValidator(_size_choice)] = None
-    """standard deviation, in the state's unit per second (SI), of several by name: needed to
-    simulate, an initial guess for filter error"""
+    """standard deviation, in the state's unit per second (SI) or as {value, unit}, of several by
+    name: needed to simulate, an initial guess for filter error"""
     tau_w: Annotated[Any, BeforeValidator(_size_choice)] = None
     """correlation time [s], of several by name or one number for all: as sigma_w"""
     fixed: list[str] = []
@@ -61,6 +77,14 @@ class DisturbanceConfig(BaseModel):
         return self.on if self.axis is None else (self.axis,)
 
     @property
+    def has_units(self) -> bool:
+        """Whether some number has a unit of its own, and is not in SI yet."""
+        given = (self.sigma_w, self.tau_w)
+        return any(
+            _has_unit(v) or (isinstance(v, dict) and any(map(_has_unit, v.values()))) for v in given
+        )
+
+    @property
     def parameters(self) -> dict[str, float | None]:
         """By the name of each parameter its value, None where none is given."""
         # The names of parameters have to be those that `with_disturbance` gives them.
@@ -70,7 +94,8 @@ class DisturbanceConfig(BaseModel):
                 given = getattr(self, key)
                 # One number stands for all, which only a time constant may: it is in seconds
                 # whatever is pushed.
-                of_it = given.get(name) if isinstance(given, dict) else given
+                by_name = isinstance(given, dict) and not _has_unit(given)
+                of_it = given.get(name) if by_name else given
                 values[f"{key}_{name}" if several else key] = of_it
         return values
 
@@ -81,12 +106,13 @@ class DisturbanceConfig(BaseModel):
             raise ValueError(f"expected axis (one) or on (a list of states), got {got}")
         for key in ("sigma_w", "tau_w"):
             given = getattr(self, key)
-            for name in given if isinstance(given, dict) else ():
+            by_name = isinstance(given, dict) and not _has_unit(given)
+            for name in given if by_name else ():
                 if name not in self.names:
                     raise ValueError(f"{key}: {name!r} is not disturbed{nearest(name, self.names)}")
-        if len(self.names) > 1 and isinstance(self.sigma_w, float):
+        if len(self.names) > 1 and (isinstance(self.sigma_w, float) or _has_unit(self.sigma_w)):
             # Of states in different units one number would mean a different thing on each.
-            example = ", ".join(f"{n}: {self.sigma_w:g}" for n in self.names)
+            example = ", ".join(f"{n}: {_plain(self.sigma_w)}" for n in self.names)
             raise ValueError(f"sigma_w: expected a value for each, as {{{example}}}, got one")
         for name in self.fixed:
             if name not in (*self.parameters, "sigma_y"):

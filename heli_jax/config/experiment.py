@@ -13,6 +13,7 @@ from heli_jax import models, naming
 from heli_jax.config.measurement import with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.opened_logs import OpenedLogs
+from heli_jax.config.quantities import in_si, initial_state
 from heli_jax.config.schema import Config, LinearConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.start import starting_at
@@ -59,6 +60,8 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
     # The model before the vehicle, since its Params say which constants a vehicle may have.
     logs = OpenedLogs()
     model = _model(config, path, logs)
+    # From here on nobody has to know that numbers may have units.
+    config = in_si(config, model, path)
     vehicle = _vehicle(config, path, model)
     return Experiment(config, path, model, vehicle, logs)
 
@@ -96,13 +99,7 @@ def _started(config: Config, path: Path, model: Model, logs: OpenedLogs) -> Mode
     model = with_measurement(model, config.flights, path, logs)
     if not config.initial_state:
         return model
-    for name in config.initial_state:
-        if name not in naming.names(model.State):
-            raise InputError(
-                f"{path}: initial_state: model {model.name} has no state {name!r}"
-                f"{nearest(name, naming.names(model.State))}"
-            )
-    return starting_at(model, config.initial_state)
+    return starting_at(model, initial_state(config, model, path))
 
 
 def in_wind(experiment: Experiment) -> Experiment:

@@ -382,9 +382,11 @@ class Config(_Strict):
     off in place of what the model has; for the whole helicopter only"""
     onboard: OnboardConfig | None = None
     """servos, rate loops, gyro, sensors and delays around the model (docs/onboard.md)"""
-    initial_state: dict[str, Finite] = {}
-    """values of states at the first sample in SI, in place of the model's own: for models that
-    cannot begin at zero"""
+    # Any: a number in SI or {value, unit}, as in a vehicle file and checked as there, where the
+    # model's units are known.
+    initial_state: dict[str, Any] = {}
+    """values of states at the first sample, in place of the model's own: for models that cannot
+    begin at zero"""
     # May be missing: a simulation needs none.
     flights: list[FlightConfig] = []
     fit: FitConfig | None = None

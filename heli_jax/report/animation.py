@@ -12,6 +12,11 @@ from heli_jax.simulation.trajectory import Trajectory
 MOST_FRAMES = 200
 """moments that are shown at most"""
 _PATH_POINTS = 2000
+_DIAGONAL = 1.45
+"""of the box in plotly's units: from `_VIEWS` all of it is seen, with the titles of its axes, also
+where the page is as narrow as a telephone"""
+_CENTRE = {"x": 0.0, "y": 0.0, "z": -0.12}
+"""of the box as it is looked at: a little low, so that the titles below it are in the picture"""
 _SMALLEST = 0.1
 """rotor diameter over the length of the path: a smaller machine is drawn larger"""
 _AROUND = 16
@@ -20,10 +25,10 @@ _DIGITS = 4
 """of a coordinate [m]: a tenth of a millimetre is more than a screen shows"""
 _LIGHT = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.1}
 _VIEWS = {
-    "from the side": {"x": 0.3, "y": -1.9, "z": 0.5},
-    "from behind": {"x": -1.9, "y": 0.0, "z": 0.6},
+    "side": {"x": 0.3, "y": -1.9, "z": 0.5},
+    "behind": {"x": -1.9, "y": 0.0, "z": 0.6},
     # Not straight from above: there plotly cannot tell which way is up.
-    "from above": {"x": -0.01, "y": 0.0, "z": 2.3},
+    "above": {"x": -0.01, "y": 0.0, "z": 2.3},
     "three-quarter": {"x": -1.3, "y": -1.3, "z": 0.9},
 }
 
@@ -204,19 +209,20 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
     """`names` are the frames' with their times as text, `pace` the time between two [ms]."""
     # One scale for all three axes: attitude angles are to be seen as they are.
     spans = bounds[1] - bounds[0]
-    ratio = spans / np.max(spans) * 1.5
+    # By the diagonal: it stays as long whichever way the box is turned, so that nothing is cut.
+    ratio = spans / np.linalg.norm(spans) * _DIAGONAL
     y = _ticks(-bounds[1, 1], -bounds[0, 1])
     # The figure's axis points left: its labels say y to the right.
     mirrored = {"tickvals": (-y).tolist(), "ticktext": [f"{v:g}" for v in y]}
     scene: dict[str, Any] = {
         "aspectmode": "manual",
         "aspectratio": dict(zip("xyz", np.round(ratio, 5).tolist(), strict=True)),
-        "camera": {"eye": _VIEWS["three-quarter"]},
+        "camera": {"eye": _VIEWS["three-quarter"], "center": _CENTRE},
         "dragmode": "orbit",
         # A constant: what the reader has turned stays so while frames are played.
         "uirevision": "kept",
     }
-    titles = {"x": "x forward [m]", "y": "y to the right [m]", "z": "height z [m]"}
+    titles = {"x": "forward [m]", "y": "right [m]", "z": "height [m]"}
     for i, (name, title) in enumerate(titles.items()):
         scene[f"{name}axis"] = {
             "title": {"text": title},
@@ -228,13 +234,18 @@ def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str,
             **(mirrored if name == "y" else {"nticks": 7}),
         }
     return {
-        "height": 620,
-        "margin": {"l": 0, "r": 0, "t": 40, "b": 90},
+        # No height: it is that of the page's style, which knows how wide the screen is.
+        "margin": {"l": 0, "r": 0, "t": 40, "b": 125},
+        "modebar": {"orientation": "v", "remove": ["pan3d", "zoom3d", "orbitRotation"]},
         "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
         "scene": scene,
         "uirevision": "kept",
         **_controls(names, pace),
     }
+
+
+def _camera(eye: dict[str, float]) -> dict[str, Any]:
+    return {"scene.camera": {"eye": eye, "center": _CENTRE}}
 
 
 def _controls(names: dict[str, str], pace: float) -> dict[str, Any]:
@@ -252,19 +263,20 @@ def _controls(names: dict[str, str], pace: float) -> dict[str, Any]:
         {"label": "pause", "method": "animate", "args": [[None], jump]},
     ]
     views = [
-        {"label": name, "method": "relayout", "args": [{"scene.camera": {"eye": eye}}]}
+        {"label": name, "method": "relayout", "args": [_camera(eye)]}
         for name, eye in _VIEWS.items()
     ]
-    # Both rows of buttons lie outside the scene: over it they would take the mouse from it.
+    # Both rows of buttons lie outside the scene: over it they would take the mouse from it. One
+    # below the other with the slider, since beside it they overlap on a narrow screen.
     row = {"type": "buttons", "direction": "right", "yanchor": "top", "showactive": False}
     return {
         "updatemenus": [
-            {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 30}},
+            {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 78}},
             {**row, "buttons": views, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},
         ],
         "sliders": [
             {
-                "steps": steps, "x": 0.2, "len": 0.78, "y": 0.0, "pad": {"t": 10},
+                "steps": steps, "x": 0.0, "len": 1.0, "y": 0.0, "pad": {"t": 5, "l": 8, "r": 24},
                 "font": {"size": 10}, "currentvalue": {"prefix": "time ", "suffix": " s"},
             }
         ],

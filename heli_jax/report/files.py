@@ -143,6 +143,7 @@ def _adequacy(adequacy: Adequacy) -> dict[str, Any]:
         # With the limits that it was judged against, so that a file can be read without the version
         # that wrote it.
         **adequacy._asdict(),
+        "summary": adequacy.summary,
         "judged": [output._asdict() for output in adequacy.judged],
         # The limits of this version: a later one may have others.
         "against": {

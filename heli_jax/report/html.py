@@ -183,6 +183,7 @@ def render(
         baseline=baseline,
         headline=tables.headline(fit),
         sentences=tables.further_sentences(fit),
+        meanings=tables.meanings(fit),
         warnings=tables.warnings(fit),
         remark=tables.model_remark(problem),
         parameters=tables.parameters(fit),

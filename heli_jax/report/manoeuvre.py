@@ -1,7 +1,7 @@
 """Figures of a manoeuvre: plain data in, matplotlib Axes out, as in `heli_jax.report.figures`."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,11 @@ _KINDS = {
     "rad/s": "rates",
 }
 _LENGTHS = (("m", 1.0), ("mm", 1e3), ("µm", 1e6))
+_STILL = 0.05
+"""span of an axis over the largest of its values, at least: what moves by less is nearly constant,
+and not drawn as if it were not"""
+_LEAST = {"m": 0.01, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01, "m/s^2": 0.05, "1": 0.02}
+"""by unit the span of an axis at least: about what the sensors of such a machine tell apart"""
 _HEIGHT = 1.25
 """of a panel [inch]"""
 _LEGEND = 1.05
@@ -48,6 +53,7 @@ def motion(run: Trajectory, model: Model, *, figure: Figure | None = None) -> Pa
         _lines(ax, run.times, {n: getattr(run.outputs, n) for n in names})
         kind = _KINDS.get(unit or "", names[0]) if len(names) > 1 else names[0]
         ax.set_ylabel(style.label(kind, unit))
+        _not_magnified(ax, [getattr(run.outputs, n) for n in names], unit)
     return _finished(axes, run, f"Motion of {model.name}")
 
 
@@ -71,9 +77,12 @@ def sticks(run: Trajectory, model: Model, *, figure: Figure | None = None) -> Pa
         _lines(ax, run.times, values, drawstyle="steps-post")
         kind = "wind" if names[0].startswith("wind") else "sticks"
         ax.set_ylabel(style.label(kind if len(names) > 1 else names[0], unit))
+        _not_magnified(ax, list(values.values()), unit)
     if rotor:
         _lines(axes[-1], run.times, {_APART: getattr(run.outputs, _APART)})
-        axes[-1].set_ylabel(style.label("rotor speed", naming.unit(model.Outputs, _APART)))
+        unit = naming.unit(model.Outputs, _APART)
+        axes[-1].set_ylabel(style.label("rotor speed", unit))
+        _not_magnified(axes[-1], [getattr(run.outputs, _APART)], unit)
     return _finished(axes, run, f"Sticks of {model.name}")
 
 
@@ -109,6 +118,26 @@ def _lines(ax: Axes, times: ArrayLike, values: Mapping[str, ArrayLike], **line_s
     for (name, y), color in zip(values.items(), itertools.cycle(style.CYCLE), strict=False):
         line(ax, times, y, color=color, lw=1.1, label=name, **line_style)
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2, borderaxespad=0.4)
+
+
+def _not_magnified(ax: Axes, values: Sequence[ArrayLike], unit: str | None) -> None:
+    """An axis that does not blow up what is nearly constant to the height of its panel.
+
+    Args:
+        ax: with the values drawn.
+        values: each (N,).
+        unit: of them.
+    """
+    all_of_them = np.concatenate([np.ravel(np.asarray(v, np.float64)) for v in values])
+    seen = all_of_them[np.isfinite(all_of_them)]
+    if seen.size == 0:
+        return
+    low, high = float(seen.min()), float(seen.max())
+    least = max(_STILL * max(abs(low), abs(high)), _LEAST.get(unit or "", 0.0))
+    if high - low < least:
+        middle = 0.5 * (low + high)
+        # With the margin of 5 % that matplotlib leaves to either side.
+        ax.set_ylim(middle - 0.55 * least, middle + 0.55 * least)
 
 
 def _finished(axes: Panels, run: Trajectory, title: str) -> Panels:

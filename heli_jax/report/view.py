@@ -134,7 +134,6 @@ def _flight(run: Trajectory, params: Any, number: int, first: bool) -> markupsaf
         full_html=False,
         # Several flights on a page would else all begin at once.
         auto_play=False,
-        default_height="620px",
         # Its checks take seconds; a test holds that the figure is one of plotly's.
         validate=False,
         # plotly's own ids are random; the same run shall give the same page.

@@ -22,7 +22,13 @@ from heli_jax.simulation.discretize import Discrete, scalars
 from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
 from heli_jax.simulation.options import DEFAULT
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at, advance, dot
-from heli_jax.simulation.stepping import field_term, held_inputs, per_sample, start_state
+from heli_jax.simulation.stepping import (
+    check_countable,
+    field_term,
+    held_inputs,
+    per_sample,
+    start_state,
+)
 from heli_jax.simulation.wrappers import Accumulating
 
 
@@ -155,6 +161,7 @@ def _by_samples(
         args = args._replace(params=values)
     # No limits: an empty record is carried, and costs nothing.
     outside, dtype = {}, jax.tree.leaves(x0)[0].dtype
+    check_countable(n, dtype)
     if reducer.limits is not None:
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
         names = reducer.limits(params, x0, at(inputs, 0))

@@ -24,7 +24,7 @@ from heli_jax.simulation.solvers import (
     Exact,
     ZeroOrderHoldArgs,
 )
-from heli_jax.simulation.stepping import held_inputs, per_sample, start_state
+from heli_jax.simulation.stepping import check_countable, held_inputs, per_sample, start_state
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.simulation.wrappers import StateFeedback, Stopping
 
@@ -205,6 +205,7 @@ def _stepwise(
     """The states from x0 on, one step a sample: time is counted in samples."""
     n = jax.tree.leaves(args.inputs)[0].shape[0]
     dtype = jax.tree.leaves(x0)[0].dtype
+    check_countable(n, dtype)
     sol = dfx.diffeqsolve(
         term,
         method,

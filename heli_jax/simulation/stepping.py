@@ -81,6 +81,26 @@ def start_state(
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
 
 
+def check_countable(samples: int, dtype: Any) -> None:
+    """Refuse a run of so many samples that their numbers are not told apart in its precision.
+
+    Args:
+        samples: of the run.
+        dtype: of its states, in which diffrax counts the samples.
+
+    Raises:
+        ValueError: float32 and more than 4 million samples.
+    """
+    # diffrax makes k out of the end and a quotient, off by up to two units in the last place; above
+    # this they are half a sample.
+    most = round(0.5 / float(jnp.finfo(dtype).eps))
+    if samples > most:
+        raise ValueError(
+            f"expected at most {most} samples in {jnp.dtype(dtype)}, got {samples}: switch to "
+            "float64 (jax.config.update('jax_enable_x64', True))"
+        )
+
+
 _LARGE = 8
 """States beyond which the stages of RK4 are a loop: 5 % slower, a quarter of the compilation."""
 

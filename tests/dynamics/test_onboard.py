@@ -318,6 +318,10 @@ def test_devices_keep_what_a_model_knows():
         (lambda m: models.with_delays(m, {"lat": "Lb"}), "has a parameter 'Lb' already"),
         (lambda m: models.with_rate_loop(m, {"lat": "r"}), "no state 'r'"),
         (lambda m: models.with_gyro(m), "no stick of its yaw axis"),
+        (
+            lambda m: models.with_gyro(models.with_rate_loop(m, ["lat"]), {"lat": "p"}),
+            "lat drives a rate loop already, expected it in one of rate_loop and gyro",
+        ),
         (lambda m: models.with_sensors(m, imu=True), "does not know its velocities"),
         (lambda m: models.with_sensors(m), "expected imu, .*lowpass or delay, got none"),
         (lambda m: models.with_sensors(m, ["r"]), "no output 'r'"),

@@ -79,11 +79,16 @@ def test_white_residuals_are_adequate_whatever_is_explained():
         assert found.sentences == ()
 
 
-def test_a_good_fit_with_coloured_residuals_is_adequate():
+def test_a_good_fit_with_coloured_residuals_is_adequate_in_size_only():
     found = judged(P + 0.14 * P.std() * SLOW, P)
     assert 0.97 < found.judged[0].vaf < 0.99
     assert not found.judged[0].white
     assert found.adequate
+    assert found.summary == "in size only (the residuals of p are not white)"
+    worse = judged(P + 0.35 * P.std() * SLOW, P).summary
+    assert worse.startswith("in size only (the residuals of p are not white; VAF of p is 0.8")
+    filtered = judged(P + 0.14 * P.std() * SLOW, P, against=1.0)
+    assert filtered.summary == "in size only (the innovations of p are not white)"
 
 
 def test_a_slow_rest_asks_for_filter_error_only_where_there_is_an_axis():

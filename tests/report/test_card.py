@@ -65,3 +65,15 @@ def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):
     assert all(g.passed is None for g in lines)
     judged = [g for g in card(problem, filtered) if g.of == "roll, one step ahead"]
     assert any(g.passed for g in judged)
+
+
+def test_theils_bias_part_is_asked_for_only_where_no_bias_was_estimated(sound):
+    fit, problem, _ = sound
+    # With a bias of its own every flight has the mean that was measured.
+    biased = [g for g in card(problem, fit) if g.what == "Theil bias part"]
+    assert biased
+    assert all(g.passed is None and "estimated on this very flight" in g.remark for g in biased)
+    layout = dataclasses.replace(fit.reached.layout, bias=False, offsets=())
+    free = dataclasses.replace(fit, reached=fit.reached._replace(layout=layout))
+    centred = [g for g in card(problem, free) if g.what == "Theil bias part"]
+    assert all(g.passed is not None and not g.remark for g in centred)

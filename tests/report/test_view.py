@@ -81,6 +81,8 @@ def test_frames_follow_the_run(xcell):
     ratio = {a: scene["aspectratio"][a] / spans[a] for a in "xyz"}
     assert ratio["x"] == pytest.approx(ratio["y"], rel=1e-3)
     assert ratio["x"] == pytest.approx(ratio["z"], rel=1e-3)
+    # As large whatever the path: all of it is seen at the distance of the views.
+    assert np.linalg.norm(list(scene["aspectratio"].values())) == pytest.approx(1.45, rel=1e-3)
     last = figure["frames"][-1]
     steps = figure["layout"]["sliders"][0]["steps"]
     assert (steps[-1]["label"], steps[-1]["args"][0]) == ("19.98", [last["name"]])
@@ -163,3 +165,15 @@ def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
     assert "needs the whole helicopter" in words(text)
     [ax] = manoeuvre.sticks(run, model)
     assert ax.get_ylabel() == "x_roll [µm]"
+
+
+def test_what_is_nearly_constant_is_not_blown_up_to_its_panel():
+    t = 0.02 * np.arange(300)
+    run = flown(phi=1e-9 * np.sin(t), Omega=150 + 0.01 * np.sin(t), z=np.sin(t))
+    attitude, _, position, _ = manoeuvre.motion(run, HELICOPTER)
+    assert np.ptp(attitude.get_ylim()) == pytest.approx(1.1 * 0.005)
+    # What moves keeps matplotlib's own limits, 5 % beside its range.
+    assert np.ptp(position.get_ylim()) == pytest.approx(1.1 * np.ptp(np.sin(t)), rel=1e-2)
+    rotor = manoeuvre.sticks(run, HELICOPTER)[-1]
+    assert np.ptp(rotor.get_ylim()) == pytest.approx(1.1 * 0.05 * 150.01, rel=1e-3)
+    assert np.mean(rotor.get_ylim()) == pytest.approx(150.0, abs=0.02)

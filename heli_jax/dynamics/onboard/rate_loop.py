@@ -172,6 +172,7 @@ def _check_rate(model: Model, stick: str, rate: str) -> None:
 @functools.cache
 def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suffix: str) -> Model:
     for stick, _ in loops:
+        _check_free(model, stick)
         # The loop computes the input from the state at hand, so there is no record of it to read
         # further back, as exact delays do: the past has to be carried along in states.
         if stick in dict(model.delays):
@@ -179,6 +180,17 @@ def _with_loops(model: Model, loops: tuple[tuple[str, str], ...], law: Law, suff
     return _RateLoop(model, loops, law).made(
         suffix, lambda bare: _with_loops(bare, loops, law, suffix)
     )
+
+
+def _check_free(model: Model, stick: str) -> None:
+    """Refuse a stick that drives a loop already."""
+    looped = {"rate-loop", "gyro"} & set(model.name.split("+")[1:])
+    if looped and f"Kp_{stick}" in naming.names(model.Params):
+        # Both would be proportional and integral of the same rate, exchangeable in any log.
+        raise ValueError(
+            f"{stick} drives a rate loop already, expected it in one of rate_loop and gyro: "
+            "name the sticks of each (on: [...])"
+        )
 
 
 class _RateLoop(Device):

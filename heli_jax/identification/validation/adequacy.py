@@ -8,9 +8,10 @@ variance accounted for (VAF) of 0.9 (Tischler and Remple, 2012, and Jategaonkar,
 flights in that region). A model is called inadequate only where it misses that by far: where it
 leaves more than a fifth of what is not white noise unexplained, twice what the gate allows.
 Between the two there is doubt, and the same advice. White
-residuals are adequate whatever the VAF: then all that is left is measurement noise. With filter
-error the simulation does not know the disturbance, so it is judged against what the estimated
-disturbance lets expect.
+residuals are adequate whatever the VAF: then all that is left is measurement noise.
+Enough explained with residuals that are not white is adequate in size only, and is said so.
+With filter error the simulation does not know the disturbance, so it is judged against what the
+estimated disturbance lets expect.
 """
 
 from collections.abc import Mapping
@@ -71,15 +72,16 @@ class Adequacy(NamedTuple):
         return any(output.doubtful for output in self.judged)
 
     @property
+    def coloured(self) -> tuple[str, ...]:
+        """The outputs whose residuals (innovations) are not white."""
+        return tuple(output.output for output in self.judged if not output.white)
+
+    @property
     def summary(self) -> str:
-        """`yes`, or `no (VAF of p is -586, less than its mean)`."""
+        """`yes`, `in size only (the residuals of p are not white)`, or
+        `no (VAF of p is -586, less than its mean)`."""
         if self.adequate:
-            doubts = [
-                f"VAF of {output.output} is {output.vaf:.3g}"
-                for output in self.judged
-                if output.doubtful
-            ]
-            return f"yes, with doubts ({'; '.join(doubts)})" if doubts else "yes"
+            return f"in size only ({'; '.join(self._left_over)})" if self.coloured else "yes"
         bad = [output for output in self.judged if not output.adequate]
         words = [
             f"VAF of {output.output} is {output.vaf:.3g}"
@@ -87,6 +89,19 @@ class Adequacy(NamedTuple):
             for output in bad
         ]
         return f"no ({'; '.join(words)})" if words else "no"
+
+    @property
+    def _left_over(self) -> list[str]:
+        """What keeps an adequate model from a plain yes."""
+        filtered = any(output.against_disturbance is not None for output in self.judged)
+        what = "innovations" if filtered else "residuals"
+        words = [f"the {what} of {', '.join(self.coloured)} are not white"]
+        # Between what is adequate and what the acceptance card asks for.
+        return words + [
+            f"VAF of {output.output} is {output.vaf:.3g}"
+            for output in self.judged
+            if output.doubtful
+        ]
 
     @property
     def sentences(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from heli_jax.report.tables.headline import (
     model_remark,
     warnings,
 )
+from heli_jax.report.tables.meanings import meanings
 from heli_jax.report.tables.provenance import Origin, constants, origins
 from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
 
@@ -42,6 +43,7 @@ __all__ = [
     "further_sentences",
     "headline",
     "intervals",
+    "meanings",
     "model_remark",
     "nuisances",
     "origins",

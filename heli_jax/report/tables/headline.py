@@ -27,7 +27,7 @@ def headline(fit: Fit) -> Headline:
     if not fit.adequate:
         worst = fit.adequacy.less_than_mean or level == "bad"
         level = "bad" if worst else "warning"
-    if fit.adequacy.doubtful and level == "good":
+    if fit.adequacy.coloured and level == "good":
         level = "warning"
     return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
 
@@ -49,7 +49,8 @@ def further_sentences(fit: Fit) -> list[str]:
 
 
 def adequate(fit: Fit) -> str:
-    """`yes`, `no (...)`; what stopped before an optimum and looks adequate was not judged."""
+    """`yes`, `in size only (...)`, `no (...)`; what stopped before an optimum and looks adequate
+    was not judged."""
     return "not judged" if adequate_unjudged(fit) else fit.adequacy.summary
 
 

@@ -1,0 +1,62 @@
+"""A run in float32 reads the right sample of its input however long it is, and says what it is."""
+
+from typing import Annotated, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Model, simulate
+from heli_jax.naming import Scalar
+from heli_jax.simulation.stepping import check_countable
+from heli_jax.summaries import as_html, of_trajectory
+
+
+class Params(NamedTuple):
+    gain: Annotated[Scalar, "1", "of the input"]
+
+
+class State(NamedTuple):
+    x: Annotated[Scalar, "1", "integral of the input"]
+
+
+class Inputs(NamedTuple):
+    u: Annotated[Scalar, "1/s", "rate"]
+
+
+INTEGRATOR = Model(
+    "integrator", lambda p, s, u: State(x=p.gain * u.u), lambda p, s, u: s, Params, State, Inputs,
+    State,
+)  # fmt: skip
+
+
+def run(n, dtype):
+    # Whole numbers that float32 holds exactly, so that any difference is a wrong sample.
+    u = np.where(np.arange(n) // 50 % 2, -1.0, 1.0)
+    p, inputs = Params(jnp.asarray(1.0, dtype)), Inputs(jnp.asarray(u, dtype))
+    return u, simulate(INTEGRATOR, p, inputs, dt=jnp.asarray(1.0, dtype), substeps=1)
+
+
+def test_every_step_of_a_long_run_has_its_own_sample():
+    u, found = run(100_000, jnp.float32)
+    assert found.states.x.dtype == jnp.float32
+    np.testing.assert_array_equal(found.states.x, np.concatenate([[0.0], np.cumsum(u)[:-1]]))
+
+
+def test_single_precision_is_said_in_text_and_table():
+    _, single = run(100, jnp.float32)
+    assert "computed in float32, 7 digits" in repr(single)
+    assert "jax_enable_x64" in as_html(of_trajectory(single, ("finished",)))
+    attributes = single.to_xarray().attrs
+    assert attributes["precision"] == "float32"
+    assert "5e-5" in attributes["precision_note"]
+    _, double = run(100, jnp.float64)
+    assert "float" not in repr(double)
+    assert double.to_xarray().attrs == {"precision": "float64"}
+
+
+def test_more_samples_than_float32_counts_are_refused():
+    check_countable(4_194_304, jnp.float32)
+    check_countable(10**9, jnp.float64)
+    with pytest.raises(ValueError, match="at most 4194304 samples in float32, got 4194305"):
+        check_countable(4_194_305, jnp.float32)
