@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
     _add_config(fit)
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
+    agree = command("compatibility", _compatibility, "do a log's sensors agree? their errors")
+    _add_config(agree)
+    agree.add_argument("--out", metavar="DIR", help="run directory (default: as of fit)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
     _add_config(check)
     simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
@@ -256,6 +259,14 @@ def _check(options: argparse.Namespace) -> int:
     check = workflow.run_check(workflow.load_config(options.config, options.set), progress=_say)
     output.print_check(check)
     return DONE if check.verdict.identifiable else NOT_DETERMINED
+
+
+def _compatibility(options: argparse.Namespace) -> int:
+    _prepare_jax()
+    from heli_jax import output
+
+    compatible = output.run_compatibility(options.config, options.out, options.set, _say)
+    return DONE if compatible else NOT_CONVERGED
 
 
 def _simulate(options: argparse.Namespace) -> int:

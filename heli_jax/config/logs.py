@@ -5,7 +5,9 @@ from collections.abc import Mapping
 from typing import Literal
 
 from heli_jax import naming, units
+from heli_jax.config.corrections import read_corrections, with_corrections
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import prepared
 from heli_jax.config.schema import FlightConfig, InputConfig, OutputConfig, SignalsConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
@@ -68,6 +70,11 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
+    flight = prepared(model, flight, where)
+    if f.corrections is not None:
+        place = f"{where}.corrections"
+        found = read_corrections(experiment.path.parent / f.corrections, place)
+        flight = with_corrections(model, flight, f.signals, found, where)
     return _with_notes(flight, _unstated_units(model, f.signals))
 
 

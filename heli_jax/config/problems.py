@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import with_noise
 from heli_jax.config.logs import read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.config.starts import first_guesses
@@ -49,6 +50,7 @@ def problem(experiment: Experiment) -> Problem:
                 "disturbance: {axis: roll, poles: 1}"
             )
         model, params = disturbed(experiment)
+        params = with_noise(model, params, flights)
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     try:
         return Problem(

@@ -89,6 +89,8 @@ class FlightConfig(_Strict):
     # parameter was bent to.
     hold_out: bool = False
     known: dict[str, Finite] = {}
+    corrections: str | None = None
+    """a file of `heli-jax compatibility`: errors of the sensors, taken off the signals"""
 
 
 class PriorConfig(_Strict):
