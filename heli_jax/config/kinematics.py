@@ -1,6 +1,7 @@
 """What a configuration of `model: kinematics` means where it leaves things out."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -178,3 +179,17 @@ def with_noise(model: Model, params: Record, flights: Sequence[Flight]) -> Recor
     # Zero is the default and no statement: no gyro is without noise.
     missing = {n: v for n, v in noise_of(model, flights).items() if not getattr(params, n) > 0}
     return naming.replace(params, **{n: jnp.asarray(v) for n, v in missing.items()})
+
+
+_STEP = 0.02
+"""s; a rotation at 5 rad/s is a tenth of a radian in it, which one step of either method follows to
+1e-6"""
+
+
+def substeps_of(flights: Sequence[Flight]) -> int:
+    """Steps in a sample for a kinematic model, which has no fast dynamics of its own.
+
+    Args:
+        flights: read.
+    """
+    return max(1, *(math.ceil(f.dt / _STEP - 1e-9) for f in flights))

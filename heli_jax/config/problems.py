@@ -1,6 +1,7 @@
 """The problem that a configuration describes."""
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,13 +9,15 @@ import jax.numpy as jnp
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.kinematics import with_noise
+from heli_jax.config.kinematics import substeps_of, with_noise
 from heli_jax.config.logs import read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.config.starts import first_guesses
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
@@ -60,7 +63,7 @@ def problem(experiment: Experiment) -> Problem:
             free,
             nuisance,
             # One number for all flights, since they share one compiled program: the slowest log's.
-            substeps=max(substeps_for(f.dt) for f in flights),
+            substeps=_substeps(model, flights),
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
             fixed_noise=fixed,
@@ -72,6 +75,12 @@ def problem(experiment: Experiment) -> Problem:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
         place = path if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+
+
+def _substeps(model: Model, flights: Sequence[Flight]) -> int:
+    if is_kinematic(model):
+        return substeps_of(flights)
+    return max(substeps_for(f.dt) for f in flights)
 
 
 def _nuisance(config: FitConfig) -> Nuisance:

@@ -1,4 +1,4 @@
-"""Rigid-body kinematics against a quaternion integrated by hand, and what sensors' errors do."""
+"""Rigid-body kinematics against a motion in closed form, and what sensors' errors do."""
 
 import runpy
 from pathlib import Path
@@ -18,15 +18,15 @@ ERRORS = {
     "b_p": 0.03, "b_q": -0.02, "b_r": 0.01, "lambda_p": 0.05, "lambda_q": -0.04, "lambda_r": 0.02,
     "b_ax": 0.3, "b_ay": -0.2, "b_az": 0.4, "lambda_ax": -0.02, "lambda_ay": 0.03,
     "lambda_az": 0.01, "x_imu": 0.3, "y_imu": -0.2, "z_imu": 0.15,
-    "delay_gyro": 0.03, "delay_accel": 0.03,
+    "delay_gyro": -0.03, "delay_accel": -0.03,
 }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def truth():
-    """A motion in closed form; its attitude is a quaternion, integrated with Runge-Kutta."""
+    """A motion in closed form; its rates are differences of the rotation matrix."""
     path = Path(__file__).parents[2] / "experiments" / "data_compatibility.py"
-    return runpy.run_path(str(path))["Motion"](np.random.default_rng(3), DURATION)
+    return runpy.run_path(str(path))["Motion"](np.random.default_rng(3))
 
 
 def test_errors_of_every_kind_are_undone(truth):
@@ -68,9 +68,10 @@ def test_errors_of_every_kind_are_undone(truth):
         ]
     )
     found = np.column_stack([np.asarray(getattr(run.outputs, n)) for n in model.Outputs._fields])
-    # Straight lines between samples of 20 ms, and before the first sample nothing is logged.
-    tolerance = [2e-3] * 3 + [0.03] * 7 + [0.1] * 3
-    assert (np.abs(found - expected).max(axis=0) < tolerance).all()
+    # Straight lines between samples of 20 ms; what the IMU, which is late, shows after the end of
+    # the record is unknown.
+    error = np.abs(found - expected)[:-2].max(axis=0)
+    np.testing.assert_array_less(error, [5e-4] * 3 + [0.02] * 7 + [0.05] * 3)
     # That the lever arm is seen: without it velocities would be off by omega times it.
     assert np.abs(np.cross(w, arm)).max() > 0.2
 
