@@ -94,7 +94,21 @@ def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
     # Gyros are inputs, and their noise is integrated: a filter knows that, a simulation does not.
     fit = {"method": "filter-error", "free": free, "starts": 1, **fit, "nuisance": nuisance}
     # No baseline: recursive least squares takes one output of one stick.
-    return {"vehicle": {}, "rls": None, **content, "model": model.name, "fit": fit}
+    full = {"vehicle": {}, "rls": None, **content, "model": model.name, "fit": fit}
+    return full | {"flights": _moving(content["flights"])} if "flights" in content else full
+
+
+def _moving(value: Any) -> Any:
+    """The flights with inputs that move between samples: a rate is measured, nobody commands it in
+    steps. What is malformed stays as it is."""
+    if isinstance(value, list):
+        return [_moving(each) for each in value]
+    signals = value.get("signals") if isinstance(value, dict) else None
+    inputs = signals.get("inputs") if isinstance(signals, dict) else None
+    if not isinstance(inputs, dict):
+        return value
+    moving = {n: {"hold": "linear", **u} if isinstance(u, dict) else u for n, u in inputs.items()}
+    return {**value, "signals": {**signals, "inputs": moving}}
 
 
 def _names(content: dict[str, Any], role: str) -> set[str]:
