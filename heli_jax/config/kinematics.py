@@ -196,8 +196,7 @@ def with_noise(model: Model, params: Record, flights: Sequence[Flight]) -> Recor
 
 
 _STEP = 0.02
-"""s; a rotation at 5 rad/s is a tenth of a radian in it, which one step of either method follows to
-1e-6"""
+"""s; the straight lines between logged samples err more than one step of this length"""
 
 
 def substeps_of(flights: Sequence[Flight]) -> int:
