@@ -25,7 +25,6 @@ from heli_jax.identification.fit import fit  # noqa: E402
 from heli_jax.identification.problem import Nuisance, Problem  # noqa: E402
 
 G = np.array([0.0, 0.0, 9.80665])
-RATE = 50.0
 SIZES = {"b": 0.02, "lambda": 0.03, "ba": 0.2, "la": 0.02, "arm": 0.1, "delay": 0.02}
 
 
@@ -104,12 +103,12 @@ def draw_errors(rng: np.random.Generator, whole: bool) -> dict[str, float]:
 
 
 def logged(
-    rng: np.random.Generator, errors: dict[str, float], gyro_noise: float, duration: float
+    rng: np.random.Generator, errors: dict[str, float], gyro_noise: float, times: np.ndarray
 ) -> Flight:
-    """One flight as the sensors have it."""
+    """One flight as the sensors have it, at equally spaced times (N,) [s]."""
     motion, whole = Motion(rng), "b_ax" in errors
-    t = np.arange(round(duration * RATE)) / RATE
-    late, n = t - errors["delay_gyro"], t.size
+    t, n = times, times.size
+    late = t - errors["delay_gyro"]
 
     def shown(true: np.ndarray, names: tuple[str, ...], noise: float) -> dict[str, np.ndarray]:
         return {
@@ -132,7 +131,9 @@ def logged(
         for i in range(3):
             outputs[kinematics.GROUND[i]] = velocity[:, i] + 0.05 * rng.standard_normal(n)
             outputs["NED"[i]] = position[:, i] + 0.02 * rng.standard_normal(n)
-    return Flight(dt=1 / RATE, inputs=inputs, outputs=outputs, hold=dict.fromkeys(inputs, "linear"))
+    return Flight(
+        dt=float(t[1]), inputs=inputs, outputs=outputs, hold=dict.fromkeys(inputs, "linear")
+    )
 
 
 def compare(
@@ -174,24 +175,25 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--duration", type=float, default=30.0)
+    parser.add_argument("--rate", type=float, default=100.0, help="of the log [Hz]")
     parser.add_argument("--gyro-noise", type=float, default=0.01, help="sd of a sample [rad/s]")
     parser.add_argument("--angles", action="store_true", help="rates against angles alone")
     parser.add_argument("--method", default="filter-error")
     options = parser.parse_args()
     table: dict[str, list[tuple[bool, float]]] = {}
     model = kinematics.attitude if options.angles else kinematics.position
-    began = time.perf_counter()
+    times, began = np.arange(0.0, options.duration, 1 / options.rate), time.perf_counter()
     # Interrupted, it shows what it has.
     with contextlib.suppress(KeyboardInterrupt):
         for run in range(options.first, options.first + options.runs):
             rng = np.random.default_rng(run)
             truth = draw_errors(rng, not options.angles)
-            flight = logged(rng, truth, options.gyro_noise, options.duration)
+            flight = logged(rng, truth, options.gyro_noise, times)
             for name, row in compare(model, flight, truth, options.method).items():
                 table.setdefault(name, []).append(row)
     print(
         f"{options.method}, {model.name}, gyro noise {options.gyro_noise:g} rad/s, "
-        f"{options.duration:g} s; {time.perf_counter() - began:.0f} s"
+        f"{options.duration:g} s at {options.rate:g} Hz; {time.perf_counter() - began:.0f} s"
     )
     show(table)
 
