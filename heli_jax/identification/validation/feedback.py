@@ -18,6 +18,7 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -107,7 +108,10 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
 
 
 def feedback_of(problem: Problem) -> tuple[Feedback, ...]:
-    """Of all flights that are fitted."""
+    """Of all flights that are fitted; nothing where sensors are compared with each other, of which
+    none is a stick that anybody moves."""
+    if is_kinematic(problem.model):
+        return ()
     flights = problem.training
     return tuple(
         one._replace(flight=label)

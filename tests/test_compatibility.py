@@ -1,0 +1,149 @@
+"""heli-jax compatibility: errors found, written, and taken off the signals again."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax import config
+from heli_jax.cli import main
+from heli_jax.errors import InputError
+
+RATE, DURATION = 25.0, 16.0
+TREX = Path(__file__).parents[2] / "shared" / "data" / "trex550" / "Pitchtest.csv"
+BIAS, SCALE, LATE = 1.5, 0.08, 0.04
+"""of the roll gyro [deg/s], of its scale, and of the angles [s]"""
+
+
+@pytest.fixture(scope="module")
+def true():
+    """Time, rates [rad/s] and angles [rad] of a motion in closed form, the angles late."""
+    path = Path(__file__).parents[1] / "experiments" / "data_compatibility.py"
+    motion = runpy.run_path(str(path))["Motion"](np.random.default_rng(5))
+    t = np.arange(round(DURATION * RATE)) / RATE
+    return t, motion.omega(t), motion.angles(t - LATE)
+
+
+@pytest.fixture
+def folder(tmp_path, true):
+    """A log with a wrong roll gyro, and its configuration."""
+    t, omega, angles = true
+    rng = np.random.default_rng(1)
+    rates = np.degrees(omega + 0.004 * rng.standard_normal(omega.shape))
+    rates[:, 0] = (1 + SCALE) * rates[:, 0] + BIAS
+    # Yaw as compasses show it, from -180 to 180 degrees.
+    shown = np.degrees(angles + np.array([0, 0, 3.0]) + 0.004 * rng.standard_normal(angles.shape))
+    shown[:, 2] = (shown[:, 2] + 180.0) % 360.0 - 180.0
+    columns = np.column_stack([t, rates, shown])
+    np.savetxt(
+        tmp_path / "log.csv", columns, delimiter=",", comments="",
+        header="t,gx,gy,gz,roll,pitch,yaw", fmt="%.9g",
+    )  # fmt: skip
+    return tmp_path
+
+
+def configured(folder, name="sensors.yaml", **more):
+    def named(pairs):
+        return {n: {"signal": s, "unit": u} for n, s, u in pairs}
+
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": named([("p", "gx", "deg/s"), ("q", "gy", "deg/s"), ("r", "gz", "deg/s")]),
+        "outputs": named(
+            [("phi", "roll", "deg"), ("theta", "pitch", "deg"), ("psi", "yaw", "deg")]
+        ),
+    }
+    content = {
+        "model": "kinematics",
+        "flights": [{"log": "log.csv", "signals": signals} | more.pop("flight", {})],
+    } | more
+    path = folder / name
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+def test_errors_are_found_and_taken_off_again(folder, true, capsys):
+    path = configured(folder)
+    out = folder / "out"
+    assert main(["compatibility", str(path), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("Compatible once ")
+    assert {"report.html", "compatibility.yaml", "config.yaml"} <= {p.name for p in out.iterdir()}
+    found = yaml.safe_load((out / "compatibility.yaml").read_text())
+    roll = found["signals"]["gx"]
+    assert roll["of"] == "p"
+    assert roll["bias"] == pytest.approx(BIAS, abs=0.15)
+    assert roll["scale"] == pytest.approx(SCALE, abs=0.02)
+    # The angles are the late ones.
+    assert found["signals"]["roll"]["delay"] == pytest.approx(LATE, abs=0.01)
+    assert not roll["delay"]
+    applied = configured(folder, "next.yaml", flight={"corrections": "out/compatibility.yaml"})
+    [flight] = config.read_flights(config.load(applied))
+    t, omega, angles = true
+    np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.025)
+    # Angles at their own times again; the last has none.
+    n = round(LATE * RATE)
+    error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
+    assert np.std(error) < 0.008
+    assert np.isnan(flight.outputs["phi"][-1])
+    assert any(note.startswith("p: corrected by scale +0.0") for note in flight.source.notes)
+
+
+def test_a_model_of_the_machine_is_refused(folder, capsys):
+    path = configured(folder, model={"linear": "roll-flybarless"})
+    assert main(["compatibility", str(path), "--out", str(folder / "out")]) == 2
+    assert not (folder / "out").exists()
+
+
+CORRECTION = {"unit": "deg/s", "bias": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"signals": {"gx": {**CORRECTION, "bais": 1}}}, "signals.gx.bais: extra inputs are not"),
+        ({"signals": {"gx": {"bias": 1.5}}}, "signals.gx.unit: field required"),
+        ({"signals": {"gx": {**CORRECTION, "unit": "rad/s"}}}, "gx: expected the unit that it was"),
+        ({"signals": {"gx": {**CORRECTION, "unit": "m"}}}, "corrections: gx: "),
+        ({"signals": {"gx": {**CORRECTION, "scale": -1}}}, "signals.gx.scale: input should be"),
+        ({"signals": {"gx": {**CORRECTION, "conversion": {"invert": True}}}}, "invert: true}, got"),
+        ({"signals": {"other": CORRECTION}}, "expected a signal of this flight, got .* other"),
+        ({}, "got corrections of none"),
+    ],
+)
+def test_wrong_corrections_are_refused_in_a_sentence(folder, content, words):
+    (folder / "c.yaml").write_text(yaml.safe_dump(content))
+    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
+    with pytest.raises(InputError, match=words):
+        config.read_flights(experiment)
+
+
+def test_a_lever_arm_goes_to_a_model_that_has_one(folder):
+    content = {
+        "signals": {"gx": CORRECTION},
+        "lever_arm": {"x_imu": 0.2},
+        "not_determined": ["b_r"],
+    }
+    (folder / "c.yaml").write_text(yaml.safe_dump(content))
+    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
+    [flight] = config.read_flights(experiment)
+    assert flight.known == {}
+    assert "lever arm not used, model kinematics-attitude has none: x_imu 0.2 m" in (
+        flight.source.notes
+    )
+    assert "not corrected, since undetermined: b_r" in flight.source.notes
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TREX.exists(), reason="needs shared/data/trex550/Pitchtest.csv")
+def test_a_real_log_is_judged(folder):
+    path = configured(folder, flight={"log": str(TREX), "rate": 25})
+    content = yaml.safe_load(path.read_text())
+    for role in ("inputs", "outputs"):
+        unit = {"inputs": "rad/s", "outputs": "rad"}[role]
+        named = content["flights"][0]["signals"][role]
+        content["flights"][0]["signals"][role] = {n: {"signal": n, "unit": unit} for n in named}
+    path.write_text(yaml.safe_dump(content))
+    assert main(["compatibility", str(path), "--out", str(folder / "out")]) in (0, 4)
