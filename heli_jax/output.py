@@ -108,7 +108,7 @@ def run_compatibility(
     print(found.verdict)
     for line in found.run.fit.notes:
         print(f"! {line}")
-    _table(*compatibility.table(found))
+    print_table(*compatibility.table(found))
     print(
         "R2 of what is reconstructed: "
         + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
