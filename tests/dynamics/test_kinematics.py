@@ -16,6 +16,8 @@ from heli_jax.config.kinematics import (
     prepared,
     sharpened,
 )
+from heli_jax.config.preset_signals import resolve
+from heli_jax.config.schema import SignalsConfig
 from heli_jax.dynamics import kinematics
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal
@@ -130,10 +132,15 @@ def test_further_logs_and_presets_are_asked_for_the_model():
     further["flights"][0]["also"] = [{"signals": {**forces, "outputs": {"vn": {"signal": "v"}}}}]
     assert completed(further, "a.yaml")["model"] == "kinematics-velocity"
     preset = {"preset": "px4-helicopter"}
-    for asked, model in ((["phi"], "attitude"), (["phi", "N"], "position")):
+    for asked, model in ((["phi"], kinematics.attitude), (["phi", "u"], kinematics.velocity)):
         signals = {**preset, "preset_outputs": asked}
         content = {"model": "kinematics", "flights": [{"log": "a", "signals": signals}]}
-        assert completed(content, "a.yaml")["model"] == f"kinematics-{model}"
+        assert completed(content, "a.yaml")["model"] == model.name
+        # What is an output of a helicopter is an input here.
+        found = resolve(model, SignalsConfig(**signals), "a.yaml", None, None, ())
+        assert set(found.inputs) == set(model.Inputs._fields)
+        assert found.inputs["p"].signal == "vehicle_angular_velocity.xyz[0]"
+        assert list(found.outputs) == asked
 
 
 def test_rates_move_between_samples_unless_the_configuration_says_otherwise():
