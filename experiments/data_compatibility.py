@@ -17,7 +17,7 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from heli_jax.config.kinematics import errors_of, noise_of, sharpened, substeps_of  # noqa: E402
+from heli_jax.config.kinematics import errors_of, free_noise, sharpened, substeps_of  # noqa: E402
 from heli_jax.dynamics import kinematics  # noqa: E402
 from heli_jax.dynamics.model import Model  # noqa: E402
 from heli_jax.flights.flight import Flight  # noqa: E402
@@ -140,12 +140,13 @@ def compare(
     model: Model, flight: Flight, truth: dict[str, float], method: str
 ) -> dict[str, tuple[bool, float]]:
     """By error whether its interval holds the truth, and how many sds the estimate is off."""
-    noise = noise_of(model, (flight,)) if method == "filter-error" else {}
+    params = model.Params()
+    noise = free_noise(model, params, (flight,)) if method == "filter-error" else {}
     problem = Problem(
         model,
-        model.Params(**noise),
+        params,
         [sharpened(model, flight)],
-        errors_of(model, flight.outputs),
+        {**noise, **errors_of(model, flight.outputs)},
         Nuisance(bias=False, input_offset=False),
         substeps=substeps_of((flight,)),
         method=method,
@@ -154,7 +155,7 @@ def compare(
     return {
         n: (e.lower95 <= truth[n] <= e.upper95, (e.value - truth[n]) / e.sd)
         for n, e in found.estimates.items()
-        if e.sd is not None and e.lower95 is not None and e.upper95 is not None
+        if n in truth and e.sd is not None and e.lower95 is not None and e.upper95 is not None
     }
 
 

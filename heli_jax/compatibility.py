@@ -5,6 +5,7 @@ intervals and report, then a word on each error, and a file of corrections.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 
 from heli_jax import naming, run_directory, units, workflow
 from heli_jax.config.corrections import Conversion, conversion_of, logged_signals
+from heli_jax.config.kinematics import SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
@@ -26,6 +28,8 @@ AGREES = 0.9
 """R^2 of a channel from which on its sensors agree (the acceptance card's gate)"""
 _RESTS = 0.5
 """share of the prior in what is known of an error from which on the record does not determine it"""
+_LARGEST_SCALE = 0.1
+"""scale error beyond which it is hardly the sensor's own: a cheap one is good to some percent"""
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,8 @@ class SensorError:
     def words(self) -> str:
         """What the table says of it."""
         if not self.determined:
-            return "not determined"
-        return "yes" if self.shows else "none shown"
+            return "unknown"
+        return "yes" if self.shows else "no"
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,8 @@ class Compatibility:
     """by output, of what the corrected rates and specific forces reconstruct"""
     compatible: bool
     verdict: str
+    doubts: tuple[str, ...]
+    """sentences on what speaks against the estimates"""
     corrections: dict[str, Any]
     """what `compatibility.yaml` holds"""
 
@@ -105,7 +111,7 @@ def run_compatibility(
 
 def judged(run: FitRun) -> Compatibility:
     """What a fit of a kinematic model says of the sensors."""
-    errors = tuple(_error(run, name, e) for name, e in run.fit.estimates.items())
+    errors = tuple(_error(run, n, e) for n, e in run.fit.estimates.items() if n in SIZES)
     r_squared = r_squared_of(run)
     bad = [n for n, r in r_squared.items() if not r >= AGREES]
     converged = run.fit.status != "not-converged"
@@ -115,6 +121,7 @@ def judged(run: FitRun) -> Compatibility:
         r_squared,
         converged and not bad,
         _verdict(errors, r_squared, bad, converged),
+        _doubts(run, errors),
         _corrections(run, {e.name: e.estimate.value for e in errors if e.determined}, errors),
     )
 
@@ -158,6 +165,24 @@ def _verdict(
     if not found:
         return f"Compatible as logged: R2 {lowest:.4f} or more, and no error shows."
     return f"Compatible once {', '.join(found)} are corrected: R2 {lowest:.4f} or more."
+
+
+def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
+    """What a fit says of itself, and errors that no sensor has."""
+    scales = [
+        e
+        for e in errors
+        if e.shows and e.name.startswith("lambda_") and abs(e.estimate.value) > _LARGEST_SCALE
+    ]
+    if not scales:
+        return run.fit.notes
+    words = ", ".join(f"{e.name} {e.estimate.value:+.0%}" for e in scales)
+    return (
+        f"{words}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
+        "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
+        "the log's signals together; which of them is wrong they do not say.",
+        *run.fit.notes,
+    )
 
 
 def _corrections(
@@ -207,13 +232,20 @@ def _short(value: float) -> float:
 
 def table(found: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and rows of the table of errors."""
-    head = ("error", "estimate", "95 % interval", "unit", "error shows", "what it is")
+    head = ("error", "estimate, 95 %", "unit", "shows", "what it is")
     rows = []
     for e in found.errors:
-        value = interval = ""
-        estimate = e.estimate
+        interval, estimate = "", e.estimate
         if e.determined and estimate.lower95 is not None and estimate.upper95 is not None:
-            value = f"{estimate.value:.4g}"
-            interval = f"{estimate.lower95:.4g} to {estimate.upper95:.4g}"
-        rows.append((e.name, value, interval, estimate.unit, e.words, e.meaning))
+            reach = max(estimate.upper95 - estimate.value, estimate.value - estimate.lower95)
+            interval = _plus_minus(estimate.value, reach)
+        rows.append((e.name, interval, estimate.unit, e.words, e.meaning))
     return head, rows
+
+
+def _plus_minus(value: float, reach: float) -> str:
+    """As many digits as the reach of the interval has sense for: two of its own."""
+    if not 0 < reach < math.inf:
+        return f"{value:.4g} +- {reach:.2g}"
+    digits = max(0, 1 - math.floor(math.log10(reach)))
+    return f"{value:.{digits}f} +- {reach:.{digits}f}"

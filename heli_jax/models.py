@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from heli_jax.dynamics import kinematics
-from heli_jax.dynamics.check_model import check_model
+from heli_jax.dynamics.check_model import check_model, what_instead
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.delays import with_delays
@@ -100,7 +100,7 @@ def _imported(name: str, where: str, folder: str | Path | None) -> Model:
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):
-        kind = "nothing" if model is None else f"a {type(model).__name__}"
+        kind = "nothing" if model is None else what_instead(model)
         raise InputError(f"{where}: expected a heli_jax.Model at {name!r}, got {kind}")
     # Here and not at the first run: the message can name the configuration's key.
     try:

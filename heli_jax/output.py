@@ -106,7 +106,7 @@ def run_compatibility(
     place = run_directory.default_directory(Path(config)) if out is None else Path(out)
     found = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
     print(found.verdict)
-    for line in found.run.fit.notes:
+    for line in found.doubts:
         print(f"! {line}")
     print_table(*compatibility.table(found))
     print(
@@ -198,6 +198,8 @@ def _escaped(text: str) -> str:
 def print_check(check: Check) -> None:
     """The identifiability at the initial guess, on standard output."""
     verdict = check.verdict
+    # The fit judges at its estimates, and need not agree: sensitivities move with the parameters.
+    print("At the start values (the fit judges at its estimates, which may differ):")
     _print_verdict(verdict)
     rows = []
     for i, name in enumerate(verdict.names):

@@ -2,14 +2,16 @@
 
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
-from heli_jax import config, run_directory, workflow
+from heli_jax import compatibility, config, run_directory, workflow
 from heli_jax.cli import main
 from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate
 
 RATE, DURATION = 25.0, 16.0
 TREX = Path(__file__).parents[2] / "shared" / "data" / "trex550" / "Pitchtest.csv"
@@ -64,7 +66,8 @@ def configured(folder, name="sensors.yaml", **more):
     return path
 
 
-def test_errors_are_found_and_taken_off_again(folder, true, capsys, monkeypatch):
+@pytest.mark.slow
+def test_errors_are_found(folder, capsys, monkeypatch):
     path = configured(folder)
     out = folder / "out"
     out.mkdir()
@@ -74,7 +77,7 @@ def test_errors_are_found_and_taken_off_again(folder, true, capsys, monkeypatch)
     assert main(["compatibility", str(path), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("Compatible once ")
-    assert "error shows" in said
+    assert "scale, gyro roll" in said
     found = yaml.safe_load((out / "compatibility.yaml").read_text())
     roll = found["signals"]["gx"]
     assert roll["of"] == "p"
@@ -83,22 +86,77 @@ def test_errors_are_found_and_taken_off_again(folder, true, capsys, monkeypatch)
     # The angles are the late ones.
     assert found["signals"]["roll"]["delay"] == pytest.approx(LATE, abs=0.01)
     assert not roll["delay"]
-    applied = configured(folder, "next.yaml", flight={"corrections": "out/compatibility.yaml"})
+
+
+def test_errors_are_taken_off(folder, true):
+    late = {"unit": "deg", "delay": LATE}
+    roll = {"of": "p", "unit": "deg/s", "scale": SCALE, "bias": BIAS}
+    content = {"signals": {"gx": roll, "roll": late, "pitch": late, "yaw": late}}
+    (folder / "found.yaml").write_text(yaml.safe_dump(content))
+    applied = configured(folder, "next.yaml", flight={"corrections": "found.yaml"})
     [flight] = config.read_flights(config.load(applied))
     t, omega, angles = true
-    np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.025)
+    np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.02)
     # Angles at their own times again; the last has none.
     n = round(LATE * RATE)
     error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
     assert np.std(error) < 0.008
     assert np.isnan(flight.outputs["phi"][-1])
-    assert any(note.startswith("p: corrected by scale +0.0") for note in flight.source.notes)
+    assert any(
+        note.startswith("p: corrected by scale +0.08, bias 1.5 deg/s")
+        for note in flight.source.notes
+    )
 
 
 def test_a_model_of_the_machine_is_refused(folder, capsys):
     path = configured(folder, model={"linear": "roll-flybarless"})
     assert main(["compatibility", str(path), "--out", str(folder / "out")]) == 2
     assert not (folder / "out").exists()
+
+
+def fitted(folder, estimates, shares, status="converged"):
+    """What a fit would have said, by error (value, reach of its interval), by output R2."""
+    experiment = config.load(configured(folder))
+    y = np.sin(np.arange(100.0))
+    left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
+    signals = SimpleNamespace(measured=dict.fromkeys(shares, y), simulated=left, hold_out=False)
+    fit = SimpleNamespace(
+        estimates={
+            n: Estimate(v, 0.5 * w, v - w, v + w, "1", 0.0, 0.9 if n == "b_r" else 0.0, False)
+            for n, (v, w) in estimates.items()
+        },
+        verdict=SimpleNamespace(resting=()),
+        status=status,
+        signals=[signals],
+        notes=("of the fit",),
+    )
+    problem = SimpleNamespace(flights=config.read_flights(experiment))
+    return SimpleNamespace(config=experiment, fit=fit, problem=problem)
+
+
+def test_a_fit_is_put_in_words(folder):
+    found = {"lambda_p": (0.23, 0.004), "b_p": (0.001, 0.002), "b_r": (0.1, 0.01),
+             "noise_gyro": (0.01, 0.001), "delay_gyro": (0.04, 0.01)}  # fmt: skip
+    judged = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.95}))
+    assert judged.compatible
+    assert judged.verdict == (
+        "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more."
+    )
+    assert judged.doubts[0].startswith("lambda_p +23%: more than a sensor's own error.")
+    assert judged.doubts[1] == "of the fit"
+    rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
+    assert rows == [
+        ("lambda_p", "0.2300 +- 0.0040", "yes"), ("b_p", "0.0010 +- 0.0020", "no"),
+        ("b_r", "", "unknown"), ("delay_gyro", "0.040 +- 0.010", "yes"),
+    ]  # fmt: skip
+    assert judged.corrections["signals"]["roll"]["delay"] == 0.04
+    assert judged.corrections["not_determined"] == ["b_r"]
+    bad = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.2}))
+    assert not bad.compatible
+    assert "bring psi (R2 0.200) to R2 0.9" in bad.verdict
+    lost = compatibility.judged(fitted(folder, found, {"phi": 0.99}, "not-converged"))
+    assert not lost.compatible
+    assert not lost.corrections["signals"]
 
 
 CORRECTION = {"unit": "deg/s", "bias": 1.5}

@@ -35,6 +35,7 @@ def chirped(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_simulate_check_and_fit_say_what_was_taken_and_why(chirped, capsys, tmp_path):
     assert main(["simulate", str(chirped), "--out", str(chirped.parent / "bench.csv")]) == 0
     said = capsys.readouterr().err
@@ -69,6 +70,7 @@ def test_no_such_hold(chirped, capsys):
     assert all(w in said for w in ("x_roll.hold", "'cubic'", "auto", "zero-order", "linear"))
 
 
+@pytest.mark.slow
 def test_a_sweep_follows_the_holds_of_its_flights():
     """Reduced while it goes on, kept whole, and delayed: each as simulate has it."""
     vehicle = load_vehicle(ROOT / "configs" / "vehicles" / "bench-30.yaml")

@@ -47,7 +47,7 @@ def test_what_it_writes_is_in_the_house_s_style(tmp_path):
     [
         ("9x", "expected a name of letters"),
         ("a-b", "expected a name of letters"),
-        ("class", "expected a name of letters"),
+        ("class", "'class' is a keyword of Python"),
         ("../x", "expected a name of letters"),
         ("rôle", "expected a name of letters"),
         ("numpy", "name of an installed module"),

@@ -76,6 +76,7 @@ def test_devices_stand_around_a_linear_model(written, tmp_path):
     assert same.vehicle.params == found.vehicle.params
 
 
+@pytest.mark.slow
 def test_they_are_simulated_checked_and_swept(written, tmp_path):
     path = written(
         onboard={"servos": {"on": ["lat"]}},

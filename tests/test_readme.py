@@ -49,6 +49,7 @@ def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
     assert (folder / "runs/notebook/fit/report.html").exists()
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_runs(folder):
     assert len(parts()) == 3
     out = run(folder, "\n".join(parts()[1:]))

@@ -12,6 +12,7 @@ from heli_jax import naming
 from heli_jax.analysis.lti import siso_polynomials
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
 from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.onboard.delays import require_past
 
 # Params, State and Inputs are classes of the user's: `Any` below.
 
@@ -66,7 +67,11 @@ def modes(model: Model, params: Any, state: Any = None, inputs: Any = None) -> n
         params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
+
+    Raises:
+        ValueError: the delay of a delay line is negative.
     """
+    require_past(model, params)
     eigenvalues = np.linalg.eigvals(np.asarray(jacobians(model, params, state, inputs).A))
     return eigenvalues[np.argsort(np.abs(eigenvalues))]
 
@@ -110,7 +115,11 @@ def eigenmodes(
         params: its constants, concrete.
         state: the model's initial state unless given.
         inputs: zeros unless given.
+
+    Raises:
+        ValueError: the delay of a delay line is negative.
     """
+    require_past(model, params)
     A = np.asarray(jacobians(model, params, state, inputs).A, np.float64)
     values, left, right = scipy.linalg.eig(A, left=True)
     # At least 1/s: of a model that does not move at all every eigenvalue is zero.

@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -194,19 +193,25 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
     return found
 
 
-def with_noise(model: Model, params: Record, flights: Sequence[Flight]) -> Record:
-    """The parameters of a kinematic model with the noise of its inputs, where nobody stated it.
+_FAINTEST = 1e-6
+"""of a drift in a second, SI: below what any log shows, and above zero, which has no logarithm"""
+
+
+def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[str, Free]:
+    """The noise of a kinematic model's inputs as parameters to be estimated, where nobody stated
+    it: third differences are where the search begins, but a filter before the log takes all noise
+    out of them, and none of what gyros and angles differ by otherwise is in them.
 
     Args:
-        model: any; the parameters of another than a kinematic one stay as they are.
+        model: any; none of another than a kinematic one.
         params: its Params.
         flights: read.
     """
     if not is_kinematic(model):
-        return params
+        return {}
     # Zero is the default and no statement: no gyro is without noise.
     missing = {n: v for n, v in noise_of(model, flights).items() if not getattr(params, n) > 0}
-    return naming.replace(params, **{n: jnp.asarray(v) for n, v in missing.items()})
+    return {n: Free(max(v, _FAINTEST), sign="keep") for n, v in missing.items()}
 
 
 def sharpened(model: Model, flight: Flight) -> Flight:

@@ -58,18 +58,7 @@ def _read_flight(
     model = experiment.model
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
-    for name in f.known:
-        # A constant of one flight alone is part of the machine, so only a parameter can be one: a
-        # misspelt name would leave the vehicle's value in its place without a word.
-        if name not in naming.names(model.Params):
-            raise InputError(
-                f"{where}.known: model {model.name} has no parameter {name!r}"
-                f"{nearest(name, naming.names(model.Params))}"
-            )
-    if f.window == "auto" and f.hold_out:
-        raise InputError(
-            f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
-        )
+    _check(model, f, where)
     time = f.signals.time
     path = experiment.path.parent / f.log
     # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
@@ -107,6 +96,22 @@ def _read_flight(
     cautions = filter_cautions(first.source, everything.outputs)
     cautions = (*cautions, *vibration_notes(experiment, first, f, where))
     return (_with_notes(first, notes, cautions), *others)
+
+
+def _check(model: Model, f: FlightConfig, where: str) -> None:
+    """What can be refused before the log is read."""
+    for name in f.known:
+        # A constant of one flight alone is part of the machine, so only a parameter can be one: a
+        # misspelt name would leave the vehicle's value in its place without a word.
+        if name not in naming.names(model.Params):
+            raise InputError(
+                f"{where}.known: model {model.name} has no parameter {name!r}"
+                f"{nearest(name, naming.names(model.Params))}"
+            )
+    if f.window == "auto" and f.hold_out:
+        raise InputError(
+            f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
+        )
 
 
 def _treated(

@@ -58,7 +58,7 @@ def with_measurement(model: Model, flights: Sequence[FlightConfig], path: Path) 
 def _outputs(flight: FlightConfig) -> Iterator[tuple[Any, str, OutputConfig]]:
     """The outputs of a flight with the section that names their log, which has `log`, `flight` and
     `signals`: the flight itself, or a further log of it."""
-    for part in (flight, *getattr(flight, "also", ())):
+    for part in (flight, *flight.also):
         for name, output in part.signals.outputs.items():
             yield part, name, output
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.kinematics import sharpened, substeps_of, with_noise
+from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.config.starts import first_guesses
@@ -54,7 +54,7 @@ def problem(experiment: Experiment) -> Problem:
                 "disturbance: {axis: roll, poles: 1}"
             )
         model, params = disturbed(experiment)
-        params = with_noise(model, params, flights)
+        free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     try:
         whole = Problem(

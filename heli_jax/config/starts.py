@@ -31,8 +31,8 @@ def first_guesses(
     assert config is not None
     # Before its start is asked for: of what the model does not have there is none.
     known = naming.names(experiment.model.Params)
-    for name in free:
-        if name not in known:
+    for name, f in free.items():
+        if name not in known and (config.start.method != "given" or math.isnan(f.start)):
             raise InputError(
                 f"{path}: fit.free: model {experiment.model.name} has no parameter {name!r}"
                 f"{nearest(name, known)}"

@@ -39,10 +39,9 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
         ValueError: naming the function, what was expected, what it did, and the remedy.
     """
     if not isinstance(model, Model):
-        kind = f"the class {model.__name__}" if isinstance(model, type) else _kind(model)
         raise TypeError(
             f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "
-            f"State, Inputs, Outputs) makes one, got {kind}"
+            f"State, Inputs, Outputs) makes one, got {what_instead(model)}"
         )
     # Ours are tested, and what they wrap was looked at when it was wrapped.
     if str(getattr(_bare(model.vector_field), "__module__", "")).startswith("heli_jax."):
@@ -56,6 +55,22 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
         _check(parts, traceable)
     else:
         _check_once(parts, traceable)
+
+
+def what_instead(value: Any) -> str:
+    """What stands where a Model was expected, for the end of a sentence.
+
+    Args:
+        value: anything but a Model.
+    """
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    function = _bare(value)
+    # Without a look at what it returns: a function of somebody's own may do anything when called.
+    if getattr(function, "__annotations__", {}).get("return") in (Model, "Model"):
+        name = function.__name__
+        return f"the function {name}, which makes one; expected what it returns, as {name}()"
+    return _kind(value)
 
 
 class _Parts(NamedTuple):
@@ -75,6 +90,7 @@ class _Parts(NamedTuple):
     delays: Any
     axes: Any
     positive: Any
+    body_rates: Any
 
 
 @functools.lru_cache(maxsize=256)
@@ -119,6 +135,8 @@ def _check(model: _Parts, traceable: bool) -> None:
         of("noise_intensity", "params").returns("State")
     if model.initial_sd is not None:
         of("initial_sd", "params").returns_by_name(naming.names(model.State))
+    if model.body_rates is not None:
+        of("body_rates", "state").returns_by_name(("p", "q", "r"))
     if model.limits is not None:
         of("limits", "params", "state", "inputs").returns_by_name(None)
 
@@ -188,7 +206,8 @@ class _Function:
                 self.refuse(f"expected a dictionary by name, got {_kind(returned)}")
             for name, value in returned.items():
                 if known is not None and name not in known:
-                    self.refuse(f"expected names of states ({', '.join(known)}), got {name!r}")
+                    kind = "rates" if self.role == "body_rates" else "states"
+                    self.refuse(f"expected names of {kind} ({', '.join(known)}), got {name!r}")
                 self.check_number(name, value)
 
         self.traced(check)

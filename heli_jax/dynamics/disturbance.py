@@ -22,27 +22,29 @@ def disturbable(model: Model) -> list[str]:
 def disturbable_states(model: Model) -> tuple[str, ...]:
     """The states whose derivative may be pushed: all but those of pure kinematics.
 
-    Kinematics (phi' = p, positions) hold whatever the air does: their derivatives are made of
-    states alone, without a parameter or an input. The rate of an axis may always be pushed.
+    Kinematics (phi' = p, z' = -w) hold whatever the air does: the derivative is another state, or
+    its negative, and nothing else. The rate of an axis may always be pushed.
     """
     names = naming.names(model.State)
-    one, nan = np.float64(1.0), np.float64(np.nan)
-    ones = model.State(**dict.fromkeys(names, one))
+    nan = np.float64(np.nan)
+    # Numbers that no formula makes of one another by chance.
+    values = np.random.default_rng(7).uniform(0.5, 1.5, len(names))
+    state = dict(zip(names, (np.float64(v) for v in values), strict=True))
     params = model.Params(**dict.fromkeys(naming.names(model.Params), nan))
     inputs = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), nan))
-    # NaN goes through every operation that uses it: what is still a number uses neither.
+    # NaN goes through every operation that uses it: what is still a number uses neither. That alone
+    # does not make it kinematics: v' = -0.4 v + 9.81 phi is a force whose coefficients are written
+    # as numbers.
     with np.errstate(all="ignore"):
-        pushed = naming.asdict(model.vector_field(params, ones, inputs))
-        known = {n: float(v) for n, v in pushed.items()}
-        # A state that nothing moves may be pushed: a random walk has no other derivative.
-        twos = model.State(**dict.fromkeys(names, 2.0 * one))
-        moved = naming.asdict(model.vector_field(params, twos, inputs))
-    rates = {axis.rate for axis in axes_of(model)}
-    return tuple(
-        n
-        for n in names
-        if n in rates or np.isnan(known[n]) or (known[n] == 0.0 and float(moved[n]) == 0.0)
-    )
+        rates = naming.asdict(model.vector_field(params, model.State(**state), inputs))
+    turning = {axis.rate for axis in axes_of(model)}
+
+    def bare(name: str) -> bool:
+        size = abs(float(rates[name]))
+        # To single precision, in which the model may have been evaluated.
+        return any(n != name and abs(size - v) < 1e-6 for n, v in state.items())
+
+    return tuple(n for n in names if n in turning or not bare(n))
 
 
 def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> Model:
@@ -115,6 +117,7 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         correlation=disturbed.correlation if poles == 2 or model.correlation else None,
         limits=None if model.limits is None else disturbed.limits,
         axes=model.axes,
+        body_rates=model.body_rates,
         # The pushes are given in a trim, at zero, as positions are.
         steady_flight=model.steady_flight,
         delays=model.delays,
@@ -184,8 +187,8 @@ def _check_pushed(model: Model, name: str, state: str, rates: dict[str, str]) ->
         return
     if state in naming.names(model.State):
         raise ValueError(
-            f"model {model.name}: the derivative of {name!r} is kinematics, made of states "
-            f"alone, which nothing can push; {expected}"
+            f"model {model.name}: the derivative of {name!r} is kinematics, another state and "
+            f"nothing else, which nothing can push; {expected}"
         )
     raise ValueError(f"model {model.name} has no axis or state {name!r} to disturb, {expected}")
 

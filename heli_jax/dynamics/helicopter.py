@@ -26,6 +26,7 @@ from heli_jax.dynamics import inflow as momentum_theory
 from heli_jax.dynamics.helicopter_equations import (
     accelerations,
     angular_accelerations,
+    body_rates,
     flow,
     inflow_of,
     main_rotor,
@@ -121,6 +122,7 @@ def helicopter(
         limits=functools.partial(_limits, corrections),
         axes=_axes(corrections),
         steady_flight=_steady_flight(corrections, Inputs),
+        body_rates=body_rates if corrections.rigid_body else None,
     )
 
 

@@ -50,17 +50,25 @@ def motion(corrections: Corrections, s: Record, u: Record) -> Motion:
         lateral_speed * at.cphi + below * at.sphi,
         below * at.cphi - lateral_speed * at.sphi,
     )
-    p, q, r = _body_rates(corrections, s, at)
-    return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
-
-
-def _body_rates(corrections: Corrections, s: Record, at: Attitude) -> tuple[Scalar, ...]:
-    """p, q and r [rad/s]."""
     # Eqs 5-7 integrate M/I straight into the angles, so the paper's rates are the angles'
     # derivatives. That is right in level flight alone: a body that turns steadily with dpsi at a
     # bank phi has a pitch rate.
-    if not corrections.rigid_body:
-        return s.dphi, s.dtheta, s.dpsi
+    p, q, r = _turned(s, at) if corrections.rigid_body else (s.dphi, s.dtheta, s.dpsi)
+    return once(Motion(at, dx, dy, dz, forward, right, down, p, q, r))
+
+
+def body_rates(s: Record) -> dict[str, Scalar]:
+    """p, q and r [rad/s] by name, as gyros on the body measure them.
+
+    Args:
+        s: state, with the names of HelicopterState.
+    """
+    at = Attitude(*sincos(s.phi), *sincos(s.theta), *sincos(s.psi))
+    return dict(zip("pqr", _turned(s, at), strict=True))
+
+
+def _turned(s: Record, at: Attitude) -> tuple[Scalar, ...]:
+    """p, q and r [rad/s] of the Euler angles' derivatives."""
     p = s.dphi - s.dpsi * at.sth
     q = s.dtheta * at.cphi + s.dpsi * at.cth * at.sphi
     r = s.dpsi * at.cth * at.cphi - s.dtheta * at.sphi

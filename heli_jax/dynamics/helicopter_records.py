@@ -96,7 +96,8 @@ class Corrections(NamedTuple):
     dynamic_inflow: bool = False
     """momentum theory with the inertia of the air (Carpenter and Fridovich, 1953): a state vi"""
     flapping: bool = False
-    """eqs 14-15: the rotor tilts first (states a1, b1); its stiffness and in-plane forces act"""
+    """eqs 14-15: the rotor tilts first (states a1, b1); its stiffness and in-plane forces act; a
+    seesaw, whose blades do not cone"""
     speed_stability: bool = False
     """the first harmonic of the lift in a speed: the rotor tilts back from where it flies to"""
     tip_loss: bool = False

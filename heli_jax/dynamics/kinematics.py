@@ -32,39 +32,37 @@ STEEPEST = 1.4
 class AttitudeErrors(NamedTuple):
     """Errors of gyros, where a log has angles alone beside them."""
 
-    b_p: Annotated[Scalar, "rad/s", "bias of the gyro, roll"] = 0.0
-    b_q: Annotated[Scalar, "rad/s", "bias of the gyro, pitch"] = 0.0
-    b_r: Annotated[Scalar, "rad/s", "bias of the gyro, yaw"] = 0.0
-    lambda_p: Annotated[Scalar, "1", "scale error of the gyro, roll"] = 0.0
-    lambda_q: Annotated[Scalar, "1", "scale error of the gyro, pitch"] = 0.0
-    lambda_r: Annotated[Scalar, "1", "scale error of the gyro, yaw"] = 0.0
-    delay_gyro: Annotated[Scalar, "s", "by how much outputs are logged later than the gyros"] = 0.0
+    b_p: Annotated[Scalar, "rad/s", "bias, gyro roll"] = 0.0
+    b_q: Annotated[Scalar, "rad/s", "bias, gyro pitch"] = 0.0
+    b_r: Annotated[Scalar, "rad/s", "bias, gyro yaw"] = 0.0
+    lambda_p: Annotated[Scalar, "1", "scale, gyro roll"] = 0.0
+    lambda_q: Annotated[Scalar, "1", "scale, gyro pitch"] = 0.0
+    lambda_r: Annotated[Scalar, "1", "scale, gyro yaw"] = 0.0
+    delay_gyro: Annotated[Scalar, "s", "outputs behind the gyros"] = 0.0
     noise_gyro: Annotated[Scalar, "rad", "sd of an angle after 1 s by the gyros' noise"] = 0.0
 
 
 class KinematicErrors(NamedTuple):
     """Errors of gyros and accelerometers, and the wind where an airspeed is measured."""
 
-    b_p: Annotated[Scalar, "rad/s", "bias of the gyro, roll"] = 0.0
-    b_q: Annotated[Scalar, "rad/s", "bias of the gyro, pitch"] = 0.0
-    b_r: Annotated[Scalar, "rad/s", "bias of the gyro, yaw"] = 0.0
-    lambda_p: Annotated[Scalar, "1", "scale error of the gyro, roll"] = 0.0
-    lambda_q: Annotated[Scalar, "1", "scale error of the gyro, pitch"] = 0.0
-    lambda_r: Annotated[Scalar, "1", "scale error of the gyro, yaw"] = 0.0
-    delay_gyro: Annotated[Scalar, "s", "by how much outputs are logged later than the gyros"] = 0.0
+    b_p: Annotated[Scalar, "rad/s", "bias, gyro roll"] = 0.0
+    b_q: Annotated[Scalar, "rad/s", "bias, gyro pitch"] = 0.0
+    b_r: Annotated[Scalar, "rad/s", "bias, gyro yaw"] = 0.0
+    lambda_p: Annotated[Scalar, "1", "scale, gyro roll"] = 0.0
+    lambda_q: Annotated[Scalar, "1", "scale, gyro pitch"] = 0.0
+    lambda_r: Annotated[Scalar, "1", "scale, gyro yaw"] = 0.0
+    delay_gyro: Annotated[Scalar, "s", "outputs behind the gyros"] = 0.0
     noise_gyro: Annotated[Scalar, "rad", "sd of an angle after 1 s by the gyros' noise"] = 0.0
-    b_ax: Annotated[Scalar, "m/s^2", "bias of the accelerometer, forward"] = 0.0
-    b_ay: Annotated[Scalar, "m/s^2", "bias of the accelerometer, to the right"] = 0.0
-    b_az: Annotated[Scalar, "m/s^2", "bias of the accelerometer, down"] = 0.0
-    lambda_ax: Annotated[Scalar, "1", "scale error of the accelerometer, forward"] = 0.0
-    lambda_ay: Annotated[Scalar, "1", "scale error of the accelerometer, to the right"] = 0.0
-    lambda_az: Annotated[Scalar, "1", "scale error of the accelerometer, down"] = 0.0
-    x_imu: Annotated[Scalar, "m", "IMU ahead of where velocities are measured"] = 0.0
+    b_ax: Annotated[Scalar, "m/s^2", "bias, accelerometer forward"] = 0.0
+    b_ay: Annotated[Scalar, "m/s^2", "bias, accelerometer right"] = 0.0
+    b_az: Annotated[Scalar, "m/s^2", "bias, accelerometer down"] = 0.0
+    lambda_ax: Annotated[Scalar, "1", "scale, accelerometer forward"] = 0.0
+    lambda_ay: Annotated[Scalar, "1", "scale, accelerometer right"] = 0.0
+    lambda_az: Annotated[Scalar, "1", "scale, accelerometer down"] = 0.0
+    x_imu: Annotated[Scalar, "m", "IMU ahead of the velocity sensor"] = 0.0
     y_imu: Annotated[Scalar, "m", "IMU to the right of it"] = 0.0
     z_imu: Annotated[Scalar, "m", "IMU below it"] = 0.0
-    delay_accel: Annotated[
-        Scalar, "s", "by how much outputs are logged later than the accelerometers"
-    ] = 0.0
+    delay_accel: Annotated[Scalar, "s", "outputs behind accelerometers"] = 0.0
     noise_accel: Annotated[
         Scalar, "m/s", "sd of a velocity after 1 s by the accelerometers' noise"
     ] = 0.0

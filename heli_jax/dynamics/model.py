@@ -124,6 +124,11 @@ class Model(eqx.Module):
     have to follow"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
+    body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(
+        static=True, default=None, kw_only=True
+    )
+    """body_rates(state): the rates p, q and r of the body [rad/s] by name, where the axes' rates
+    are derivatives of Euler angles; None: the axes' rates are those of the body"""
     noise: Callable[[Any], Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """deprecated: the name that `noise_intensity` had"""
     spread: Callable[[Any], dict[str, Any]] | None = eqx.field(

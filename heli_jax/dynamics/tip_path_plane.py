@@ -9,8 +9,14 @@ with the cyclic pitch of eq. 11, $\tau_f = 16/(\gamma\Omega)$ and the Lock numbe
 $\gamma = \rho a c R^4/I_\beta$ (Mettler, Tischler and Kanade, CMU-RI-TR-00-03, 2000; Gavrilets,
 MIT thesis, 2003; Padfield, Helicopter Flight Dynamics). $\omega_k = k_\beta/(2 I_\beta\Omega)$ is
 what a stiff hub turns: it raises the blade's frequency above $\Omega$, and a free tilt then moves
-around against the rotor's sense. Left out is what is $\gamma/16$ of it or less: the blade's own
-second derivative.
+around against the rotor's sense.
+
+Left out are the blade's own second derivative, which is $\gamma/16$ of what is kept or less, and
+coning. The rotor is a seesaw, whose blades do not cone. One whose blades flap freely by the angle
+$a_0$ tilts further by $-\tfrac43\frac{v}{R\Omega}a_0$ in a1, with v the speed to the right, and by
+$-\tfrac43\frac{u}{R\Omega}a_0$ in b1, with u that forward. For the X-Cell 60, whose thrust would
+cone free blades by 1.3 degrees, that is -0.17 degrees of b1 at 10 m/s, beside the -0.15 that it has
+here; in a trim the lateral stick takes it up.
 """
 
 from typing import NamedTuple

@@ -153,12 +153,13 @@ class ParquetTable:
     def _read(self, names: Sequence[str] | None) -> "pa.Table":
         import pyarrow as pa
 
-        self._require_few(names)
         try:
+            self._require_few(names)
             data = self._file.read(columns=None if names is None else list(names))
             data.validate(full=True)  # a damaged page can decode to lengths that do not fit
             return data
-        except (pa.ArrowException, OSError, MemoryError) as e:
+        # UnicodeDecodeError: of a damaged name, which pyarrow reads as UTF-8.
+        except (pa.ArrowException, OSError, MemoryError, UnicodeDecodeError) as e:
             raise wrong(self.path, "is no whole Parquet file") from e
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from heli_jax.errors import InputError
 from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Flight, Signal
+from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.onto_grid import FEWEST, decided_holds
 from heli_jax.flights.origins import with_origins, without_constants
@@ -105,13 +106,7 @@ def read_parts(
     parts, left_out, why = [], [], None
     for start, end in found:
         name = f"{options.name or 'flight 1'}, part {len(parts) + 1}"
-        part = copy.copy(request)
-        part.options = dataclasses.replace(options, window=(start, end), name=name)
-        # By the whole run: of the few moves in a part the same stick may look different.
-        part.signals = {
-            key: dataclasses.replace(s, hold=holds[key[0]].hold) if key[1] == "input" else s
-            for key, s in request.signals.items()
-        }
+        part = _of_part(request, (start, end), name, holds)
         try:
             if is_too_short((start, end), clocks):
                 raise InputError("too short")
@@ -151,6 +146,20 @@ def _opened(
     return logs, request, functools.partial(
         with_origins, inputs=both[0], outputs=both[1], constants=constants
     )  # fmt: skip
+
+
+def _of_part(
+    request: Request, window: tuple[float, float], name: str, holds: Mapping[str, Decision]
+) -> Request:
+    """The request for one part of a run."""
+    part = copy.copy(request)
+    part.options = dataclasses.replace(request.options, window=window, name=name)
+    # By the whole run: of the few moves in a part the same stick may look different.
+    part.signals = {
+        key: dataclasses.replace(s, hold=holds[key[0]].hold) if key[1] == "input" else s
+        for key, s in request.signals.items()
+    }
+    return part
 
 
 def _notes(found: list[tuple[float, float]], left_out: list[str]) -> tuple[str, ...]:

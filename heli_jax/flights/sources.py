@@ -145,7 +145,8 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Besi
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
-    signals = _clocked(_open(asked), asked)
+    # The log that is open already: it may be large.
+    signals = _clocked(_open(asked, other if isinstance(other, ChannelLog) else other.table), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
     sha256 = other.sha256 if isinstance(other, ChannelLog) else other.table.sha256

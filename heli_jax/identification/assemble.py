@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.agreement import (
     correlated_residuals,
     free_runs,
@@ -17,6 +18,7 @@ from heli_jax.identification.agreement import (
     signals_of,
     whiteness_of,
 )
+from heli_jax.identification.estimation.arrival import unless_stuck
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
@@ -148,9 +150,9 @@ def assemble(
         optimum: where the optimiser ended, with the measurement noise there.
         run: how it came there.
     """
+    e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
+    optimum = unless_stuck(search.layout, optimum, e)
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
-    # The optimiser keeps only what it minimises; signals and Jacobian are those of its last point.
-    e = evaluate(layout, data, noise, best.z)
     signals, absent = signals_of(e, problem.training), _absent_names(layout, optimum)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
@@ -162,7 +164,7 @@ def assemble(
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
-    found, closed_loop = _feedback(problem, white)
+    found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     missing = () if all_white else _missing(problem, signals, adequacy)
@@ -213,12 +215,14 @@ def _against_expected(
 
 
 def _feedback(
-    problem: Problem, white: dict[str, Whiteness]
+    problem: Problem, white: dict[str, Whiteness], arrived: _Numbers | None
 ) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
     """Whether inputs follow the outputs, and what is to be said of it."""
     # Whether feedback does harm depends on the residuals: with white innovations the direct method
     # is unbiased in a closed loop too.
-    found = feedback_of(problem)
+    estimates = arrived.of_interest if arrived is not None else {}
+    # A late log looks like feedback: each input at the time at which it acted.
+    found = feedback_of(problem, {n: (e.value, e.sd) for n, e in estimates.items()})
     notes = feedback_notes(problem, found, all(w.white for w in white.values()))
     return found, (*notes, *untested(problem))
 
@@ -234,7 +238,8 @@ def _missing(
         tuple(
             Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
             for s, flight in zip(signals, problem.training, strict=True)
-        )
+        ),
+        sensors=is_kinematic(problem.model),
     )
 
 

@@ -45,7 +45,12 @@ def write_skeleton(name: str, folder: str | Path | None = None) -> list[Path]:
 
 
 def _check_identifier(name: str) -> None:
-    if not name.isascii() or not name.isidentifier() or keyword.iskeyword(name):
+    if keyword.iskeyword(name):
+        raise InputError(
+            f"new-model: {name!r} is a keyword of Python, which no module can be named after; "
+            "expected another name"
+        )
+    if not name.isascii() or not name.isidentifier():
         raise InputError(
             f"new-model: got {name!r:.60}, expected a name of letters, digits and _ that does not "
             "begin with a digit"

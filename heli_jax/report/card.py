@@ -25,6 +25,7 @@ THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
 # Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
+_CORRELATED = "largest correlation"
 
 
 class Gate(NamedTuple):
@@ -88,6 +89,10 @@ def shown(gate: Gate) -> str:
     if math.isnan(gate.value):
         return "none"
     text = f"{gate.value:.3g}"
+    if gate.what == _CORRELATED:
+        # Two digits of what is missing to one, where three in all would say 1.
+        missing = max(1.0 - abs(gate.value), 2e-5)
+        text = f"{gate.value:+.{max(3, math.ceil(1.0 - math.log10(missing)))}f}"
     return f"{text} {gate.unit}" if gate.unit else text
 
 
@@ -137,8 +142,9 @@ def _of_relations(fit: Fit) -> list[Gate]:
         # Without the diagonal, which is one whatever the data are.
         size = np.abs(v.correlation - np.diag(np.diag(v.correlation)))
         i, j = np.unravel_index(int(np.nanargmax(size)), size.shape)
-        of = f"{v.names[min(i, j)]}, {v.names[max(i, j)]}"
-        lines.append(_most("largest correlation", of, float(size[i, j]), "", CORRELATION))
+        of, value = f"{v.names[min(i, j)]}, {v.names[max(i, j)]}", float(v.correlation[i, j])
+        gate = f"at most {CORRELATION:g} in size"
+        lines.append(Gate(_CORRELATED, of, value, "", gate, abs(value) <= CORRELATION))
     return lines
 
 

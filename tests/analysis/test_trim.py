@@ -251,6 +251,7 @@ def johnson_descent(inflow):
     return -c[np.argmin(np.abs(c * (0.373 * c**2 - 0.991) - inflow))]
 
 
+@pytest.mark.slow
 def test_autorotation_sinks_as_measured(full, xcell):
     """Straight down the rotor's power is nil where thrust times inflow makes up for the drag of
     main blades and tail; the measured curve says how fast it sinks for that."""

@@ -16,7 +16,7 @@ from heli_jax.cli import main
 from heli_jax.dynamics import check_model as checks
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Axis
-from heli_jax.models import on_stand
+from heli_jax.models import helicopter, on_stand
 from heli_jax.sweeps import Range, Reduce, sobol
 
 
@@ -241,7 +241,16 @@ def test_every_way_in_says_it(case):
 
 @pytest.mark.parametrize(
     ("value", "got"),
-    [(None, "None"), ("roll", "a str"), (Model, "the class Model"), (rates, "a function")],
+    [
+        (None, "None"),
+        ("roll", "a str"),
+        (Model, "the class Model"),
+        (rates, "a function"),
+        (
+            helicopter,
+            "the function helicopter, which makes one; expected what it returns, as helicopter()",
+        ),
+    ],
 )
 def test_what_is_no_model(value, got):
     ways = [

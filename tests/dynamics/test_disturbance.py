@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from heli_jax import models, naming, simulate
-from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax import linear_model, models, naming, simulate
+from heli_jax.dynamics.disturbance import disturbable_states, with_disturbance
 from heli_jax.dynamics.model import correlation_of, initial_sd_of
 from heli_jax.dynamics.roll import on_stand
 from heli_jax.simulation.discretize import process_noise
@@ -141,6 +141,33 @@ def test_pitch_has_its_own_axis(bench30):
 def test_what_cannot_be_disturbed(axis, poles, said):
     with pytest.raises(ValueError, match=said):
         with_disturbance(models.roll, axis, poles)
+
+
+NUMBERS = """
+name: numbers
+states: {v: m/s, p: rad/s, phi: rad, y: m, z: m}
+inputs: {da: "1"}
+outputs: {v: m/s}
+parameters: {Lda: {value: 20, unit: 1/s^2}}
+A:
+  v: {v: -0.4, phi: 9.81}
+  p: {v: -0.5}
+  phi: {p: 1}
+  y: {v: 1}
+  z: {y: -1}
+B:
+  p: {da: Lda}
+"""
+
+
+def test_a_force_with_its_coefficients_in_numbers_is_no_kinematics(tmp_path):
+    (tmp_path / "numbers.yaml").write_text(NUMBERS)
+    model = linear_model(tmp_path / "numbers.yaml").model
+    assert disturbable_states(model) == ("v", "p")
+    assert with_disturbance(model, "v").disturbances[0].state == "v"
+    for name in ("phi", "y", "z"):
+        with pytest.raises(ValueError, match=f"{name}' is kinematics, another state and nothing"):
+            with_disturbance(model, name)
 
 
 def test_a_stand_keeps_the_disturbance(bench30):

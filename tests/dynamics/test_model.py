@@ -145,6 +145,7 @@ def test_own_model_by_import_path(tmp_path):
         ("no_such_module:model", "cannot import 'no_such_module'"),
         ("tests.dynamics.test_model:nothing", "expected a heli_jax.Model at .*, got nothing"),
         ("tests.dynamics.test_model:U", "expected a heli_jax.Model at .*, got a ndarray"),
+        ("heli_jax.models:helicopter", "got the function helicopter, which makes one; expected"),
         ("os:system('ls')", "unknown model"),
     ],
 )

@@ -142,22 +142,45 @@ def test_a_rate_loop_is_a_pi_controller_with_feedforward():
     assert naming.unit(model.State, "lat_integral") == "rad"
 
 
+class Tail(NamedTuple):
+    Nr: Annotated[Scalar, "1/s", "damping"]
+    Nped: Annotated[Scalar, "rad/s^2", "effect of the pedal"]
+
+
+class Yaw(NamedTuple):
+    r: Annotated[Scalar, "rad/s", "yaw rate"]
+
+
+class Pedal(NamedTuple):
+    ped: Annotated[Scalar, "1", "pedal"]
+
+
+YAW = Model(
+    "tail",
+    lambda p, s, u: Yaw(r=p.Nr * s.r + p.Nped * u.ped),
+    lambda p, s, u: s,
+    Tail,
+    Yaw,
+    Pedal,
+    Yaw,
+    linear=True,
+)
+
+
 def test_a_damper_on_the_tail_is_the_published_yaw_gyro():
     # Mettler et al. 2000: r_fb' = 2.163 r - 8.258 r_fb and 33.07 (ped - r_fb).
-    bare = linear_model("heave")  # a first-order model; its numbers become those of yaw
-    model = models.with_gyro(bare.model, {"col": "w"}, heading_hold=False)
-    p = params(model, bare, Kp_col=2.163 / 8.258, tau_gyro_col=1 / 8.258)
-    p = p._replace(Zw=-4.129, Zcol=33.07)
+    model = models.with_gyro(YAW, {"ped": "r"}, heading_hold=False)
+    p = model.Params(Nr=-4.129, Nped=33.07, Kp_ped=2.163 / 8.258, tau_gyro_ped=1 / 8.258)
     poles = np.roots(np.poly(np.asarray(jacobians(model, p).A)))
     # Without the couplings to the rest of the machine, which move the fourth digit.
     np.testing.assert_allclose(sorted(poles.imag), [-8.1990, 8.1990], atol=5e-3)
     np.testing.assert_allclose(poles.real, -6.1966, atol=5e-3)
     np.testing.assert_allclose(np.prod(poles), 4.129 * 8.258 + 33.07 * 2.163, rtol=1e-12)
-    hold = models.with_gyro(bare.model, {"col": "w"}, lag=False)
-    p = params(hold, bare, Kp_col=0.2, Ki_col=0.5, Kc_col=2.0)._replace(Zw=-4.129, Zcol=33.07)
+    hold = models.with_gyro(YAW, {"ped": "r"}, lag=False)
+    p = hold.Params(Nr=-4.129, Nped=33.07, Kp_ped=0.2, Ki_ped=0.5, Kc_ped=2.0)
     s = 1j * W
     loop = 33.07 / (s + 4.129) * (0.2 + 0.5 / s)
-    got = transfer(hold, p, W, "w", "col")
+    got = transfer(hold, p, W, "r", "ped")
     np.testing.assert_allclose(got, 2.0 * loop / (1 + loop), rtol=1e-10)
 
 
@@ -242,6 +265,7 @@ def test_sensors_lag_and_feel():
     assert naming.unit(model.Outputs, "ax") == "m/s^2"
 
 
+@pytest.mark.slow
 def test_the_helicopter_feels_its_weight_and_its_lever(vehicles_folder):
     """In hover an accelerometer shows g upwards; turning it shows the centripetal acceleration."""
     x_cell = load_vehicle(vehicles_folder / "x-cell-60.yaml")

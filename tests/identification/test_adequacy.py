@@ -130,6 +130,7 @@ def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
     assert not judged(P + 3.0 * P.std() * SLOW, P, against=1.2).adequate
 
 
+@pytest.mark.slow
 def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     model, _, start, flight = made(bench30, 3)
     right = fit(Problem(model, start, [flight], FREE, method="filter-error"))

@@ -95,6 +95,7 @@ class Angle(NamedTuple):
     x: Annotated[Any, "rad"]
 
 
+@pytest.mark.slow
 def test_a_model_never_ends_below_one_nested_in_it():
     # Undamped, and with a wrong frequency: the likelihood has an optimum at every beat.
     model = Model(

@@ -201,6 +201,7 @@ def test_the_rate_of_an_input_that_moved_between_its_samples():
     assert rates == [100.0, pytest.approx(10.0), pytest.approx(10.0), None, None, None, None]
 
 
+@pytest.mark.slow
 def test_a_log_too_slow_for_the_machine_is_refused_in_words():
     # The machine swings at 0.95 Hz: three samples a second are doubtful, 1.6 hopeless.
     f = flight(1, 3000)
@@ -238,6 +239,7 @@ def test_a_missing_output_costs_what_the_fit_with_it_would_gain():
     np.testing.assert_allclose(m.ratios, ratio, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_to_fly_next_does_what_is_promised():
     # Steps of two seconds and more say little of the damping.
     f = flight(0, 500)

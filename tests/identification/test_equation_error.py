@@ -201,6 +201,46 @@ def test_what_cannot_be_regressed_is_said(bench30):
         equation_error_start(ROLL, NOTHING, [short], FREE)
 
 
+LAG = """
+name: lag
+states: {p: rad/s}
+inputs: {da: rad}
+outputs: {p: rad/s}
+parameters: {tau: {value: 1, unit: s}, K: {value: 1, unit: 1/s}}
+A: {p: {p: -1/tau}}
+B: {p: {da: K/tau}}
+"""
+
+
+@pytest.mark.parametrize("vehicle", [{}, {"tau": 3.0, "K": -1.0}, {"tau": -0.2, "K": 1.0}])
+@pytest.mark.parametrize("stepwise", [None, (20.0, 10.0)])
+def test_a_parameter_that_something_is_divided_by(tmp_path, vehicle, stepwise):
+    (tmp_path / "lag.yaml").write_text(LAG)
+    model = linear_model(tmp_path / "lag.yaml").model
+    params = model.Params(**{"tau": math.nan, "K": math.nan, **vehicle})
+    flight = record()
+    only = replace(flight, outputs={"p": flight.outputs["p"]})
+    free = {"tau": UNKNOWN, "K": UNKNOWN}
+    found = values(equation_error_start(model, params, [only], free, stepwise=stepwise))
+    # 1 / 4 and 25 / 4, as the two terms of the same record regressed by themselves have it.
+    known = Params(math.nan, math.nan, 0.0)
+    two = {"Lp": UNKNOWN, "Lda": UNKNOWN}
+    terms = values(equation_error_start(ROLL, known, [only], two))
+    assert found["tau"] == pytest.approx(-1.0 / terms["Lp"], rel=1e-4)
+    assert found["K"] == pytest.approx(-terms["Lda"] / terms["Lp"], rel=1e-4)
+
+
+def test_equations_that_are_finite_nowhere_are_said(tmp_path, monkeypatch):
+    (tmp_path / "lag.yaml").write_text(LAG)
+    model = linear_model(tmp_path / "lag.yaml").model
+    flight = record(n=300)
+    only = replace(flight, outputs={"p": flight.outputs["p"]})
+    monkeypatch.setattr("heli_jax.identification.equation_error.start._TRIED", (0.0,))
+    free = {"tau": UNKNOWN, "K": UNKNOWN}
+    with pytest.raises(ValueError, match="not finite at any value tried of tau, K"):
+        equation_error_start(model, model.Params(math.nan, math.nan), [only], free)
+
+
 class Total(NamedTuple):
     total: Annotated[Scalar, "rad", "of both states"]
 

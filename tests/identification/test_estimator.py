@@ -43,6 +43,7 @@ def differences(monkeypatch):
     monkeypatch.setitem(METHODS, "differences", entry)
 
 
+@pytest.mark.slow
 def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     drift = 0.02 * np.cumsum(np.random.default_rng(0).standard_normal(1500)) / 1500**0.5
     made = record(BENCH, seed=3, n=1500, noise=1e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Problem
+from heli_jax import Flight, Free, Problem, linear_model
 from heli_jax.identification.validation.feedback import feedback, feedback_notes, feedback_of
 from tests.identification.test_equation_error import ROLL, Params
 
@@ -49,6 +49,74 @@ def test_a_pilot_who_holds_the_bank_angle_is_found():
     assert one.input == "da"
 
 
+def logged_late(seed, samples, n=2000):
+    """A stick that nobody moves by the response, logged late."""
+    flight = record(seed, 0.0, n=n, gust=0.1)
+    poles, u = np.exp(-20.0 * DT), np.random.default_rng(seed).standard_normal(n + 200)
+    for _ in range(4):
+        u = scipy.signal.lfilter([1.0 - poles], [1.0, -poles], u)
+    u = 0.05 * u[200:] / u[200:].std()
+    p = scipy.signal.lfilter([0.0, 25.0 * DT], [1.0, 4.0 * DT - 1.0], u)
+    phi = scipy.signal.lfilter([0.0, DT], [1.0, -1.0], p)
+    # The motion that the other stick made goes out with it; the gusts and the noise stay.
+    other = scipy.signal.lfilter([0.0, 25.0 * DT], [1.0, 4.0 * DT - 1.0], flight.inputs["da"])
+    turned = scipy.signal.lfilter([0.0, DT], [1.0, -1.0], other)
+    outputs = {
+        "p": flight.outputs["p"] - other + p,
+        "phi": flight.outputs["phi"] - turned + phi,
+    }
+    late = np.concatenate([np.full(samples, u[0]), u[: n - samples]])
+    return Flight(dt=DT, inputs={"da": late}, outputs=outputs)
+
+
+def test_a_stick_that_is_logged_late_is_taken_when_it_acted():
+    late = [logged_late(s, 3) for s in range(4)]
+    # As logged it follows what it caused itself.
+    assert sum(any(f.present for f in feedback(flight)) for flight in late) >= 3
+    # 0.06 s, and a little more than it was: as the interval of an estimate has it.
+    for earlier in (0.06, 0.063):
+        found = [feedback(flight, 1, {"da": earlier}) for flight in late]
+        assert not any(f.present for one in found for f in one)
+    assert found[0][0].earlier == pytest.approx(0.08)
+
+
+LATE_ROLL = """
+name: roll
+states: {p: rad/s, phi: rad}
+inputs: {da: rad}
+outputs: {p: rad/s, phi: rad}
+parameters:
+  Lp: {value: -4, unit: 1/s}
+  Lda: {value: 25, unit: 1/s^2}
+  tau: {value: 0, unit: s}
+A: {p: {p: Lp}, phi: {p: 1}}
+B: {p: {da: Lda}}
+delays: {da: tau}
+"""
+
+
+def test_the_delay_that_a_fit_found_is_used(tmp_path):
+    (tmp_path / "roll.yaml").write_text(LATE_ROLL)
+    model = linear_model(tmp_path / "roll.yaml").model
+    free = {"Lp": Free(-3.0), "Lda": Free(20.0), "tau": Free(0.0)}
+    problem = Problem(model, model.Params(-4.0, 25.0, 0.0), [logged_late(0, 3)], free)
+    (before,) = feedback_of(problem)
+    assert before.present
+    assert not before.delay_known
+    assert "or da is logged late (a fit that arrives tells" in feedback_notes(problem, [before])[0]
+    (after,) = feedback_of(problem, {"tau": (-0.0605, 0.001), "time_shift": (0.0, None)})
+    assert (after.present, after.delay_known) == (False, True)
+    assert feedback_notes(problem, [after]) == []
+    # The delay of all inputs is added; one that may be zero moves nothing.
+    (both,) = feedback_of(problem, {"tau": (-0.02, 0.001), "time_shift": (-0.0405, 0.001)})
+    assert both.earlier == pytest.approx(0.08)
+    (none,) = feedback_of(problem, {"tau": (-0.02, 0.02)})
+    assert (none.present, none.delay_known, none.earlier) == (True, True, 0.0)
+    fixed = {n: f for n, f in free.items() if n != "tau"}
+    (held,) = feedback_of(replace(problem, vehicle=model.Params(-4.0, 25.0, -0.06), free=fixed))
+    assert (held.present, held.delay_known) == (False, False)
+
+
 def test_steps_without_any_other_motion_are_no_feedback():
     flight = record(0, 0.0)
     held = 0.1 * np.repeat(np.random.default_rng(1).uniform(-1.0, 1.0, 50), 20)
@@ -78,8 +146,13 @@ def test_what_it_does_is_said_unless_the_noise_model_is_right():
     )
     found = feedback_of(problem)
     (said,) = feedback_notes(problem, found, white=False)
-    for words in ("The loop is closed: da follows", "gusty", "biased", "filter-error"):
+    for words in ("da follows the response (gusty", "biased", "filter-error"):
         assert words in said
+    # No correlation tells it from a log that is late: without a delay both are named.
+    assert "the loop is closed, or da is logged late (free a delay" in said
+    known = tuple(f._replace(delay_known=True) for f in found)
+    (said,) = feedback_notes(problem, known, white=False)
+    assert said.startswith("The loop is closed: da follows")
     opened = tuple(f._replace(p_value=0.5) for f in found)
     assert feedback_notes(problem, opened) == []
     # Filter error asks for nothing but whiteness.

@@ -65,7 +65,9 @@ def information(u, z, concentrated):
     return found[:2, :2] - np.outer(found[:2, 2], found[2, :2]) / found[2, 2]
 
 
-@pytest.mark.parametrize("fixed", [("tau_w", "sigma_y"), ("tau_w",)], ids=" ".join)
+@pytest.mark.parametrize(
+    "fixed", [("tau_w", "sigma_y"), pytest.param(("tau_w",), marks=pytest.mark.slow)], ids=" ".join
+)
 def test_the_rows_hold_fishers_information(bench30, fixed):
     model = with_disturbance(models.roll_on_stand, "roll")
     truth = np.log([BENCH["Ixx"], SIGMA])

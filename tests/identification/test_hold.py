@@ -24,6 +24,7 @@ def held_inputs():
         yield module
 
 
+@pytest.mark.slow
 def test_an_unstable_aircraft_with_a_continuous_elevator(held_inputs):
     truth = held_inputs.TRUTH
     found = held_inputs.aircraft_fit(0, "linear", 0.3)
@@ -53,6 +54,7 @@ def told(note, name):
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero-order"])
+@pytest.mark.slow
 def test_check_tells_what_the_other_hold_would_change(held_inputs, hold):
     """As much as the fits of both holds differ by."""
     record = held_inputs.late_record(0, hold)
@@ -62,6 +64,7 @@ def test_check_tells_what_the_other_hold_would_change(held_inputs, hold):
     assert told(note, "time_shift") == pytest.approx(20.0 * sign, abs=4.0)
 
 
+@pytest.mark.slow
 def test_the_change_told_is_that_between_two_fits(held_inputs):
     found = held_inputs.aircraft_fit(0, "zero-order", 0.3)
     assert not words(found.notes)  # as stated: nothing is in doubt
@@ -80,6 +83,7 @@ def test_a_fit_doubts_only_what_the_log_let_be_linear(held_inputs):
     assert told(note, "time_shift") == pytest.approx(-20.0, abs=4.0)
 
 
+@pytest.mark.slow
 def test_nothing_is_said_where_it_does_not_matter(held_inputs):
     """A slow stick in much noise: half a sample is nothing."""
     record = held_inputs.late_record(0, "linear")
@@ -89,6 +93,7 @@ def test_nothing_is_said_where_it_does_not_matter(held_inputs):
     assert not words(check(problem).notes)
 
 
+@pytest.mark.slow
 def test_an_input_that_is_seen_directly(held_inputs):
     """With feed-through the other hold is a program of its own, and check makes it."""
     roll = held_inputs.ROLL

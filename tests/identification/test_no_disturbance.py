@@ -1,25 +1,36 @@
 """What filter error says where no disturbance is, and where its optimiser would go too far."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from heli_jax import Free, Problem, fit, models
-from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
+from heli_jax.dynamics.model import Axis
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
+from heli_jax.identification.estimation.disturbance_search import (
+    at_limit,
+    disturbance_or_none,
+    from_other_taus,
+)
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,
     first_noise,
+    log_likelihood_of,
+    relaxed_from,
 )
 from heli_jax.identification.uncertainty.estimates import extreme_noise_notes
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of, unpack
 from heli_jax.naming import asdict
 from tests.identification.bench import BENCH, record, vehicle
+from tests.identification.test_equation_error import ROLL
+from tests.identification.test_equation_error import record as gusty
 from tests.identification.test_filter_error import made
 
 MODEL = with_disturbance(models.roll_on_stand, "roll")
@@ -34,6 +45,7 @@ def problem(seed, n=1000):
 
 # Of seeds 0 to 59 number 23 ended with sigma_w = 9e-105 +- 4e-119, tau_w = 3e197 s.
 @pytest.mark.parametrize("seed", [22, 23])
+@pytest.mark.slow
 def test_white_noise_has_no_disturbance(seed):
     found = fit(problem(seed))
     assert found.status == "converged"
@@ -99,3 +111,31 @@ def test_a_search_that_went_astray_begins_anew_from_the_nested_model(bench30):
     reached = layout.estimator.log_likelihood(layout, data, settled.noise, e)
     assert reached == pytest.approx(best.log_likelihood, abs=2.0)
     assert any("begun anew" in note for note in settled.notes)
+
+
+def test_a_search_that_ran_to_white_noise_is_begun_again_from_other_correlation_times():
+    flight = gusty(n=600, gust=1.0, noise=0.01)
+    model = with_disturbance(replace(ROLL, axes=(Axis("roll", rate="p", angle="phi"),)), "roll")
+    params = model.Params(Lp=-4.0, Lda=25.0, Lphi=0.0, sigma_w=0.0, tau_w=1.0)
+    free = {"Lp": Free(-3.0), "Lda": Free(20.0)}
+    one = Problem(model, params, [flight], free, method="filter-error")
+    layout, data = layout_of(one, one.training), data_of(one, one.training)
+    noise, [d] = first_noise(one, one.training), disturbances_of(model)
+    z = start_vector(layout, data, one)
+    # An output's measurement noise has gone with it, beside which nothing else has a slope.
+    z = z.at[layout.disturbance_at("tau_w")].set(-30.0).at[layout.first_nuisance - 1].set(-20.0)
+    astray = RelaxedOptimum(Optimum(z, jnp.asarray(1.0), 1, True), noise, ())
+    search = Search(one, layout, data, 200)
+    assert at_limit(search, astray, d)
+    found = from_other_taus(search, astray, d)
+    assert not at_limit(search, found, d)
+    # As from the values that the record was made with.
+    truth = start_vector(layout, data, one)
+    for name, value in (("sigma_w", 1.0), ("tau_w", 0.3)):
+        truth = truth.at[layout.disturbance_at(name)].set(np.log(value))
+    best = relaxed_from(search, noise, truth)
+    reached = log_likelihood_of(search, found)
+    assert reached == pytest.approx(log_likelihood_of(search, best), abs=0.5)
+    assert reached > log_likelihood_of(search, astray) + 100.0
+    # One that did not run to an end is left alone.
+    assert from_other_taus(search, found, d) is found

@@ -66,6 +66,7 @@ def test_two_flights_have_offsets_of_their_own_and_windows_share_one():
     assert np.abs(J[:, column] - slope).max() < 1e-6 * np.abs(slope).max()
 
 
+@pytest.mark.slow
 def test_the_identifiability_analysis_knows_the_offset():
     flight, _ = flown(3, 0.0)
     sds = []

@@ -102,6 +102,7 @@ fit:
 """
 
 
+@pytest.mark.slow
 def test_a_configuration_takes_the_windows(tmp_path, vehicles_folder, capsys):
     rng = np.random.default_rng(0)
     u = np.zeros(1500)

@@ -111,6 +111,7 @@ def test_a_damping_of_the_wrong_sign_is_found_through_windows(wrong):
     assert any("diverges at the start values" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_the_sign_may_be_kept():
     free = {"Ld": Free(10.0), "Nd": Free(1.0, sign="keep"), "Lr": Free(1.0, lower=0.0)}
     one = problem(free)
@@ -144,6 +145,7 @@ def test_a_parameter_that_is_zero_is_determined():
     assert one.sd < 0.2
 
 
+@pytest.mark.slow
 def test_what_says_nothing_is_not_determined():
     # A record without motion but noise: every derivative is anybody's guess.
     rng = np.random.default_rng(1)

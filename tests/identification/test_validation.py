@@ -82,6 +82,7 @@ def test_the_initial_state_of_a_flight_held_out_is_found(flights):
     assert not any("eld out" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_windows_are_used_and_the_run_in_one_piece_stands_beside(flights):
     found = fit(problem(flights, window=1.0))
     assert found.validation["x"].vaf > 0.99

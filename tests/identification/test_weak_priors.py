@@ -115,6 +115,7 @@ def test_without_one_of_the_two_it_is_determined(off):
     assert found.estimates["L0"].prior_share < 1e-4
 
 
+@pytest.mark.slow
 def test_a_prior_determines_it_and_is_said_to():
     verdict = check(problem(BOUNDED._replace(prior=Prior(0.0, 0.1)))).verdict
     assert verdict.identifiable
@@ -131,6 +132,7 @@ def test_two_flights_have_a_bias_and_a_start_each():
     assert verdict.text.count("the bias of p") == 1
 
 
+@pytest.mark.slow
 def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
     how = {"window": 2.0, "flights": 1}
     verdict = check(problem(BOUNDED, Nuisance(bias=False), continuity=0.01, **how)).verdict
@@ -140,6 +142,7 @@ def test_windows_tied_together_are_data_and_windows_alone_cannot_go():
     assert "switch off nuisance.bias, fix L0" in verdict.text
 
 
+@pytest.mark.slow
 def test_what_no_output_shows_does_no_harm():
     """The free roll of the paper: bias and initial angle are one; on the stand they are two."""
     for model, stand in ((models.roll, False), (models.roll_on_stand, True)):

@@ -77,6 +77,7 @@ def test_a_file_beside_the_configuration_runs_again_from_anywhere(written, tmp_p
     assert configuration.load(again).vehicle.params == found.vehicle.params
 
 
+@pytest.mark.slow
 def test_it_is_simulated_checked_and_swept(written, tmp_path):
     path = written()
     assert main(["simulate", str(path), "--out", str(tmp_path / "heave.csv")]) == 0
@@ -136,7 +137,7 @@ def test_what_cannot_be_ends_in_a_sentence(written, content, words):
         assert word in str(e.value)
 
 
-@pytest.mark.parametrize("command", ["simulate", "sweep"])
+@pytest.mark.parametrize("command", ["simulate", pytest.param("sweep", marks=pytest.mark.slow)])
 def test_a_model_with_a_delay_flies(written, tmp_path, capsys, command):
     sweep = {
         "design": "list",

@@ -3,7 +3,9 @@
 import dataclasses
 import math
 
-from heli_jax.report.card import card, failed, summary
+import numpy as np
+
+from heli_jax.report.card import card, failed, shown, summary
 from heli_jax.report.tables import prior_note
 
 
@@ -33,6 +35,18 @@ def test_the_prior_share_of_a_parameter_without_a_prior_says_whose_it_is(sound):
     assert "it has none itself" in line.remark
     assert prior_note(problem, fit) == ""
     assert prior_note(problem, weak).startswith("Ixx: the prior share is that of the weak priors")
+
+
+def test_a_correlation_keeps_its_sign_and_the_digits_that_tell_it_from_one(sound):
+    fit, problem, _ = sound
+    v = fit.verdict
+    correlation = np.array([[1.0, -0.99986], [-0.99986, 1.0]])
+    close = dataclasses.replace(fit, verdict=dataclasses.replace(v, correlation=correlation))
+    [line] = [g for g in card(problem, close) if g.what == "largest correlation"]
+    assert (line.value, line.passed) == (-0.99986, False)
+    assert shown(line) == "-0.99986"
+    for value, text in ((-1.0, "-1.000000"), (0.42, "+0.420"), (0.9972, "+0.9972")):
+        assert shown(line._replace(value=value)) == text
 
 
 def test_what_is_not_determined_fails(not_identifiable):

@@ -186,6 +186,7 @@ def test_derivatives_by_each_delay(machine, hold):
         np.testing.assert_allclose(J[:, i], central, rtol=0, atol=1e-6 * np.abs(central).max())
 
 
+@pytest.mark.slow
 def test_one_delay_of_all_and_one_of_its_own_add_up(run):
     u = sticks(4)
     own = run(LINEAR, u, (0.031, 0.116), "linear", delay=0.02)
@@ -240,7 +241,7 @@ def test_noise_is_drawn_beside_delays(run, machine):
     np.testing.assert_allclose(moved, still, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("window", [None, 1.0])
+@pytest.mark.parametrize("window", [None, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_delays_are_found_beside_the_parameters(run, window):
     """In one piece and in windows, whose inputs begin before them."""
     u = sticks(8)

@@ -113,6 +113,7 @@ def energetic(p):
     return model, energy
 
 
+@pytest.mark.slow
 def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
     model, energy = energetic(xcell)
     start = model.State(**naming.asdict(hover.state), work=jnp.zeros(()))
@@ -129,7 +130,9 @@ def test_the_energy_balance_closes_with_the_order_of_the_steps(xcell, hover):
     assert 10 < left[0] / left[1] < 30  # sixteen for fourth order
 
 
-@pytest.mark.parametrize(("variant", "substeps"), [("consistent", 4), ("paper", 8)])
+@pytest.mark.parametrize(
+    ("variant", "substeps"), [("consistent", 4), pytest.param("paper", 8, marks=pytest.mark.slow)]
+)
 def test_rk4_is_dopri8(variant, substeps, xcell):
     model = models.helicopter(variant)
     found = trim(model, xcell)
@@ -185,6 +188,7 @@ def pilot(hover, gain=1.0):
     return feedback
 
 
+@pytest.mark.slow
 def test_feedback_is_applied_once_a_sample(xcell, hover):
     model, n = models.helicopter("consistent"), 30
     u = sticks(hover, n, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)
@@ -257,6 +261,7 @@ def test_the_ground_ends_a_run_at_its_moment():
     assert np.isfinite(float(slope))
 
 
+@pytest.mark.slow
 def test_the_rotor_s_limits_end_a_run(xcell, hover):
     model = models.helicopter("consistent")
     u = sticks(hover, 60, roll=0.0, pitch=0.0, yaw=0.0, throttle=0.0)

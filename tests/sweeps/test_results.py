@@ -263,6 +263,7 @@ def test_several_flights_are_a_dimension(bench30, record):
         np.testing.assert_array_equal(both["misfit"][:, i], one["misfit"])
 
 
+@pytest.mark.slow
 def test_float32_says_how_far_off_it_is(bench30, record):
     design, reduce = sobol(AXES, 30), {"rms": Reduce("rms", "roll"), "end": Reduce("final", "roll")}
     single = sweep(ROLL, bench30, record, design, reduce, precision="float32")

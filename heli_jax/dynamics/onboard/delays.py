@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
+
 from heli_jax import naming
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Model, zeros
@@ -188,10 +190,12 @@ class _LateOutputs(Device):
         return naming.replace(
             y,
             **{
-                # Shifted Legendre polynomials are all one at the far end of the delay, where the
-                # signal is as it was one delay ago: the sum of the coefficients is its value there.
-                n: sum(getattr(s, state) for state in line_states(n, self.order))
-                for n in self.late
+                n: line_value(
+                    [getattr(s, state) for state in line_states(n, self.order)],
+                    getattr(y, n),
+                    getattr(p, parameter),
+                )
+                for n, parameter in self.late.items()
             },
         )
 
@@ -248,7 +252,9 @@ class _LateInput(Device):
             s: its State, with the states added here.
             u: its Inputs, as they come from outside.
         """
-        return naming.replace(u, **{self.name: sum(getattr(s, n) for n in self.parts.states)})
+        past = [getattr(s, n) for n in self.parts.states]
+        late = line_value(past, getattr(u, self.name), getattr(p, self.parameter))
+        return naming.replace(u, **{self.name: late})
 
     def rates(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
         """The derivatives of the line's states, per second.
@@ -268,18 +274,63 @@ def line_states(name: str, order: int) -> tuple[str, ...]:
     return tuple(f"{name}_late{i}" for i in range(order))
 
 
+def line_value(past: Sequence[Any], value: Any, delay: Any) -> Any:
+    """What comes out of a delay line: the signal one delay ago, or as it is now for none.
+
+    Args:
+        past: the states of the line, in the signal's unit.
+        value: the signal now.
+        delay: [s].
+    """
+    # Shifted Legendre polynomials are all one at the far end of the delay, where the signal is as
+    # it was one delay ago: the sum of the coefficients is its value there.
+    return jnp.where(delay == 0, value, sum(past))
+
+
+_UNREAD = 0.02
+"""[s], the delay of a line of which nothing is read: fast, but not for a solver's steps"""
+
+
+def _possible(delay: Any) -> Any:
+    """The delay by which a line's rates are divided [s]."""
+    # A line of no delay passes its signal on (`line_value`), and its states, which nothing reads,
+    # stay finite. One that looked ahead would diverge: a run of it might end at 1e100 and be called
+    # a success, so that it is not a number from the beginning.
+    return jnp.where(delay > 0, delay, jnp.where(delay == 0, _UNREAD, jnp.nan))
+
+
+def require_past(model: Model, params: Record) -> None:
+    """Refuse a delay line that would look ahead.
+
+    Args:
+        model: any.
+        params: its Params, concrete.
+
+    Raises:
+        ValueError: naming the signal and its delay.
+    """
+    for name, parameter in model.delay_lines:
+        delay = float(getattr(params, parameter))
+        if delay < 0:
+            raise ValueError(
+                f"{parameter} of model {model.name}: {name!r} is late by a delay line, expected "
+                f"0 s or more, got {delay:g} s"
+            )
+
+
 def line_rates(past: Sequence[Any], value: Any, delay: Any) -> list[Any]:
     r"""The derivatives of a delay line's states, per second.
 
     $\tau\dot m_i = (2i+1)\left[(-1)^i u - \sum_j a_{ij} m_j\right]$ with a_ij = 1 for j > i, else
-    $(-1)^{i-j}$ (Voelker, Kajic and Eliasmith, 2019). The sum of all m is u one delay ago.
+    $(-1)^{i-j}$ (Voelker, Kajic and Eliasmith, 2019). The sum of all m is u one delay ago. All are
+    NaN where tau is negative.
 
     Args:
         past: the states m, in the signal's unit.
         value: the signal u now.
         delay: tau [s].
     """
-    rates = []
+    rates, delay = [], _possible(delay)
     for i in range(len(past)):
         # The signal enters at the near end of the delay, where Legendre's polynomials are 1 and -1
         # in turn.

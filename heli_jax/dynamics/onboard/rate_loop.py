@@ -5,16 +5,20 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from heli_jax import naming
+from heli_jax import naming, units
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.model import Axis, Model, axes_of
 from heli_jax.dynamics.onboard.delays import with_delay_line
 from heli_jax.dynamics.onboard.device import Device, Parts, Quantity, quotient, require
 from heli_jax.errors import nearest
 from heli_jax.naming import Record
 
 type Loops = Sequence[str] | Mapping[str, str] | None
-"""sticks; or by stick the state that is the rate it commands; None: those of the model's axes"""
+"""sticks; or by stick the rate that it commands, a state, or p, q or r where the model's angles are
+Euler angles; None: those of the model's axes"""
+
+_BODY = {"roll": "p", "pitch": "q", "yaw": "r"}
+"""by axis the rate that a gyro on the body measures"""
 
 
 class Law(NamedTuple):
@@ -40,6 +44,9 @@ def with_rate_loop(
     r"""The model with a flybarless unit: sticks command rates, which PI loops and a feed-forward
     make.
 
+    The rate is that which a gyro on the body measures: p, q or r where the model's angles are Euler
+    angles (`Model.body_rates`), else the state that is the axis's rate.
+
     $\delta = K_{ff} r_c + K_p (r_c - r) + K_i \int (r_c - r)\,dt$ with the command
     $r_c = K_c u$, u the stick and r the rate. The stick keeps the unit of the input in whose
     place it stands.
@@ -51,14 +58,15 @@ def with_rate_loop(
 
     Args:
         model: with servos already, where it has them (`with_servos`): they are in the loop.
-        on: the sticks; by stick the state that is its rate where the model's axes do not say it;
-            None for those of the model's roll and pitch axes.
+        on: the sticks; by stick its rate where the model's axes do not say it: a state, or p, q or
+            r of a model with `body_rates`; None for those of the model's roll and pitch axes.
         integral: whether there is K_i.
         feedforward: whether there is K_ff.
         lag: whether the unit's gyro is low-passed, tau dr_m/dt = r - r_m.
 
     Raises:
-        ValueError: no such stick, no rate known for it, or a name that is taken.
+        ValueError: no such stick, no rate known for it, one whose unit is not that of an angular
+            rate, or a name that is taken.
     """
     check_model(model)
     loops = _loops(model, on, ("roll", "pitch"))
@@ -81,7 +89,8 @@ def with_gyro(
         lag: whether the gyro is low-passed.
 
     Raises:
-        ValueError: no such pedal, no rate known for it, or a name that is taken.
+        ValueError: no such pedal, no rate known for it, one whose unit is not that of an angular
+            rate, or a name that is taken.
     """
     check_model(model)
     law = Law(heading_hold, heading_hold, False, lag)
@@ -89,9 +98,9 @@ def with_gyro(
 
 
 def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """Sticks with the states that are their rates."""
+    """Sticks with their rates: states, or those of the body."""
     # The model's axes say which rate a stick turns: most loops need no table of their own.
-    known = {a.stick: a.rate for a in axes_of(model) if a.stick is not None}
+    known = {a.stick: _measured_by_gyro(model, a) for a in axes_of(model) if a.stick is not None}
     if on is None:
         own = [a for a in axes_of(model) if a.name in axes and a.stick in known]
         own = [a for a in own if a.stick in naming.names(model.Inputs)]
@@ -100,23 +109,64 @@ def _loops(model: Model, on: Loops, axes: tuple[str, ...]) -> tuple[tuple[str, s
                 f"model {model.name} says no stick of its {' or '.join(axes)} axis, expected "
                 "on: {STICK: RATE} with an input and a state"
             )
-        return tuple((str(a.stick), a.rate) for a in own)
+        return _checked(model, {str(a.stick): _measured_by_gyro(model, a) for a in own})
     require(on, model.Inputs, "input", model)
     if isinstance(on, Mapping):
-        for stick, rate in on.items():
-            states = naming.names(model.State)
-            if rate not in states:
-                raise ValueError(
-                    f"{stick}: model {model.name} has no state {rate!r}{nearest(str(rate), states)}"
-                )
-        return tuple(on.items())
+        return _checked(model, on)
     for stick in on:
         if stick not in known:
             raise ValueError(
                 f"model {model.name} does not say which rate {stick!r} commands, expected "
                 f"on: {{{stick}: RATE}} with one of its states"
             )
-    return tuple((stick, known[stick]) for stick in on)
+    return _checked(model, {stick: known[stick] for stick in on})
+
+
+def _checked(model: Model, loops: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """Sticks with their rates, each of which is an angular rate."""
+    for stick, rate in loops.items():
+        _check_rate(model, stick, rate)
+    return tuple(loops.items())
+
+
+def _measured_by_gyro(model: Model, axis: Axis) -> str:
+    """The rate about an axis as a gyro on the body has it."""
+    # The derivatives of Euler angles are no rates of the body: in a steady turn at a bank the body
+    # pitches although theta stays.
+    return axis.rate if model.body_rates is None else _BODY.get(axis.name, axis.rate)
+
+
+def _is_of_body(model: Model, rate: str) -> bool:
+    """Whether a rate is computed from the state, and is none of its fields."""
+    states = naming.names(model.State)
+    return model.body_rates is not None and rate in _BODY.values() and rate not in states
+
+
+def _unit_of(model: Model, rate: str) -> str | None:
+    return "rad/s" if _is_of_body(model, rate) else naming.unit(model.State, rate)
+
+
+def _check_rate(model: Model, stick: str, rate: str) -> None:
+    """Refuse what is no state, and a state whose unit is not that of an angular rate."""
+    if _is_of_body(model, rate):
+        return
+    states = naming.names(model.State)
+    if rate not in states:
+        known = (*states, *_BODY.values()) if model.body_rates is not None else states
+        raise ValueError(
+            f"{stick}: model {model.name} has no state {rate!r}{nearest(str(rate), known)}"
+        )
+    unit = naming.unit(model.State, rate)
+    try:
+        kind = None if unit is None else units.base_of(unit)
+    except ValueError:  # a unit of the user's own, of which nobody knows what it measures
+        return
+    # A file may leave the radian out.
+    if kind not in (None, {"s": -1, "rad": 1}, {"s": -1}):
+        raise ValueError(
+            f"{stick}: {rate!r} of model {model.name} is in {unit}, expected the state that is the "
+            "rate, in rad/s or 1/s"
+        )
 
 
 @functools.cache
@@ -140,7 +190,7 @@ class _RateLoop(Device):
         for stick, rate in loops:
             # The stick of the loop takes the place and the unit of the input that it drives, so
             # that a log of sticks fits the model with its loop and without.
-            unit = naming.unit(model.Inputs, stick), naming.unit(model.State, rate)
+            unit = naming.unit(model.Inputs, stick), _unit_of(model, rate)
             params |= _gains(stick, *unit, law)
             if law.integral:
                 angle = quotient(unit[1], "1/s")
@@ -149,8 +199,20 @@ class _RateLoop(Device):
                 states[f"{stick}_integral"] = Quantity(angle, f"integral of the error of {rate}")
             if law.lag:
                 states[f"{stick}_gyro"] = Quantity(unit[1], f"{rate} as the gyro has it")
-        super().__init__(model, Parts(params, states))
+        linear = not any(_is_of_body(model, rate) for _, rate in loops)
+        super().__init__(model, Parts(params, states, linear=linear))
         self.loops, self.law = loops, law
+
+    def rate(self, s: Record, name: str) -> Any:
+        """The rate itself.
+
+        Args:
+            s: the State, with the loop's own states.
+            name: of a state, or p, q or r.
+        """
+        if _is_of_body(self.model, name) and self.model.body_rates is not None:
+            return self.model.body_rates(s)[name]
+        return getattr(s, name)
 
     def seen(self, s: Record, stick: str, rate: str) -> Any:
         """The rate as the loop has it.
@@ -158,9 +220,9 @@ class _RateLoop(Device):
         Args:
             s: the State, with the loop's own states.
             stick: the input that the loop drives.
-            rate: the state that is the rate.
+            rate: its name.
         """
-        return getattr(s, f"{stick}_gyro" if self.law.lag else rate)
+        return getattr(s, f"{stick}_gyro") if self.law.lag else self.rate(s, rate)
 
     def inputs(self, p: Record, s: Record, u: Record) -> Record:
         """What the loops ask of the machine in place of their sticks; other inputs pass.
@@ -210,7 +272,7 @@ class _RateLoop(Device):
                 rates[f"{stick}_integral"] = command - measured
             if self.law.lag:
                 lag = getattr(p, f"tau_gyro_{stick}")
-                rates[f"{stick}_gyro"] = (getattr(s, rate) - measured) / lag
+                rates[f"{stick}_gyro"] = (self.rate(s, rate) - measured) / lag
         return rates
 
 

@@ -71,9 +71,8 @@ class Baseline:
 def baseline(
     model: Model, params: Any, flight: Flight, *, order: int = 4, forgetting: float = 1.0
 ) -> Baseline:
-    """RLS of one flight: its first output (an angle before its rate) from its first input.
-
-    The first samples, whose past was not recorded, only serve as past.
+    """RLS of one flight: its first output (an angle before its rate) from its first input, with the
+    first samples, whose past was not recorded, as past alone.
 
     Args:
         model: names the signals, and says whether physical parameters can be read off.

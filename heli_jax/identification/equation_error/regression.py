@@ -242,8 +242,8 @@ def search(
     start: Float[np.ndarray, " q"],
     keep_sign: np.ndarray,
     weights: Mapping[str, float],
-) -> tuple[np.ndarray, Rows]:
-    """Levenberg-Marquardt on the equation error.
+) -> tuple[np.ndarray, Rows] | None:
+    """Levenberg-Marquardt on the equation error; None where that is not finite at the start.
 
     Args:
         regression: what is regressed.
@@ -252,7 +252,9 @@ def search(
         weights: by equation.
     """
     x, damping = start.copy(), 1e-6
-    at = regression.rows(x, weights)
+    at = finite(lambda: regression.rows(x, weights))
+    if at is None:
+        return None
     for _ in range(_STEPS):
         # A logarithm's step is relative: its column is the parameter's times its value.
         size = np.where(keep_sign, x, 1.0)
@@ -261,7 +263,7 @@ def search(
             # At most a factor of e^2 a step: far from the optimum the linear step of a logarithm
             # can be hundreds.
             new = np.where(keep_sign, x * np.exp(np.clip(step, -2.0, 2.0)), x + step)
-        tried = _finite(lambda new=new: regression.rows(new, weights))
+        tried = finite(lambda new=new: regression.rows(new, weights))
         # Put so that a cost that is no number counts as no gain.
         if tried is None or not tried.cost < at.cost:
             damping = 10.0 * damping
@@ -275,7 +277,13 @@ def search(
     return x, at
 
 
-def _finite(make: Callable[[], Rows]) -> Rows | None:
+def finite(make: Callable[[], Rows]) -> Rows | None:
+    """The rows; None where they are not finite, as at a parameter of zero that something is
+    divided by.
+
+    Args:
+        make: gives them.
+    """
     with np.errstate(all="ignore"):
         try:
             rows = make()

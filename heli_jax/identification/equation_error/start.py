@@ -21,7 +21,13 @@ from heli_jax.identification.equation_error.first_guess import (
     Origin,
     StartValue,
 )
-from heli_jax.identification.equation_error.regression import Optimum, Regression, search
+from heli_jax.identification.equation_error.regression import (
+    Optimum,
+    Regression,
+    Rows,
+    finite,
+    search,
+)
 from heli_jax.identification.equation_error.stepwise import Selection, select
 from heli_jax.identification.equation_error.structure import (
     Structure,
@@ -39,6 +45,8 @@ _ROUNDS = 3
 """of regression and weights of the equations"""
 _NULL = 1e-5
 """singular value, of columns of length one, below which parameters are exchangeable"""
+_TRIED = (1.0, 0.1, 10.0, 0.01, 100.0, -1.0, -0.1, -10.0)
+"""values to begin with where nothing is known, and zero will not do"""
 
 
 class _Setup(NamedTuple):
@@ -86,7 +94,9 @@ def equation_error_start(
     selection = None
     if stepwise is not None:
         keeps = zip(regression.names, _keeps(setup, regression), strict=True)
-        forced = [n for n, keep in keeps if keep]
+        forced = [
+            n for i, (n, keep) in enumerate(keeps) if keep or _divides(regression, optimum, i)
+        ]
         selection = select(optimum.rows, optimum.values, regression.names, forced, stepwise)
         out = [n for n in regression.names if n not in selection.selected]
         # Terms that are out are zero from here on, and the others are regressed again: where
@@ -174,26 +184,54 @@ def _keeps(setup: _Setup, regression: Regression) -> np.ndarray:
 def _optimum(setup: _Setup, regression: Regression) -> Optimum:
     """The regression with the equations weighed by their own residuals."""
     keep = _keeps(setup, regression)
-    at_hand = np.array([setup.base[n] for n in regression.names])
-    known = np.isfinite(at_hand) & (at_hand != 0)
-    # From nothing, and from the values at hand: products of parameters may have two optima.
-    starts = [np.where(keep, np.where(known, at_hand, 1.0), 0.0)]
-    if known.any():
-        starts.append(np.where(known, at_hand, starts[0]))
     # Equations differ in unit and noise, and share parameters. Before there are residuals each is
     # weighed by the size of its left-hand side; then by its own residuals, which least squares of
     # several equations asks for.
     weights = _sizes(regression)
-    runs = [search(regression, x, keep, weights) for x in starts]
-    values, rows = min(runs, key=lambda run: run[1].cost)
+    values, rows = _first_search(setup, regression, keep, weights)
     for _ in range(_ROUNDS - 1):
         weights = {
             # The floor keeps an equation that is met exactly from drowning all others.
             name: w / max(float(np.sqrt(np.mean(rows.r[rows.equation == i] ** 2))), 1e-9)
             for i, (name, w) in enumerate(weights.items())
         }
-        values, rows = search(regression, values, keep, weights)
+        again = search(regression, values, keep, weights)
+        if again is None:
+            break
+        values, rows = again
     return Optimum(values, rows, weights)
+
+
+def _first_search(
+    setup: _Setup, regression: Regression, keep: np.ndarray, weights: Mapping[str, float]
+) -> tuple[np.ndarray, Rows]:
+    """The best of searches from several values."""
+    at_hand = np.array([setup.base[n] for n in regression.names])
+    known = np.isfinite(at_hand) & (at_hand != 0)
+    # From nothing, and from the values at hand: products of parameters may have two optima.
+    starts = [np.where(keep, np.where(known, at_hand, 1.0), 0.0)]
+    if known.any():
+        starts.append(np.where(known, at_hand, starts[0]))
+    runs = [run for x in starts if (run := search(regression, x, keep, weights)) is not None]
+    if len(runs) < len(starts):
+        # Something is divided by one of them: begun with any size, and either sign.
+        tries = [np.where(keep, np.where(known, at_hand, abs(x)), x) for x in _TRIED]
+        tried = (search(regression, x, keep, weights) for x in tries)
+        runs += [run for run in tried if run is not None]
+    if not runs:
+        raise ValueError(
+            "start: equation-error: the equations are not finite at any value tried of "
+            f"{', '.join(regression.names)} (zero, the vehicle's, {_TRIED[0]:g} and others): "
+            "expected a start of each free parameter"
+        )
+    return min(runs, key=lambda run: run[1].cost)
+
+
+def _divides(regression: Regression, optimum: Optimum, which: int) -> bool:
+    """Whether something is divided by a parameter, by its number, so that it cannot be zero."""
+    values = optimum.values.copy()
+    values[which] = 0.0
+    return finite(lambda: regression.rows(values, optimum.weights)) is None
 
 
 def _sizes(regression: Regression) -> dict[str, float]:

@@ -14,7 +14,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     log_likelihood_of,
     relaxed_from,
 )
-from heli_jax.identification.estimation.noise_search import noise_guess_at
+from heli_jax.identification.estimation.noise_search import noise_guess_at, noise_guesses_by_tau
 from heli_jax.identification.unknowns.layout import Layout, disturbance_limits, unpack
 
 NO_DISTURBANCE = 2.71
@@ -60,20 +60,80 @@ def _restarted_from_a_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedO
     """Where the correlation time ran to an end of what a record can show, the better of that and of
     a search begun anew with the disturbance at its start: white noise is a local optimum of short
     records."""
-    layout, data = search.layout, search.data
-    [d] = disturbances_of(layout.model)
-    if d.tau not in layout.disturbance:
-        return optimum
-    # At the limits `unpack` clips, so that the likelihood is flat and no optimiser comes back.
-    low, high = (float(v) for v in disturbance_limits(layout, data)[d.tau])
-    if low < float(optimum.best.z[layout.disturbance_at(d.tau)]) < high:
+    [d] = disturbances_of(search.layout.model)
+    if not at_limit(search, optimum, d):
         return optimum
     z = with_noise_guess(search, optimum)
-    at_guess = evaluate(layout, data, optimum.noise, z)
-    noise = layout.estimator.with_level(data, at_guess, optimum.noise)
-    again = relaxed_from(search, noise, z)
+    again = _begun_at(search, optimum, z)
     gained = log_likelihood_of(search, again) > log_likelihood_of(search, optimum)
-    return again.after(optimum) if bool(again.best.converged) and gained else optimum
+    if bool(again.best.converged) and gained:
+        optimum = again.after(optimum)
+    return from_other_taus(search, optimum, d)
+
+
+def at_limit(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
+    """Whether the correlation time ran to an end of what a record can show, or below a sample.
+
+    Args:
+        search: the optimiser over the problem.
+        optimum: where it ended.
+        d: the disturbance.
+    """
+    if d.tau not in search.layout.disturbance:
+        return False
+    # At the limits `unpack` clips, so that the likelihood is flat and no optimiser comes back; and
+    # it is all but flat below a sample.
+    _, high = (float(v) for v in disturbance_limits(search.layout, search.data)[d.tau])
+    low = np.log(min(float(f.dt) for f in search.data.flights))
+    return not low < float(optimum.best.z[search.layout.disturbance_at(d.tau)]) < high
+
+
+def from_other_taus(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> RelaxedOptimum:
+    """The better of an optimum whose correlation time ran to an end and of searches from other
+    ones, all other parameters as they are; any other optimum as it is.
+
+    Args:
+        search: the optimiser over the problem.
+        optimum: where it ended.
+        d: the disturbance.
+    """
+    if not at_limit(search, optimum, d):
+        return optimum
+    start, layout = at_its_start(search, optimum, d), search.layout
+    # With it an output's noise may have run to zero, beside which no other parameter has a slope.
+    scales = slice(layout.first_nuisance - len(layout.scaled), layout.first_nuisance)
+    start = start.at[scales].set(0.0)
+    likelihood = log_likelihood_of(search, optimum)
+    for z in noise_guesses_by_tau(search.layout, search.data, optimum.noise, start, d):
+        again = _begun_at(search, optimum, z)
+        inside = bool(again.best.converged) and not at_limit(search, again, d)
+        # Each takes as long as a fit: the first that ends between the limits will do.
+        if inside and log_likelihood_of(search, again) > likelihood:
+            return again.after(optimum)
+    return optimum
+
+
+def at_its_start(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> Float[Array, " q"]:
+    """z of an optimum with one disturbance at its start, from where its grid reaches all sizes.
+
+    Args:
+        search: the optimiser over the problem.
+        optimum: where it ended.
+        d: the disturbance.
+    """
+    z = optimum.best.z
+    for name in (d.sigma, d.tau):
+        if name in search.layout.disturbance:
+            start = np.log(search.problem.noise[name].start)
+            z = z.at[search.layout.disturbance_at(name)].set(jnp.asarray(start, z.dtype))
+    return z
+
+
+def _begun_at(search: Search, optimum: RelaxedOptimum, z: Float[Array, " q"]) -> RelaxedOptimum:
+    """A search begun anew from z, its noise at the level that shows there."""
+    at_guess = evaluate(search.layout, search.data, optimum.noise, z)
+    noise = search.layout.estimator.with_level(search.data, at_guess, optimum.noise)
+    return relaxed_from(search, noise, z)
 
 
 def is_sure(layout: Layout, optimum: RelaxedOptimum, e: Evaluation, d: Disturbance) -> bool:

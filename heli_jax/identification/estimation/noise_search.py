@@ -7,8 +7,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.model import Disturbance
 from heli_jax.identification.estimation.residual import rows_of
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+
+_DECADES = np.log(10.0) * np.arange(-3.0, 2.5)
+"""by which the coarse search moves sigma_w"""
+_TAUS = 3
+"""correlation times between a few samples and a part of the record, from which a search that ran
+to an end is begun again; with the decades as many points as the coarse search has"""
 
 
 def noise_guess_at(
@@ -50,7 +57,7 @@ def one_noise_guess(
     """
     # Decades: from a disturbance far too faint the likelihood has no slope that leads back.
     steps = {
-        "sigma": np.log(10.0) * np.arange(-3.0, 2.5),
+        "sigma": _DECADES,
         "tau": np.log(10.0) * np.arange(-1, 2),
     }
     # One factor for all sigmas and one for all taus: the grid stays two-dimensional however many
@@ -66,6 +73,34 @@ def one_noise_guess(
     # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)
+
+
+def noise_guesses_by_tau(
+    layout: Layout, data: Data, noise: Noise, z0: Float[Array, " q"], d: Disturbance
+) -> list[Float[Array, " q"]]:
+    """z0 with one disturbance at correlation times from five samples to a fifth of the longest
+    record, sigma_w of the greatest likelihood on a coarse grid for each; the most likely first.
+
+    Args:
+        layout: what the unknowns are, d.tau among them.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        z0: where the grid of sigma_w has its middle.
+        d: the disturbance.
+    """
+    dt = min(float(f.dt) for f in data.flights)
+    longest = max(float(f.dt) * next(iter(f.outputs.values())).shape[0] for f in data.flights)
+    first, last = sorted((5.0 * dt, 0.2 * longest))
+    decades = _DECADES if d.sigma in layout.disturbance else np.zeros(1)
+    points = np.tile(np.asarray(z0), (_TAUS, decades.size, 1))
+    points[..., layout.disturbance_at(d.tau)] = np.log(np.geomspace(first, last, _TAUS))[:, None]
+    if d.sigma in layout.disturbance:
+        points[..., layout.disturbance_at(d.sigma)] += decades
+    flat = jnp.asarray(points.reshape(-1, points.shape[-1]), z0.dtype)
+    costs = np.asarray(_costs(layout, data, noise, flat)).reshape(points.shape[:2])
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    best = points[np.arange(_TAUS), np.argmin(costs, axis=1)]
+    return [jnp.asarray(best[i], z0.dtype) for i in np.argsort(costs.min(axis=1))]
 
 
 @eqx.filter_jit

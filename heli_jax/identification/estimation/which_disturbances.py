@@ -1,13 +1,12 @@
 """Which of several disturbances there are, each asked by itself, and the optimum with those."""
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
-
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
 from heli_jax.identification.estimation.disturbance_search import (
     NO_DISTURBANCE,
+    at_its_start,
+    at_limit,
+    from_other_taus,
     is_sure,
     silenced,
 )
@@ -19,7 +18,6 @@ from heli_jax.identification.estimation.noise_covariance import (
     relaxed_from,
 )
 from heli_jax.identification.estimation.noise_search import one_noise_guess
-from heli_jax.identification.unknowns.layout import disturbance_limits
 
 
 def those_that_show(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
@@ -40,7 +38,7 @@ def those_that_show(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
         # it.
         if _is_known(search, optimum, d):
             continue
-        optimum = _begun_again(search, optimum, d)
+        optimum = from_other_taus(search, _begun_again(search, optimum, d), d)
         optimum, shows = _with_or_without(search, optimum, d)
         if not shows:
             absent.append(d)
@@ -52,16 +50,7 @@ def those_that_show(search: Search, optimum: RelaxedOptimum) -> RelaxedOptimum:
 def _is_known(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
     """Whether a disturbance is there beyond doubt, its correlation time within what can be seen."""
     e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
-    return is_sure(search.layout, optimum, e, d) and not _at_limit(search, optimum, d)
-
-
-def _at_limit(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> bool:
-    """Whether the correlation time ran to an end of what a record can show, where the likelihood
-    is flat and no optimiser comes back."""
-    if d.tau not in search.layout.disturbance:
-        return False
-    low, high = (float(v) for v in disturbance_limits(search.layout, search.data)[d.tau])
-    return not low < float(optimum.best.z[search.layout.disturbance_at(d.tau)]) < high
+    return is_sure(search.layout, optimum, e, d) and not at_limit(search, optimum, d)
 
 
 def _begun_again(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> RelaxedOptimum:
@@ -74,12 +63,12 @@ def _begun_again(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> Rel
     """
     layout, data = search.layout, search.data
     likelihood = log_likelihood_of(search, optimum)
-    z = _at_start(search, optimum, d)
+    z = at_its_start(search, optimum, d)
     # One evaluation for each of the grid's points, at the parameters that there are.
     z = one_noise_guess(layout, data, optimum.noise, z, (d.sigma, d.tau))
     guess = evaluate(layout, data, optimum.noise, z)
     gain = layout.estimator.log_likelihood(layout, data, optimum.noise, guess) - likelihood
-    if not (gain > NO_DISTURBANCE or _at_limit(search, optimum, d)):
+    if not (gain > NO_DISTURBANCE or at_limit(search, optimum, d)):
         return optimum
     again = relaxed_from(search, layout.estimator.with_level(data, guess, optimum.noise), z)
     gained = log_likelihood_of(search, again) > likelihood
@@ -103,13 +92,3 @@ def _with_or_without(
     if bool(without.best.converged) and not ratio > NO_DISTURBANCE:
         return without.after(optimum), False
     return optimum, True
-
-
-def _at_start(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> Float[Array, " q"]:
-    """z of an optimum with one disturbance at its start, from where its grid reaches all sizes."""
-    z = optimum.best.z
-    for name in (d.sigma, d.tau):
-        if name in search.layout.disturbance:
-            start = np.log(search.problem.noise[name].start)
-            z = z.at[search.layout.disturbance_at(name)].set(jnp.asarray(start, z.dtype))
-    return z

@@ -7,9 +7,14 @@ Under feedback an input depends on past innovations (L. Ljung, System Identifica
 rest is correlated with sums of past innovations. The variance of such a correlation between two
 autocorrelated signals is Bartlett's: the sum over all lags of the product of both autocorrelations
 (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
+
+An input that is logged late follows the response as well, though nobody closes a loop: no such
+correlation tells the two apart. Where a delay was estimated and is negative, the input is taken so
+much earlier; elsewhere a late log is named as the other reading.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +67,10 @@ class Feedback(NamedTuple):
     """[s] how long ago they were"""
     p_value: float
     """for all inputs, outputs and lags of the record that were tested"""
+    earlier: float = 0.0
+    """[s] how much earlier than logged the input was taken, as its estimated delay says"""
+    delay_known: bool = False
+    """whether its delay was estimated: else the input may also be logged late"""
 
     @property
     def present(self) -> bool:
@@ -69,15 +78,21 @@ class Feedback(NamedTuple):
         return self.p_value < LEVEL
 
 
-def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
+def feedback(
+    flight: Flight, together: int = 1, earlier: Mapping[str, float] | None = None
+) -> tuple[Feedback, ...]:
     """By input that moves freely, whether it follows past innovations; nothing where the record is
     too short to tell.
 
     Args:
         flight: inputs and outputs as measured; no model is asked.
         together: how many flights are tested side by side, for the p values.
+        earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    inputs, outputs, dt = _decimated(flight)
+    # Half of a record at most: a delay beyond is none that it could show.
+    most = flight.n_samples // 2
+    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in (earlier or {}).items()}
+    inputs, outputs, dt = _decimated(flight, steps)
     n = next(iter(outputs.values())).size if outputs else 0
     if not inputs or n < _LEAST:
         return ()
@@ -103,21 +118,52 @@ def feedback(flight: Flight, together: int = 1) -> tuple[Feedback, ...]:
             for block in blocks
         )
         lag, label = (first * dt, last * dt), flight.name or "flight 1"
-        found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p)))
+        late = steps.get(name, 0) * flight.dt
+        found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
     return tuple(found)
 
 
-def feedback_of(problem: Problem) -> tuple[Feedback, ...]:
+def feedback_of(
+    problem: Problem, delays: Mapping[str, tuple[float, float | None]] | None = None
+) -> tuple[Feedback, ...]:
     """Of all flights that are fitted; nothing where sensors are compared with each other, of which
-    none is a stick that anybody moves."""
+    none is a stick that anybody moves.
+
+    Args:
+        problem: flights, and the model, which says what is delayed.
+        delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
+            delays [s]; None before a fit, and of one that did not arrive.
+    """
     if is_kinematic(problem.model):
         return ()
-    flights = problem.training
-    return tuple(
-        one._replace(flight=label)
-        for label, f in zip(labels(flights), flights, strict=True)
-        for one in feedback(f, len(flights))
-    )
+    flights, made = problem.training, []
+    for label, flight in zip(labels(flights), flights, strict=True):
+        of_inputs = {n: _delay(problem, flight, n, delays or {}) for n in flight.inputs}
+        # As early as its interval has it: what is left of a late log would still be an alarm. One
+        # that may be zero is none: an input that is moved for nothing hides a fast controller.
+        earlier = {n: 2.0 * sd - d for n, (d, sd, _) in of_inputs.items() if d + 2.0 * sd < 0}
+        made += [
+            one._replace(flight=label, delay_known=of_inputs[one.input][2])
+            for one in feedback(flight, len(flights), earlier)
+        ]
+    return tuple(made)
+
+
+def _delay(
+    problem: Problem, flight: Flight, name: str, found: Mapping[str, tuple[float, float | None]]
+) -> tuple[float, float, bool]:
+    """Of an input its delay and its sd [s], as far as they are known, and whether that was
+    estimated."""
+    delay, variance, estimated = 0.0, 0.0, False
+    own = dict(problem.model.delays).get(name)
+    if own is not None and own not in found:
+        stated = flight.known.get(own)
+        delay = float(getattr(problem.vehicle, own) if stated is None else stated)
+    for parameter in ("time_shift", own):
+        value, sd = found.get(parameter or "", (0.0, None))
+        if sd is not None:
+            delay, variance, estimated = delay + value, variance + sd**2, True
+    return delay, math.sqrt(variance), estimated
 
 
 def untested(problem: Problem) -> list[str]:
@@ -152,15 +198,7 @@ def feedback_notes(
     # estimate is unbiased in a closed loop too.
     if not present or (filtered and white):
         return []
-    sure = min(present, key=lambda one: one.p_value)
-    names = list(dict.fromkeys(one.input for one in present))
-    follows = "follow" if len(names) > 1 else "follows"
-    begun = (
-        f"The loop is closed: {' and '.join(names)} {follows} the response ({sure.flight}: "
-        f"correlation {sure.correlation:+.2f} of what is unforeseen of {sure.input} with what was "
-        f"unforeseen of {sure.output} {sure.lag[0]:.2g} to {sure.lag[1]:.2g} s before). Estimates "
-        "are then unbiased only if the noise model is right. "
-    )
+    begun = f"{_what_follows(problem, present)} unbiased only if the noise model is right. "
     if filtered:
         doubt = "" if white is None else ", and they are not: disturbances or dynamics are missing"
         return [f"{begun}Filter error asks for white innovations{doubt}."]
@@ -170,6 +208,34 @@ def feedback_notes(
         f"{begun}That of {problem.method} knows no gusts, which feedback brings into the inputs: "
         f"in gusts its estimates are biased, and method: filter-error{how} is advised."
     ]
+
+
+def _what_follows(problem: Problem, present: Sequence[Feedback]) -> str:
+    """Which inputs follow what, up to what holds of the estimates then."""
+    sure = min(present, key=lambda one: one.p_value)
+    names = list(dict.fromkeys(one.input for one in present))
+    of = " and ".join(names)
+    moved = f", taken {sure.earlier:.2g} s earlier as its delay says" if sure.earlier else ""
+    follows = (
+        f"{of} {'follow' if len(names) > 1 else 'follows'} the response ({sure.flight}: "
+        f"correlation {sure.correlation:+.2f} of what is unforeseen of {sure.input}{moved} with "
+        f"what was unforeseen of {sure.output} {sure.lag[0]:.2g} to {sure.lag[1]:.2g} s before)"
+    )
+    if all(one.delay_known for one in present):
+        return f"The loop is closed: {follows}. Estimates are then"
+    late = list(dict.fromkeys(one.input for one in present if not one.delay_known))
+    return (
+        f"{follows}: the loop is closed, or {' and '.join(late)} {'are' if len(late) > 1 else 'is'}"
+        f" logged late ({_how_told(problem, late)}). In a closed loop estimates are"
+    )
+
+
+def _how_told(problem: Problem, late: Sequence[str]) -> str:
+    """What tells inputs that are logged late from a closed loop."""
+    own = dict(problem.model.delays)
+    if problem.nuisance.time_shift or all(own.get(name) in problem.free for name in late):
+        return "a fit that arrives tells, by its delay"
+    return "free a delay: nuisance.time_shift, or delays of the model"
 
 
 def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
@@ -198,9 +264,13 @@ def _unforeseen(u: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"] | None:
 
 
 def _decimated(
-    flight: Flight,
+    flight: Flight, earlier: Mapping[str, int]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
-    """Inputs that move and outputs that are mostly seen, averaged down to a moderate rate."""
+    """Inputs that move and outputs that are mostly seen, averaged down to a moderate rate.
+
+    Args:
+        earlier: by how many samples an input is taken earlier than logged, where it is.
+    """
     every = max(1, int(np.ceil(1.0 / (flight.dt * _RATE) - 1e-9)))
 
     def thinned(x: np.ndarray) -> np.ndarray:
@@ -209,8 +279,14 @@ def _decimated(
         whole = x[: x.size // every * every].reshape(-1, every)
         return whole.mean(axis=1)  # NaN where one of them is missing
 
-    inputs = {n: thinned(u) for n, u in flight.inputs.items()}
-    outputs = {n: thinned(y) for n, y in flight.outputs.items()}
+    # What an input does after the end of its log is not known: all signals end there.
+    cut = max(earlier.values(), default=0)
+
+    def taken(x: np.ndarray, first: int) -> np.ndarray:
+        return thinned(x[first : x.size - cut + first])
+
+    inputs = {n: taken(u, earlier.get(n, 0)) for n, u in flight.inputs.items()}
+    outputs = {n: taken(y, 0) for n, y in flight.outputs.items()}
     # Of a very long record a part will do, and its regressors fit into memory.
     inputs = {n: u[:_MOST] for n, u in inputs.items()}
     outputs = {n: y[:_MOST] for n, y in outputs.items()}

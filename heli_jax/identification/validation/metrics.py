@@ -29,7 +29,7 @@ BAND99 = 2.5758293035489004
 """half width of the 99 % band of a white residual's correlation, times sqrt(N): the 99.5 % point of
 the normal distribution"""
 
-_MOSTLY_MISSING = 0.5
+_MOSTLY_MISSING = 0.4
 """part of the samples that are seen, below which a signal is one of fewer samples"""
 
 NO_METRICS = Metrics(*[float("nan")] * 7)

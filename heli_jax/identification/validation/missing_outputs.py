@@ -210,8 +210,10 @@ def _ratios(
     results = []
     for name, sd in sds.items():
         after = expected_sd(s.unknowns, triangle(s, np.flatnonzero(have | (output == name))))
-        # What nothing determines before and after is as it was.
-        ratio = np.where(np.isfinite(before), after / np.where(before > 0, before, 1.0), 0.0)
-        ratio = np.where(np.isfinite(after), ratio, 1.0)
+        # What nothing determines before and after is as it was; what only the further output
+        # determines is infinitely better.
+        ratio = np.where(np.isfinite(after), 0.0, 1.0)
+        both = np.isfinite(before) & np.isfinite(after) & (before > 0)
+        np.divide(after, before, out=ratio, where=both)
         results.append(MissingOutput(name, sd, ratio, before))
     return results
