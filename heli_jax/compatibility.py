@@ -15,7 +15,8 @@ import numpy as np
 
 from heli_jax import naming, run_directory, units, workflow
 from heli_jax.config.corrections import Conversion, conversion_of, logged_signals
-from heli_jax.config.kinematics import SIZES
+from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import NOISES, SIZES
 from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
@@ -99,6 +100,11 @@ def run_compatibility(
         )
     run = workflow.run_fit(experiment, progress=progress)
     found = judged(run)
+    if _smoother_than_noise(run):
+        progress("the log is smooth: once more by output error")
+        found = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
+        found = dataclasses.replace(found, doubts=(_SMOOTH, *found.doubts))
+        run = found.run
     if out is None:
         return found
     progress("writing the report")
@@ -107,6 +113,30 @@ def run_compatibility(
     with run_directory.whole_file(place, f"--out {place}") as part:
         part.write_text(as_yaml(found.corrections), encoding="utf-8")
     return dataclasses.replace(found, run=run)
+
+
+_SMOOTH = (
+    "The log is smoother than white noise would have it (low-passed before it was logged?), so that "
+    "the noise of gyros and angles cannot be told: fitted by output error, whose intervals go by "
+    "the autocorrelation of the residuals."
+)
+
+
+def _smoother_than_noise(run: FitRun) -> bool:
+    """Whether filter error found no noise to hold its innovations against."""
+    searched = {*NOISES} & {*run.problem.free}
+    return run.fit.method == "filter-error" and bool(searched) and run.fit.status == "not-converged"
+
+
+def _by_output_error(experiment: Experiment) -> Experiment:
+    config = experiment.config
+    assert config.fit is not None  # it has been fitted
+    fit = config.fit.model_copy(update={"method": "output-error"})
+    return dataclasses.replace(experiment, config=config.model_copy(update={"fit": fit}))
+
+
+def _silent(_: str) -> None:
+    pass
 
 
 def judged(run: FitRun) -> Compatibility:

@@ -3,6 +3,7 @@
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,6 +67,11 @@ def configured(folder, name="sensors.yaml", **more):
     return path
 
 
+def notes_of(flight):
+    assert flight.source is not None
+    return flight.source.notes
+
+
 @pytest.mark.slow
 def test_errors_are_found(folder, capsys, monkeypatch):
     path = configured(folder)
@@ -114,7 +120,7 @@ def test_a_model_of_the_machine_is_refused(folder, capsys):
     assert not (folder / "out").exists()
 
 
-def fitted(folder, estimates, shares, status="converged"):
+def fitted(folder, estimates, shares, status="converged") -> Any:
     """What a fit would have said, by error (value, reach of its interval), by output R2."""
     experiment = config.load(configured(folder))
     y = np.sin(np.arange(100.0))
@@ -192,10 +198,9 @@ def test_a_lever_arm_goes_to_a_model_that_has_one(folder):
     experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
     [flight] = config.read_flights(experiment)
     assert flight.known == {}
-    assert "lever arm not used, model kinematics-attitude has none: x_imu 0.2 m" in (
-        flight.source.notes
-    )
-    assert "not corrected, since undetermined: b_r" in flight.source.notes
+    said = notes_of(flight)
+    assert "lever arm not used, model kinematics-attitude has none: x_imu 0.2 m" in said
+    assert "not corrected, since undetermined: b_r" in said
 
 
 @pytest.mark.slow

@@ -42,6 +42,9 @@ SIZES = {
 """how large an error may well be, SI: the sd of its prior, and the unit of the search. A record
 that says no more than this does not determine the error"""
 
+NOISES = {"noise_gyro": RATES, "noise_accel": FORCES}
+"""of what is integrated, by the model's parameter"""
+
 
 def errors_of(model: Model, outputs: Iterable[str]) -> dict[str, Free]:
     """The errors that a log's signals allow to be free, each from zero with a prior of its size.
@@ -184,7 +187,7 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
         flights: read.
     """
     known, found = naming.names(model.Params), {}
-    for parameter, names in (("noise_gyro", RATES), ("noise_accel", FORCES)):
+    for parameter, names in NOISES.items():
         if parameter in known:
             # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
             walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
