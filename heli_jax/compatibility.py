@@ -116,9 +116,9 @@ def run_compatibility(
 
 
 _SMOOTH = (
-    "The log is smoother than white noise would have it (low-passed before it was logged?), so that "
-    "the noise of gyros and angles cannot be told: fitted by output error, whose intervals go by "
-    "the autocorrelation of the residuals."
+    "The log is smoother than white noise would have it (low-passed before the log?), and the "
+    "noise of gyros and angles cannot be told: fitted by output error, whose intervals go by the "
+    "autocorrelation of the residuals."
 )
 
 
@@ -132,7 +132,7 @@ def _by_output_error(experiment: Experiment) -> Experiment:
     config = experiment.config
     assert config.fit is not None  # it has been fitted
     fit = config.fit.model_copy(update={"method": "output-error"})
-    return dataclasses.replace(experiment, config=config.model_copy(update={"fit": fit}))
+    return experiment._replace(config=config.model_copy(update={"fit": fit}))
 
 
 def _silent(_: str) -> None:

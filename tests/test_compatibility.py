@@ -109,8 +109,7 @@ def test_errors_are_taken_off(folder, true):
     assert np.std(error) < 0.008
     assert np.isnan(flight.outputs["phi"][-1])
     assert any(
-        note.startswith("p: corrected by scale +0.08, bias 1.5 deg/s")
-        for note in flight.source.notes
+        note.startswith("p: corrected by scale +0.08, bias 1.5 deg/s") for note in notes_of(flight)
     )
 
 
