@@ -79,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
     _add_config(fit)
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
+    agree = command("compatibility", _compatibility, "do a log's sensors agree? their errors")
+    _add_config(agree)
+    agree.add_argument("--out", metavar="DIR", help="run directory (default: as of fit)")
     check = command("check", _check, "identifiability, sampling and excitation before any fit")
     _add_config(check)
     check.add_argument("--json", action="store_true", help="everything, for other programs")
@@ -230,6 +233,14 @@ def _windows(options: argparse.Namespace) -> int:
     ranking = log_windows.rank_log(experiment, options.log, options.length, progress=_say)
     log_windows.print_ranking(ranking)
     return DONE
+
+
+def _compatibility(options: argparse.Namespace) -> int:
+    _prepare_jax()
+    from heli_jax import output
+
+    compatible = output.run_compatibility(options.config, options.out, options.set, _say)
+    return DONE if compatible else NOT_CONVERGED
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+from heli_jax.dynamics import kinematics
 from heli_jax.dynamics.check_model import check_model, what_instead
 from heli_jax.dynamics.helicopter import Corrections, helicopter
 from heli_jax.dynamics.model import Model
@@ -38,7 +39,13 @@ __all__ = [
 
 # By the names that a configuration, fit.json and the report use; in Python the names are
 # attributes.
-_SHIPPED = {model.name: model for model in (roll, roll_on_stand, pitch, pitch_on_stand)}
+_SHIPPED = {
+    model.name: model
+    for model in (
+        *(roll, roll_on_stand, pitch, pitch_on_stand),
+        *(kinematics.attitude, kinematics.velocity, kinematics.position),
+    )
+}
 _HELICOPTERS: dict[str, Literal["paper", "consistent", "full"]] = {
     "helicopter": "full",
     "helicopter-consistent": "consistent",

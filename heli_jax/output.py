@@ -86,6 +86,38 @@ def print_fit(run: FitRun) -> None:
         print(f"report: {run.directory / 'report.html'}")
 
 
+def run_compatibility(
+    config: str, out: str | None, overrides: list[str], say: Callable[[str], None]
+) -> bool:
+    """Compare a log's sensors and print what was found; whether they agree.
+
+    Args:
+        config: the configuration.
+        out: a new directory; runs/NAME-DATE-TIME unless given.
+        overrides: of `--set`.
+        say: for words as the work goes on.
+
+    Raises:
+        InputError: a log or something of the configuration is wrong.
+    """
+    # Here: of all commands only this one needs it.
+    from heli_jax import compatibility
+
+    place = run_directory.default_directory(Path(config)) if out is None else Path(out)
+    found = compatibility.run_compatibility(config, place, overrides=overrides, progress=say)
+    print(found.verdict)
+    for line in found.doubts:
+        print(f"! {line}")
+    print_table(*compatibility.table(found))
+    print(
+        "R2 of what is reconstructed: "
+        + ", ".join(f"{n} {r:.4f}" for n, r in found.r_squared.items())
+    )
+    print(f"corrections: {place / compatibility.FILE}")
+    print(f"report: {place / 'report.html'}")
+    return found.compatible
+
+
 def _print_first_guess(guess: EquationErrorStart) -> None:
     print("Where the fit began, by equation error (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):

@@ -50,7 +50,7 @@ ALLOWED = {
 # Entry points may import everything below them, never the command line.
 ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
-    "log_output", "log_windows", "cli_options", "interrupts", "reading_progress",
+    "log_output", "log_windows", "cli_options", "interrupts", "reading_progress", "compatibility",
     "__init__",
     "__main__",
 }  # fmt: skip

@@ -3,7 +3,8 @@
 from heli_jax.config.experiment import Experiment, in_wind, load, resolved
 from heli_jax.config.logs import first_signals, read_flights, signals
 from heli_jax.config.problems import candidate_models, disturbed, problem
-from heli_jax.config.schema import Config, SimulateConfig, StickConfig
+from heli_jax.config.schema import Config
+from heli_jax.config.simulate_section import SimulateConfig, StickConfig
 
 __all__ = [
     "Config",

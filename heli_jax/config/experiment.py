@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from heli_jax import models, naming
+from heli_jax.config.kinematics import completed
 from heli_jax.config.measurement import with_measurement
 from heli_jax.config.onboard import with_onboard
 from heli_jax.config.opened_logs import OpenedLogs
@@ -56,7 +57,7 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
     else:
         for text in overrides:
             _override(content, text)
-    config = _validated(content, str(path))
+    config = _validated(completed(content, str(path)), str(path))
     # The model before the vehicle, since its Params say which constants a vehicle may have.
     logs = OpenedLogs()
     model = _model(config, path, logs)
@@ -314,6 +315,8 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
         # With links resolved too: the run's config.yaml is read from its own directory.
         for log in (flight, *flight["also"]):
             log["log"] = str((path.parent / log["log"]).resolve())
+        if "corrections" in flight:
+            flight["corrections"] = str((path.parent / flight["corrections"]).resolve())
     for design in _designs(content.get("sweep")):
         if "file" in design:
             design["file"] = str((path.parent / design["file"]).resolve())

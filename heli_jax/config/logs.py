@@ -1,11 +1,13 @@
 """The flights that a configuration names."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from heli_jax import naming, units
+from heli_jax.config.corrections import read_corrections, with_corrections
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import filter_cautions
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
@@ -94,13 +96,7 @@ def _read_flight(
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
     notes = (*_unstated_units(model, everything), *named.notes)
-    flights = tuple(
-        dataclasses.replace(
-            with_notches(flight, f.notch or (), f"{where}.notch"), choose_windows=f.window == "auto"
-        )
-        for flight in flights
-    )
-    first, *others = flights
+    first, *others = _treated(experiment, flights, f, where)
     cautions = filter_cautions(first.source, everything.outputs)
     cautions = (*cautions, *vibration_notes(experiment, first, f, where))
     return (_with_notes(first, notes, cautions), *others)
@@ -120,6 +116,25 @@ def _check(model: Model, f: FlightConfig, where: str) -> None:
         raise InputError(
             f"{where}.window: auto chooses what to fit, expected two numbers with hold_out"
         )
+
+
+def _treated(
+    experiment: Experiment, flights: Sequence[Flight], f: FlightConfig, where: str
+) -> tuple[Flight, ...]:
+    """The flights as they are to be fitted: what the configuration takes off its signals is off."""
+    model, corrections = experiment.model, None
+    if f.corrections is not None:
+        place = experiment.path.parent / f.corrections
+        corrections = read_corrections(place, f"{where}.corrections")
+    treated = []
+    for flight in flights:
+        # Jumps of a turn before the notch, which would ring at them; delays behind it, since they
+        # leave samples without a value.
+        flight = with_notches(prepared(model, flight, where), f.notch or (), f"{where}.notch")
+        if corrections is not None:
+            flight = with_corrections(model, flight, corrections, where)
+        treated.append(dataclasses.replace(flight, choose_windows=f.window == "auto"))
+    return tuple(treated)
 
 
 def _with_also(named: Resolved, f: FlightConfig, where: str) -> Resolved:
@@ -246,8 +261,9 @@ def _of_model(
         words = {name: named.origins.get((role, name), "") for name in by_name}
         return {n: dataclasses.replace(s, origin=words[n]) for n, s in by_name.items()}
 
+    inputs = between_samples(model, signals(model, "inputs", named.inputs, where, gain))
     return (
-        with_origins("inputs", signals(model, "inputs", named.inputs, where, gain)),
+        with_origins("inputs", inputs),
         with_origins("outputs", signals(model, "outputs", named.outputs, where)),
     )
 

@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 from heli_jax import naming
 from heli_jax.config.onboard import OnboardConfig
 from heli_jax.config.schema import InputConfig, OutputConfig, SignalsConfig
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.derived import CCPM
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.preset import (
     Alternative,
+    ModelSignal,
     Preset,
     choose,
     model_inputs,
@@ -157,6 +159,9 @@ class _Search(NamedTuple):
 
     def input(self, model: Model, name: str, pilot: bool) -> Alternative:
         known = model_inputs().get(name)
+        # What is an output elsewhere is an input where sensors are compared with each other.
+        if is_kinematic(model) and (sensor := model_outputs().get(name)) is not None:
+            known = ModelSignal(sensor, sensor)
         if known is None:
             problem = f"no preset knows the input {name!r} of model {model.name}"
             raise InputError(f"{self.where}.inputs: {problem}, expected it by name")

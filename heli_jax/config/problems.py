@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,12 +10,15 @@ import jax.numpy as jnp
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
 from heli_jax.config.starts import first_guesses
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
@@ -50,16 +54,18 @@ def problem(experiment: Experiment) -> Problem:
                 "disturbance: {axis: roll, poles: 1}"
             )
         model, params = disturbed(experiment)
+        free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
     try:
         whole = Problem(
             model,
             params,
-            flights,
+            # Not before the noise of the inputs is known, which it makes larger.
+            tuple(sharpened(model, f) for f in flights),
             free,
             nuisance,
             # One number for all flights, since they share one compiled program: the slowest log's.
-            substeps=max(substeps_for(f.dt, model.fastest) for f in flights),
+            substeps=_substeps(model, flights),
             gain_units=_gain_units(experiment) if nuisance.input_gain else {},
             method=config.fit.method,
             fixed_noise=fixed,
@@ -93,6 +99,12 @@ def with_chosen_windows(problem: Problem) -> Problem:
     by_flight = {id(f): parts.get(i, ()) for i, f in enumerate(chosen)}
     flights = [part for f in problem.flights for part in by_flight.get(id(f), (f,))]
     return dataclasses.replace(problem, flights=tuple(flights))
+
+
+def _substeps(model: Model, flights: Sequence[Flight]) -> int:
+    if is_kinematic(model):
+        return substeps_of(flights)
+    return max(substeps_for(f.dt, model.fastest) for f in flights)
 
 
 def _nuisance(config: FitConfig) -> Nuisance:

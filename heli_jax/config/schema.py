@@ -1,7 +1,6 @@
 """What may stand in a configuration: its sections, their keys and their bounds."""
 
 import math
-import warnings
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
@@ -10,6 +9,7 @@ from heli_jax.config.design_section import DesignConfig, ReduceConfig, Trajector
 from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
 from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
+from heli_jax.config.simulate_section import SimulateConfig, StartConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.stepwise import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -147,6 +147,8 @@ class FlightConfig(_Strict):
     """frequencies [Hz] that are taken out of inputs and outputs alike"""
     vibration: VibrationConfig | None = None
     """the rotor's speed, by which lines of vibration are named"""
+    corrections: str | None = None
+    """a file of `heli-jax compatibility`: errors of the sensors, taken off the signals"""
 
 
 class PriorConfig(_Strict):
@@ -266,89 +268,6 @@ class RLSConfig(_Strict):
     # One forgets nothing: all samples count alike, as for a machine that does not change in a
     # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
-
-
-class StickConfig(_Strict):
-    """How one input moves in a simulation."""
-
-    # "sweep" is the older name of "chirp".
-    kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
-    amplitude: Positive
-    unit: str | None = None
-    hold: tuple[Positive, Positive] = (0.3, 2.0)
-    """shortest and longest step of random-steps [s]"""
-    step: Positive = 0.3
-    """unit length of 3-2-1-1 [s]"""
-    pause: Positive = 2.0
-    """neutral between two 3-2-1-1 [s]"""
-    band: tuple[Positive, Positive] = (0.05, 5.0)
-    """first and last frequency of a chirp [Hz]"""
-
-
-class NoiseConfig(_Strict):
-    sd: Positive
-    unit: str | None = None
-
-
-class StartConfig(_Strict):
-    """The steady flight in which a run of the whole helicopter begins."""
-
-    forward_speed: Finite = 0.0
-    """speed over the ground along the heading [m/s]"""
-    lateral_speed: Finite = 0.0
-    """to the right of it [m/s]"""
-    climb: Finite = 0.0
-    """[m/s]"""
-    heading: Finite = 0.0
-    """psi [rad]"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, content: Any) -> Any:
-        """The keys under which the speeds stood before, accepted with a warning."""
-        if not isinstance(content, dict):
-            return content
-        content = dict(content)
-        for old, new in (("ahead", "forward_speed"), ("aside", "lateral_speed")):
-            if old not in content:
-                continue
-            if new in content:
-                raise ValueError(f"expected {new} alone, got {old} and {new}, which mean the same")
-            warnings.warn(f"{old} is deprecated, expected {new}", DeprecationWarning, stacklevel=2)
-            content[new] = content.pop(old)
-        return content
-
-
-class SimulateConfig(_Strict):
-    """A run that the project makes itself.
-
-    The whole helicopter begins in a trimmed flight, and `inputs` are added to the trim's sticks;
-    start, wind, hold_attitude and ground are for it alone.
-    """
-
-    duration: Positive
-    rate: Positive
-    inputs: dict[str, StickConfig] = {}
-    noise: dict[str, NoiseConfig] = {}
-    seed: Annotated[int, Field(ge=0)] = 0
-    start: StartConfig | None = None
-    """hover unless given"""
-    wind: tuple[Finite, Finite, Finite] | None = None
-    """velocity of the air along x, y and z (up) [m/s]"""
-    hold_attitude: bool = False
-    """whether a pilot's gentle feedback is added to the sticks, so that a long manoeuvre does not
-    diverge (`heli_jax.analysis.pilot`)"""
-    ground: Annotated[float, Field(lt=0, allow_inf_nan=False)] | None = None
-    """height at which the run ends [m]; it begins at a height of zero"""
-
-    @model_validator(mode="after")
-    def _bounded(self) -> "SimulateConfig":
-        # 8: no reader takes fewer. 1e8 samples of ten signals fill 8 GB.
-        if not 8 <= self.duration * self.rate <= 1e8:
-            raise ValueError(
-                f"duration times rate is {self.duration * self.rate:g} samples, expected 8 to 1e8"
-            )
-        return self
 
 
 class SweepConfig(DesignConfig):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.agreement import (
     correlated_residuals,
     free_runs,
@@ -237,7 +238,8 @@ def _missing(
         tuple(
             Left(flight.dt, {n: s.error(n) for n in s.measured}, s.inputs)
             for s, flight in zip(signals, problem.training, strict=True)
-        )
+        ),
+        sensors=is_kinematic(problem.model),
     )
 
 

@@ -23,6 +23,7 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.dynamics.disturbance import disturbable
+from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -125,13 +126,16 @@ def feedback(
 def feedback_of(
     problem: Problem, delays: Mapping[str, tuple[float, float | None]] | None = None
 ) -> tuple[Feedback, ...]:
-    """Of all flights that are fitted.
+    """Of all flights that are fitted; nothing where sensors are compared with each other, of which
+    none is a stick that anybody moves.
 
     Args:
         problem: flights, and the model, which says what is delayed.
         delays: value and sd of what a fit found, among it `time_shift` and the parameters that are
             delays [s]; None before a fit, and of one that did not arrive.
     """
+    if is_kinematic(problem.model):
+        return ()
     flights, made = problem.training, []
     for label, flight in zip(labels(flights), flights, strict=True):
         of_inputs = {n: _delay(problem, flight, n, delays or {}) for n in flight.inputs}

@@ -23,6 +23,14 @@ _WORTH_IT = 0.02
 """share of the whitened residual below which it makes no difference to the estimates"""
 _FEWEST = 10
 """samples for each regressor"""
+_OF_A_MACHINE = (
+    "the model lacks dynamics between the two, which its estimates then stand for. Is a servo, a "
+    "rate loop or a filter missing (onboard)?"
+)
+_OF_SENSORS = (
+    "bias, scale and delay do not account for it, and their estimates take up a part. Is one of "
+    "the two filtered, or an estimator's and not a sensor's?"
+)
 
 
 class Left(NamedTuple):
@@ -47,11 +55,13 @@ class Explained(NamedTuple):
     """where the response to the input is largest [s]"""
 
 
-def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
+def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> list[str]:
     """Sentences on what inputs still explain of the residuals.
 
     Args:
         flights: those that were fitted.
+        sensors: whether inputs and outputs are sensors that are compared with each other, between
+            which there are no dynamics; of each output the input that explains most is named.
     """
     pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
     # By output and input over all flights, so that one missing servo is one sentence.
@@ -63,10 +73,16 @@ def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
         known = found.get((output, name))
         if known is None or one.share > known.share:
             found[output, name] = one
+    if sensors:
+        most = {
+            output: max(e.share for (o, _), e in found.items() if o == output)
+            for output, _ in found
+        }
+        found = {pair: e for pair, e in found.items() if e.share == most[pair[0]]}
+    remedy = _OF_SENSORS if sensors else _OF_A_MACHINE
     return [
         f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
-        f"{one.lag:.2g} s after it moved: the model lacks dynamics between the two, which its "
-        "estimates then stand for. Is a servo, a rate loop or a filter missing (onboard)?"
+        f"{one.lag:.2g} s after it moved: {remedy}"
         for (output, name), one in found.items()
     ]
 

@@ -1,0 +1,281 @@
+"""Do the sensors of a log agree? Rates against angles, accelerations against velocities.
+
+A layer over `run_fit` with the models of `heli_jax.dynamics.kinematics`: the same estimator,
+intervals and report, then a word on each error, and a file of corrections.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax import naming, run_directory, units, workflow
+from heli_jax.config.corrections import Conversion, conversion_of, logged_signals
+from heli_jax.config.experiment import Experiment
+from heli_jax.config.kinematics import NOISES, SIZES
+from heli_jax.dynamics.kinematics import FORCES, RATES, is_kinematic
+from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate
+from heli_jax.workflow import FitRun, Say
+from heli_jax.yaml_file import as_yaml
+
+FILE = "compatibility.yaml"
+
+AGREES = 0.9
+"""R^2 of a channel from which on its sensors agree (the acceptance card's gate)"""
+_RESTS = 0.5
+"""share of the prior in what is known of an error from which on the record does not determine it"""
+_LARGEST_SCALE = 0.1
+"""scale error beyond which it is hardly the sensor's own: a cheap one is good to some percent"""
+
+
+@dataclass(frozen=True)
+class SensorError:
+    """One error: what was found of it."""
+
+    name: str
+    meaning: str
+    estimate: Estimate
+    determined: bool
+
+    @property
+    def shows(self) -> bool:
+        """Whether the record determines it, and it is not zero."""
+        low, high = self.estimate.lower95, self.estimate.upper95
+        return self.determined and low is not None and high is not None and low * high > 0
+
+    @property
+    def words(self) -> str:
+        """What the table says of it."""
+        if not self.determined:
+            return "unknown"
+        return "yes" if self.shows else "no"
+
+
+@dataclass(frozen=True)
+class Compatibility:
+    """What a log's sensors say of each other."""
+
+    run: FitRun
+    errors: tuple[SensorError, ...]
+    r_squared: dict[str, float]
+    """by output, of what the corrected rates and specific forces reconstruct"""
+    compatible: bool
+    verdict: str
+    doubts: tuple[str, ...]
+    """sentences on what speaks against the estimates"""
+    corrections: dict[str, Any]
+    """what `compatibility.yaml` holds"""
+
+
+def run_compatibility(
+    config: str | Path,
+    out: str | Path | None = None,
+    *,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    progress: Say = print,
+) -> Compatibility:
+    """Compare the sensors of a configuration's flights.
+
+    Args:
+        config: a configuration with `model: kinematics`.
+        out: a new directory for the report and compatibility.yaml; none is written unless given.
+        overrides: values in place of the file's, as of `load_config`.
+        progress: called with what is going on, in words.
+
+    Raises:
+        InputError: a log or something of the configuration is wrong, or `out` exists.
+    """
+    if out is not None:
+        run_directory.require_free(Path(out))
+    experiment = workflow.load_config(config, overrides)
+    if not is_kinematic(experiment.model):
+        raise InputError(
+            f"{config}: model: expected kinematics, which compares sensors with each other, got "
+            f"{experiment.model.name} (docs/compatibility.md)"
+        )
+    run = workflow.run_fit(experiment, progress=progress)
+    found = judged(run)
+    if _smoother_than_noise(run):
+        progress("the log is smooth: once more by output error")
+        found = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
+        found = dataclasses.replace(found, doubts=(_SMOOTH, *found.doubts))
+        run = found.run
+    if out is None:
+        return found
+    progress("writing the report")
+    run = workflow.write_report(run, out)
+    place = Path(out) / FILE
+    with run_directory.whole_file(place, f"--out {place}") as part:
+        part.write_text(as_yaml(found.corrections), encoding="utf-8")
+    return dataclasses.replace(found, run=run)
+
+
+_SMOOTH = (
+    "The log is smoother than white noise would have it (low-passed before the log?), and the "
+    "noise of gyros and angles cannot be told: fitted by output error, whose intervals go by the "
+    "autocorrelation of the residuals."
+)
+
+
+def _smoother_than_noise(run: FitRun) -> bool:
+    """Whether filter error found no noise to hold its innovations against."""
+    searched = {*NOISES} & {*run.problem.free}
+    return run.fit.method == "filter-error" and bool(searched) and run.fit.status == "not-converged"
+
+
+def _by_output_error(experiment: Experiment) -> Experiment:
+    config = experiment.config
+    assert config.fit is not None  # it has been fitted
+    fit = config.fit.model_copy(update={"method": "output-error"})
+    return experiment._replace(config=config.model_copy(update={"fit": fit}))
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def judged(run: FitRun) -> Compatibility:
+    """What a fit of a kinematic model says of the sensors."""
+    errors = tuple(_error(run, n, e) for n, e in run.fit.estimates.items() if n in SIZES)
+    r_squared = r_squared_of(run)
+    bad = [n for n, r in r_squared.items() if not r >= AGREES]
+    converged = run.fit.status != "not-converged"
+    return Compatibility(
+        run,
+        errors,
+        r_squared,
+        converged and not bad,
+        _verdict(errors, r_squared, bad, converged),
+        _doubts(run, errors),
+        _corrections(run, {e.name: e.estimate.value for e in errors if e.determined}, errors),
+    )
+
+
+def _error(run: FitRun, name: str, estimate: Estimate) -> SensorError:
+    verdict = run.fit.verdict
+    rests = name in verdict.resting or estimate.prior_share > _RESTS
+    determined = estimate.sd is not None and not rests and run.fit.status != "not-converged"
+    return SensorError(name, naming.meaning(run.config.model.Params, name), estimate, determined)
+
+
+def r_squared_of(run: FitRun) -> dict[str, float]:
+    """By output, 1 - the squared residual over the squared deviation from the mean, over all fitted
+    flights; NaN where an output never moves."""
+    shares = {}
+    flights = [s for s in run.fit.signals if not s.hold_out]
+    for n in sorted({n for s in flights for n in s.measured}):
+        left = total = 0.0
+        for s in flights:
+            if n in s.measured:
+                y = s.measured[n]
+                left += float(np.nansum((y - s.simulated[n]) ** 2))
+                total += float(np.nansum((y - np.nanmean(y)) ** 2))
+        shares[n] = 1.0 - left / total if total > 0 else float("nan")
+    return shares
+
+
+def _verdict(
+    errors: Sequence[SensorError], r_squared: dict[str, float], bad: list[str], converged: bool
+) -> str:
+    if not converged:
+        return "Not judged: the search did not converge."
+    if bad:
+        channels = ", ".join(f"{n} (R2 {r_squared[n]:.3f})" for n in bad)
+        return (
+            f"Not compatible: no errors of these kinds bring {channels} to R2 {AGREES:g}. Look for "
+            "a wrong unit, sign or axis, a filter, a scale that changes in the flight."
+        )
+    lowest = min(r_squared.values())
+    found = [e.name for e in errors if e.shows]
+    if not found:
+        return f"Compatible as logged: R2 {lowest:.4f} or more, and no error shows."
+    return f"Compatible once {', '.join(found)} are corrected: R2 {lowest:.4f} or more."
+
+
+def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
+    """What a fit says of itself, and errors that no sensor has."""
+    scales = [
+        e
+        for e in errors
+        if e.shows and e.name.startswith("lambda_") and abs(e.estimate.value) > _LARGEST_SCALE
+    ]
+    if not scales:
+        return run.fit.notes
+    words = ", ".join(f"{e.name} {e.estimate.value:+.0%}" for e in scales)
+    return (
+        f"{words}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
+        "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
+        "the log's signals together; which of them is wrong they do not say.",
+        *run.fit.notes,
+    )
+
+
+def _corrections(
+    run: FitRun, values: dict[str, float], errors: Sequence[SensorError]
+) -> dict[str, Any]:
+    """The content of a file of corrections: what was determined, by the log's own names."""
+    experiment = run.config
+    model = experiment.model
+    # The sensor that is logged first needs no correction; what is late is late against it.
+    by_sensor = {"delay_gyro": RATES, "delay_accel": FORCES}
+    early = {n: values.get(p, 0.0) for p, names in by_sensor.items() for n in names}
+    latest = max(0.0, *early.values())
+    lines = dict(model.delay_lines)
+    signals: dict[str, Any] = {}
+    for each in (each for flight in run.problem.flights for each in logged_signals(flight)):
+        n, signal = each.name, each.signal
+        if signals.get(signal.name, {"of": n})["of"] != n:
+            # A file of corrections knows a signal by its name alone.
+            raise InputError(
+                f"{experiment.path}: {signal.name} is {signals[signal.name]['of']} in one log and "
+                f"{n} in another, expected one name for one sensor"
+            )
+        late = latest - early[n] if n in early else latest + values.get(lines.get(n, ""), 0.0)
+        correction = {
+            "scale": _short(values.get(f"lambda_{n}", 0.0)),
+            "bias": _short(values.get(f"b_{n}", 0.0) / units.factor(signal.unit, signal.si)),
+            "delay": _short(late),
+        }
+        if any(correction.values()):
+            how = conversion_of(signal)
+            # Left out where the numbers were read as they are.
+            read = {} if how == Conversion() else {"conversion": how.model_dump()}
+            signals[signal.name] = {"of": n, "unit": signal.unit, **correction, **read}
+    arm = {n: _short(values[n]) for n in ("x_imu", "y_imu", "z_imu") if n in values}
+    return {
+        "found_by": f"heli-jax compatibility {experiment.path.name}",
+        "signals": signals,
+        "lever_arm": arm,
+        "not_determined": [e.name for e in errors if not e.determined],
+    }
+
+
+def _short(value: float) -> float:
+    # Five digits: for people to read, and more than any record gives.
+    return float(f"{value:.5g}")
+
+
+def table(found: Compatibility) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of the table of errors."""
+    head = ("error", "estimate, 95 %", "unit", "shows", "what it is")
+    rows = []
+    for e in found.errors:
+        interval, estimate = "", e.estimate
+        if e.determined and estimate.lower95 is not None and estimate.upper95 is not None:
+            reach = max(estimate.upper95 - estimate.value, estimate.value - estimate.lower95)
+            interval = _plus_minus(estimate.value, reach)
+        rows.append((e.name, interval, estimate.unit, e.words, e.meaning))
+    return head, rows
+
+
+def _plus_minus(value: float, reach: float) -> str:
+    """As many digits as the reach of the interval has sense for: two of its own."""
+    if not 0 < reach < math.inf:
+        return f"{value:.4g} +- {reach:.2g}"
+    digits = max(0, 1 - math.floor(math.log10(reach)))
+    return f"{value:.{digits}f} +- {reach:.{digits}f}"

@@ -1,0 +1,210 @@
+"""Errors of sensors, found by `heli-jax compatibility`, taken off the signals of a flight."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
+
+from heli_jax import naming, units
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight, Signal
+from heli_jax.yaml_file import read_mapping
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+_LATEST = 1.0
+"""s; a delay beyond is another unit, or another clock"""
+
+
+class _Strict(BaseModel):
+    # As in a configuration: a misspelt key would leave an error on the signal.
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Conversion(_Strict):
+    """Of the log's numbers, as in `signals`."""
+
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+    invert: StrictBool = False
+
+    @property
+    def words(self) -> str:
+        """As a configuration has it."""
+        return f"{{scale: {self.scale:g}, offset: {self.offset:g}, invert: {self.invert}}}".lower()
+
+
+class SignalCorrection(_Strict):
+    """What one signal of a log showed: (1 + scale) truth + bias, late by the delay."""
+
+    of: str = ""
+    """what it is, for the reader"""
+    unit: str
+    """of the log's numbers, and of the bias"""
+    scale: Annotated[Finite, Field(gt=-0.9)] = 0.0
+    bias: Finite = 0.0
+    delay: Annotated[Finite, Field(ge=-_LATEST, le=_LATEST)] = 0.0
+    """s"""
+    conversion: Conversion = Conversion()
+    """by which the log's numbers were read when this was found"""
+
+
+class Corrections(_Strict):
+    """A file of corrections."""
+
+    found_by: str = ""
+    signals: dict[str, SignalCorrection] = {}
+    """by name in the log"""
+    lever_arm: dict[str, Finite] = {}
+    """x_imu, y_imu, z_imu [m]"""
+    not_determined: list[str] = []
+    """errors that the record did not determine, and that are therefore not corrected"""
+
+
+def read_corrections(path: Path, where: str) -> Corrections:
+    """A file of corrections.
+
+    Args:
+        path: of the file.
+        where: what errors begin with.
+
+    Raises:
+        InputError: it cannot be read, or something in it is wrong.
+    """
+    content = read_mapping(path)
+    try:
+        return Corrections.model_validate(content)
+    except pydantic.ValidationError as e:
+        error = e.errors()[0]
+        place = ".".join(str(part) for part in error["loc"])
+        got = "" if error["type"] == "missing" else f", got {error['input']!r:.60}"
+        message = str(error["msg"])
+        message = message[0].lower() + message[1:]
+        raise InputError(f"{where}: {path}: {place}: {message}{got}") from None
+
+
+class Logged(NamedTuple):
+    """A signal of the model, and which of the log it is."""
+
+    role: str
+    """inputs or outputs"""
+    name: str
+    """the model's"""
+    signal: Signal
+
+
+def logged_signals(flight: Flight) -> Iterator[Logged]:
+    """The signals that a flight has from its logs, inputs first.
+
+    Args:
+        flight: as read; one that a script made has none.
+    """
+    if flight.source is None:
+        return
+    for role, signals in (("inputs", flight.source.inputs), ("outputs", flight.source.outputs)):
+        for name, signal in signals.items():
+            if signal.constant is None:  # a constant is stated, and no sensor showed it
+                yield Logged(role, name, signal)
+
+
+def conversion_of(signal: Signal) -> Conversion:
+    """How the log's numbers were read."""
+    return Conversion(scale=signal.scale, offset=signal.offset, invert=signal.invert)
+
+
+def with_corrections(model: Model, flight: Flight, corrections: Corrections, where: str) -> Flight:
+    """The flight without the errors of its sensors; what was done stands in its notes.
+
+    Args:
+        model: of the configuration.
+        flight: as read.
+        corrections: what was found.
+        where: what errors begin with.
+
+    Raises:
+        InputError: none of its signals is corrected, or a unit is not that of the correction.
+    """
+    samples = {"inputs": dict(flight.inputs), "outputs": dict(flight.outputs)}
+    notes = []
+    for each in logged_signals(flight):
+        found = corrections.signals.get(each.signal.name)
+        if found is None:
+            continue
+        factor = _factor(each, found, where)
+        x = samples[each.role][each.name]
+        x = (x - found.bias * factor) / (1.0 + found.scale)
+        samples[each.role][each.name] = _earlier(x, found.delay / flight.dt, each.role)
+        notes.append(
+            f"{each.name}: corrected by scale {found.scale:+.3g}, bias {found.bias:.3g} "
+            f"{found.unit}, delay {found.delay:.3g} s"
+        )
+    if not notes:
+        raise InputError(
+            f"{where}.corrections: expected a signal of this flight, got corrections of "
+            f"{', '.join(corrections.signals) or 'none'}"
+        )
+    known, words = _lever_arm(model, flight, corrections)
+    notes += words
+    if corrections.not_determined:
+        notes.append(f"not corrected, since undetermined: {', '.join(corrections.not_determined)}")
+    flight = dataclasses.replace(flight, **samples, known={**flight.known, **known})
+    if flight.source is None:
+        return flight
+    source = dataclasses.replace(flight.source, notes=(*flight.source.notes, *notes))
+    return dataclasses.replace(flight, source=source)
+
+
+def _factor(each: Logged, found: SignalCorrection, where: str) -> float:
+    """From the stated unit to SI."""
+    signal = each.signal
+    place = f"{where}.corrections: {signal.name}"
+    try:
+        stated, of_correction = (units.factor(u, signal.si) for u in (signal.unit, found.unit))
+    except ValueError as e:
+        raise InputError(f"{place}: {e}") from e
+    # Read as degrees there and as radians here, one of the two fits was of other numbers.
+    if not np.isclose(stated, of_correction, rtol=1e-9):
+        raise InputError(
+            f"{place}: expected the unit that it was corrected in, {found.unit}, got {signal.unit}"
+        )
+    # With another sign or zero the errors would be added and not taken off.
+    here, there = conversion_of(signal), found.conversion
+    if here != there:
+        raise InputError(
+            f"{place}: expected the conversion that it was corrected with, {there.words}, got "
+            f"{here.words}"
+        )
+    return stated
+
+
+def _earlier(x: np.ndarray, samples: float, role: str) -> np.ndarray:
+    """A signal (N,) that was logged late by so many samples, at its own time."""
+    if not samples:
+        return x
+    n = np.arange(x.size)
+    # A sample beside a gap is in between what is there and what is not: NaN.
+    moved = np.interp(n + samples, n, x)
+    moved[(n + samples > x.size - 1) | (n + samples < 0)] = np.nan
+    if role == "outputs":
+        return moved
+    # An input acts all the time: at the ends it stays.
+    return np.interp(n + samples, n, x)
+
+
+def _lever_arm(
+    model: Model, flight: Flight, corrections: Corrections
+) -> tuple[dict[str, float], list[str]]:
+    """What a model gets to know of its accelerometers' place, and a note of it."""
+    arm = corrections.lever_arm
+    if not arm:
+        return {}, []
+    words = ", ".join(f"{n} {v:.3g} m" for n, v in arm.items())
+    if not set(arm) <= set(naming.names(model.Params)):
+        return {}, [f"lever arm not used, model {model.name} has none: {words}"]
+    # What the configuration says of this flight goes before.
+    new = {n: v for n, v in arm.items() if n not in flight.known}
+    return new, [f"lever arm of the accelerometer: {words}"]

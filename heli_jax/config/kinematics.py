@@ -1,0 +1,257 @@
+"""What a configuration of `model: kinematics` means where it leaves things out."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.kinematics import (
+    ANGLES,
+    BODY,
+    FORCES,
+    GROUND,
+    POSITION,
+    RATES,
+    STEEPEST,
+    is_kinematic,
+    kinematics,
+)
+from heli_jax.dynamics.model import Model
+from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight, Signal
+from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.free import Free, Prior
+from heli_jax.naming import Record
+
+NAME = "kinematics"
+
+SIZES = {
+    **{f"b_{n}": 0.2 for n in RATES},
+    **{f"lambda_{n}": 0.2 for n in (*RATES, *FORCES)},
+    **{f"b_{n}": 2.0 for n in FORCES},
+    **{f"{axis}_imu": 0.5 for axis in "xyz"},
+    "delay_gyro": 0.1,
+    "delay_accel": 0.1,
+    "wind_n": 10.0,
+    "wind_e": 10.0,
+    "wind_d": 3.0,
+}
+"""how large an error may well be, SI: the sd of its prior, and the unit of the search. A record
+that says no more than this does not determine the error"""
+
+NOISES = {"noise_gyro": RATES, "noise_accel": FORCES}
+"""of what is integrated, by the model's parameter"""
+
+
+def errors_of(model: Model, outputs: Iterable[str]) -> dict[str, Free]:
+    """The errors that a log's signals allow to be free, each from zero with a prior of its size.
+
+    Args:
+        model: of `heli_jax.dynamics.kinematics`.
+        outputs: those that are measured.
+    """
+    measured = set(outputs)
+    # An airspeed alone is the only velocity there is: a steady wind is then no part of the motion.
+    windy = "V" in measured and bool(measured & {*GROUND, *POSITION})
+    known = set(naming.names(model.Params))
+    return {
+        n: Free(0.0, prior=Prior(0.0, size))
+        for n, size in SIZES.items()
+        if n in known and (windy or not n.startswith("wind_"))
+    }
+
+
+def completed(content: dict[str, Any], where: str) -> dict[str, Any]:
+    """A configuration's content with what `model: kinematics` leaves out filled in: the model that
+    its signals allow, all errors free, no bias beside them.
+
+    Args:
+        content: as read, not validated.
+        where: the file, for errors.
+
+    Raises:
+        InputError: accelerometers without a velocity to compare them with, or the reverse.
+    """
+    if content.get("model") != NAME:
+        return content
+    inputs, outputs = (_names(content, role) for role in ("inputs", "outputs"))
+    try:
+        model = kinematics(inputs, outputs)
+    except ValueError as e:
+        raise InputError(f"{where}: flights: {e}") from e
+    fit = content.get("fit") or {}
+    if not isinstance(fit, dict) or not isinstance(fit.get("nuisance", {}), dict):
+        return content  # the validation says what is wrong with it
+    free = {
+        n: {"start": f.start, "prior": {"mean": f.prior.mean, "sd": f.prior.sd}}
+        for n, f in errors_of(model, outputs).items()
+        # Who gives a value knows the error: it is not searched for.
+        if f.prior is not None and n not in _given(content)
+    }
+    # A bias of the outputs or an offset of the inputs would be a second name of the same error, and
+    # one delay among so many needs no search over its valleys.
+    nuisance = {"bias": False, "input_offset": False, **fit.get("nuisance", {})}
+    # Gyros are inputs, and their noise is integrated: a filter knows that, a simulation does not.
+    fit = {"method": "filter-error", "free": free, "starts": 1, **fit, "nuisance": nuisance}
+    # No baseline: recursive least squares takes one output of one stick.
+    return {"vehicle": {}, "rls": None, **content, "model": model.name, "fit": fit}
+
+
+def between_samples(model: Model, inputs: Mapping[str, Signal]) -> dict[str, Signal]:
+    """The inputs of a kinematic model, moving between samples where the configuration says nothing
+    of it: a rate is measured, nobody commands it in steps.
+
+    Args:
+        model: any; the inputs of another than a kinematic one stay as they are.
+        inputs: by the model's name.
+    """
+    if not is_kinematic(model):
+        return dict(inputs)
+    return {
+        n: dataclasses.replace(u, hold="linear") if u.hold == "auto" else u
+        for n, u in inputs.items()
+    }
+
+
+def _names(content: dict[str, Any], role: str) -> set[str]:
+    """The inputs or outputs that any flight names; none where the configuration is malformed, which
+    its validation says."""
+    found: set[str] = set()
+    flights = content.get("flights")
+    for flight in flights if isinstance(flights, list) else []:
+        also = flight.get("also") if isinstance(flight, dict) else None
+        for log in (flight, *(also if isinstance(also, list) else ())):
+            signals = log.get("signals") if isinstance(log, dict) else None
+            found |= _named(signals, role) if isinstance(signals, dict) else set()
+    return found
+
+
+def _named(signals: dict[str, Any], role: str) -> set[str]:
+    """Of one log; a preset supplies all inputs that are needed for the outputs asked of it."""
+    named, asked = signals.get(role), signals.get("preset_outputs")
+    found = {str(n) for n in named} if isinstance(named, dict) else set()
+    asked = {str(n) for n in asked} if isinstance(asked, list) else set()
+    if role == "outputs":
+        return found | asked
+    return found | ({*FORCES} if asked & {*GROUND, *BODY, *POSITION, "V"} else set())
+
+
+def _given(content: dict[str, Any]) -> set[str]:
+    vehicle = content.get("vehicle")
+    return {str(n) for n in vehicle} if isinstance(vehicle, dict) else set()
+
+
+def prepared(model: Model, flight: Flight, where: str) -> Flight:
+    """A flight for a kinematic model: roll and yaw without jumps of a turn.
+
+    Args:
+        model: any; the flight of another than a kinematic one stays as it is.
+        flight: as read.
+        where: what an error begins with.
+
+    Raises:
+        InputError: the machine points so steeply up or down that its angles mean nothing.
+    """
+    if not is_kinematic(model):
+        return flight
+    theta = flight.outputs.get("theta")
+    if theta is not None and np.nanmax(np.abs(theta), initial=0.0) > STEEPEST:
+        raise InputError(
+            f"{where}: theta reaches {np.degrees(np.nanmax(np.abs(theta))):.0f} deg, expected at "
+            f"most {np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: choose "
+            "another window"
+        )
+    # The kinematics turn on where a log begins again at -180 deg.
+    turned = {n: _unwrapped(y) for n, y in flight.outputs.items() if n in ANGLES}
+    if all(np.array_equal(y, flight.outputs[n], equal_nan=True) for n, y in turned.items()):
+        return flight
+    return dataclasses.replace(flight, outputs={**flight.outputs, **turned})
+
+
+def _unwrapped(angle: np.ndarray) -> np.ndarray:
+    """Without jumps of a turn (N,) [rad]; samples that are missing stay so."""
+    out, seen = angle.copy(), np.isfinite(angle)
+    out[seen] = np.unwrap(angle[seen])
+    return out
+
+
+def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
+    """How far the noise of gyros and accelerometers lets angles and velocities drift in a second,
+    by the model's parameter, from the third differences of what they logged.
+
+    Args:
+        model: of `heli_jax.dynamics.kinematics`.
+        flights: read.
+    """
+    known, found = naming.names(model.Params), {}
+    for parameter, names in NOISES.items():
+        if parameter in known:
+            # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
+            walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
+            # One intensity for three axes, as the model has it: their rms.
+            found[parameter] = float(np.sqrt(np.mean(np.square(walks))))
+    return found
+
+
+_FAINTEST = 1e-6
+"""of a drift in a second, SI: below what any log shows, and above zero, which has no logarithm"""
+
+
+def free_noise(model: Model, params: Record, flights: Sequence[Flight]) -> dict[str, Free]:
+    """The noise of a kinematic model's inputs as parameters to be estimated, where nobody stated
+    it: third differences are where the search begins, but a filter before the log takes all noise
+    out of them, and none of what gyros and angles differ by otherwise is in them.
+
+    Args:
+        model: any; none of another than a kinematic one.
+        params: its Params.
+        flights: read.
+    """
+    if not is_kinematic(model):
+        return {}
+    # Zero is the default and no statement: no gyro is without noise.
+    missing = {n: v for n, v in noise_of(model, flights).items() if not getattr(params, n) > 0}
+    return {n: Free(max(v, _FAINTEST), sign="keep") for n, v in missing.items()}
+
+
+def sharpened(model: Model, flight: Flight) -> Flight:
+    r"""The flight with rates and forces whose straight lines between samples have the area of the
+    motion.
+
+    Lines cut corners: of a motion at omega they keep 1 - (omega dt)^2 / 12 of the area, which a fit
+    would take for the sensor's scale. Each sample less a twelfth of its second difference brings
+    it back, but for (omega dt)^4 / 240; of white noise in the samples it changes the drift by what
+    the first and the last add (Euler and Maclaurin's correction of the trapezoidal rule).
+
+    Args:
+        model: any; the flight of another than a kinematic one stays as it is.
+        flight: its inputs are changed that are linear between samples.
+    """
+    if not is_kinematic(model):
+        return flight
+    inputs = {
+        n: u - _second_difference(u) / 12.0 if flight.hold.get(n) == "linear" else u
+        for n, u in flight.inputs.items()
+    }
+    return dataclasses.replace(flight, inputs=inputs)
+
+
+def _second_difference(u: np.ndarray) -> np.ndarray:
+    """(N,), at the ends that of their neighbours."""
+    return np.pad(np.diff(u, 2), 1, mode="edge") if u.size > 2 else np.zeros_like(u)
+
+
+_STEP = 0.02
+"""s; within one of this length a machine turns too little for a step's error to count"""
+
+
+def substeps_of(flights: Sequence[Flight]) -> int:
+    """Steps in a sample for a kinematic model, which has no fast dynamics of its own.
+
+    Args:
+        flights: read.
+    """
+    return max(1, *(math.ceil(f.dt / _STEP - 1e-9) for f in flights))

@@ -1,0 +1,217 @@
+"""heli-jax compatibility: errors found, written, and taken off the signals again."""
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from heli_jax import compatibility, config, run_directory, workflow
+from heli_jax.cli import main
+from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate
+
+RATE, DURATION = 25.0, 16.0
+TREX = Path(__file__).parents[2] / "shared" / "data" / "trex550" / "Pitchtest.csv"
+BIAS, SCALE, LATE = 1.5, 0.08, 0.04
+"""of the roll gyro [deg/s], of its scale, and of the angles [s]"""
+
+
+@pytest.fixture(scope="module")
+def true():
+    """Time, rates [rad/s] and angles [rad] of a motion in closed form, the angles late."""
+    path = Path(__file__).parents[1] / "experiments" / "data_compatibility.py"
+    motion = runpy.run_path(str(path))["Motion"](np.random.default_rng(5))
+    t = np.arange(round(DURATION * RATE)) / RATE
+    return t, motion.omega(t), motion.angles(t - LATE)
+
+
+@pytest.fixture
+def folder(tmp_path, true):
+    """A log with a wrong roll gyro, and its configuration."""
+    t, omega, angles = true
+    rng = np.random.default_rng(1)
+    rates = np.degrees(omega + 0.004 * rng.standard_normal(omega.shape))
+    rates[:, 0] = (1 + SCALE) * rates[:, 0] + BIAS
+    # Yaw as compasses show it, from -180 to 180 degrees.
+    shown = np.degrees(angles + np.array([0, 0, 3.0]) + 0.004 * rng.standard_normal(angles.shape))
+    shown[:, 2] = (shown[:, 2] + 180.0) % 360.0 - 180.0
+    columns = np.column_stack([t, rates, shown])
+    np.savetxt(
+        tmp_path / "log.csv", columns, delimiter=",", comments="",
+        header="t,gx,gy,gz,roll,pitch,yaw", fmt="%.9g",
+    )  # fmt: skip
+    return tmp_path
+
+
+def configured(folder, name="sensors.yaml", **more):
+    def named(pairs):
+        return {n: {"signal": s, "unit": u} for n, s, u in pairs}
+
+    signals = {
+        "time": {"signal": "t"},
+        "inputs": named([("p", "gx", "deg/s"), ("q", "gy", "deg/s"), ("r", "gz", "deg/s")]),
+        "outputs": named(
+            [("phi", "roll", "deg"), ("theta", "pitch", "deg"), ("psi", "yaw", "deg")]
+        ),
+    }
+    content = {
+        "model": "kinematics",
+        "flights": [{"log": "log.csv", "signals": signals} | more.pop("flight", {})],
+    } | more
+    path = folder / name
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+def notes_of(flight):
+    assert flight.source is not None
+    return flight.source.notes
+
+
+@pytest.mark.slow
+def test_errors_are_found(folder, capsys, monkeypatch):
+    path = configured(folder)
+    out = folder / "out"
+    out.mkdir()
+    # The page takes longer than the fit, and is that of any fit.
+    monkeypatch.setattr(run_directory, "require_free", lambda place: None)
+    monkeypatch.setattr(workflow, "write_report", lambda run, place: run)
+    assert main(["compatibility", str(path), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("Compatible once ")
+    assert "scale, gyro roll" in said
+    found = yaml.safe_load((out / "compatibility.yaml").read_text())
+    roll = found["signals"]["gx"]
+    assert roll["of"] == "p"
+    assert roll["bias"] == pytest.approx(BIAS, abs=0.15)
+    assert roll["scale"] == pytest.approx(SCALE, abs=0.02)
+    # The angles are the late ones.
+    assert found["signals"]["roll"]["delay"] == pytest.approx(LATE, abs=0.01)
+    assert not roll["delay"]
+
+
+def test_errors_are_taken_off(folder, true):
+    late = {"unit": "deg", "delay": LATE}
+    roll = {"of": "p", "unit": "deg/s", "scale": SCALE, "bias": BIAS}
+    content = {"signals": {"gx": roll, "roll": late, "pitch": late, "yaw": late}}
+    (folder / "found.yaml").write_text(yaml.safe_dump(content))
+    applied = configured(folder, "next.yaml", flight={"corrections": "found.yaml"})
+    [flight] = config.read_flights(config.load(applied))
+    t, omega, angles = true
+    np.testing.assert_allclose(flight.inputs["p"], omega[:, 0], atol=0.02)
+    # Angles at their own times again; the last has none.
+    n = round(LATE * RATE)
+    error = flight.outputs["phi"][:-2] - angles[n : n + t.size - 2, 0]
+    assert np.std(error) < 0.008
+    assert np.isnan(flight.outputs["phi"][-1])
+    assert any(
+        note.startswith("p: corrected by scale +0.08, bias 1.5 deg/s") for note in notes_of(flight)
+    )
+
+
+def test_a_model_of_the_machine_is_refused(folder, capsys):
+    path = configured(folder, model={"linear": "roll-flybarless"})
+    assert main(["compatibility", str(path), "--out", str(folder / "out")]) == 2
+    assert not (folder / "out").exists()
+
+
+def fitted(folder, estimates, shares, status="converged") -> Any:
+    """What a fit would have said, by error (value, reach of its interval), by output R2."""
+    experiment = config.load(configured(folder))
+    y = np.sin(np.arange(100.0))
+    left = {n: y - np.sqrt(1 - r) * (y - y.mean()) for n, r in shares.items()}
+    signals = SimpleNamespace(measured=dict.fromkeys(shares, y), simulated=left, hold_out=False)
+    fit = SimpleNamespace(
+        estimates={
+            n: Estimate(v, 0.5 * w, v - w, v + w, "1", 0.0, 0.9 if n == "b_r" else 0.0, False)
+            for n, (v, w) in estimates.items()
+        },
+        verdict=SimpleNamespace(resting=()),
+        status=status,
+        signals=[signals],
+        notes=("of the fit",),
+    )
+    problem = SimpleNamespace(flights=config.read_flights(experiment))
+    return SimpleNamespace(config=experiment, fit=fit, problem=problem)
+
+
+def test_a_fit_is_put_in_words(folder):
+    found = {"lambda_p": (0.23, 0.004), "b_p": (0.001, 0.002), "b_r": (0.1, 0.01),
+             "noise_gyro": (0.01, 0.001), "delay_gyro": (0.04, 0.01)}  # fmt: skip
+    judged = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.95}))
+    assert judged.compatible
+    assert judged.verdict == (
+        "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more."
+    )
+    assert judged.doubts[0].startswith("lambda_p +23%: more than a sensor's own error.")
+    assert judged.doubts[1] == "of the fit"
+    rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
+    assert rows == [
+        ("lambda_p", "0.2300 +- 0.0040", "yes"), ("b_p", "0.0010 +- 0.0020", "no"),
+        ("b_r", "", "unknown"), ("delay_gyro", "0.040 +- 0.010", "yes"),
+    ]  # fmt: skip
+    assert judged.corrections["signals"]["roll"]["delay"] == 0.04
+    assert judged.corrections["not_determined"] == ["b_r"]
+    bad = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.2}))
+    assert not bad.compatible
+    assert "bring psi (R2 0.200) to R2 0.9" in bad.verdict
+    lost = compatibility.judged(fitted(folder, found, {"phi": 0.99}, "not-converged"))
+    assert not lost.compatible
+    assert not lost.corrections["signals"]
+
+
+CORRECTION = {"unit": "deg/s", "bias": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"signals": {"gx": {**CORRECTION, "bais": 1}}}, "signals.gx.bais: extra inputs are not"),
+        ({"signals": {"gx": {"bias": 1.5}}}, "signals.gx.unit: field required"),
+        ({"signals": {"gx": {**CORRECTION, "unit": "rad/s"}}}, "gx: expected the unit that it was"),
+        ({"signals": {"gx": {**CORRECTION, "unit": "m"}}}, "corrections: gx: "),
+        ({"signals": {"gx": {**CORRECTION, "scale": -1}}}, "signals.gx.scale: input should be"),
+        ({"signals": {"gx": {**CORRECTION, "conversion": {"invert": True}}}}, "invert: true}, got"),
+        ({"signals": {"other": CORRECTION}}, "expected a signal of this flight, got .* other"),
+        ({}, "got corrections of none"),
+    ],
+)
+def test_wrong_corrections_are_refused_in_a_sentence(folder, content, words):
+    (folder / "c.yaml").write_text(yaml.safe_dump(content))
+    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
+    with pytest.raises(InputError, match=words):
+        config.read_flights(experiment)
+
+
+def test_a_lever_arm_goes_to_a_model_that_has_one(folder):
+    content = {
+        "signals": {"gx": CORRECTION},
+        "lever_arm": {"x_imu": 0.2},
+        "not_determined": ["b_r"],
+    }
+    (folder / "c.yaml").write_text(yaml.safe_dump(content))
+    experiment = config.load(configured(folder, flight={"corrections": "c.yaml"}))
+    [flight] = config.read_flights(experiment)
+    assert flight.known == {}
+    said = notes_of(flight)
+    assert "lever arm not used, model kinematics-attitude has none: x_imu 0.2 m" in said
+    assert "not corrected, since undetermined: b_r" in said
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TREX.exists(), reason="needs shared/data/trex550/Pitchtest.csv")
+def test_a_real_log_is_judged(folder):
+    path = configured(folder, flight={"log": str(TREX), "rate": 25})
+    content = yaml.safe_load(path.read_text())
+    for role in ("inputs", "outputs"):
+        unit = {"inputs": "rad/s", "outputs": "rad"}[role]
+        named = content["flights"][0]["signals"][role]
+        content["flights"][0]["signals"][role] = {n: {"signal": n, "unit": unit} for n in named}
+    path.write_text(yaml.safe_dump(content))
+    out = folder / "out"
+    assert main(["compatibility", str(path), "--out", str(out)]) in (0, 4)
+    assert {"report.html", "compatibility.yaml", "config.yaml"} <= {p.name for p in out.iterdir()}
