@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from heli_jax import naming, units
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.measurement import filter_cautions
 from heli_jax.config.preset_signals import Resolved, resolve
 from heli_jax.config.schema import (
@@ -68,13 +69,14 @@ def _read_flight(
     # Of all logs together: what one lacks may stand in another.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
+    instruments = instrument_signals(model, f.signals, f"{where}.signals")
     try:
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         flights = (read_parts if f.gaps == "split" else _read_one)(
             path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
-            inputs={n: inputs[n] for n in named.inputs},
+            inputs={n: inputs[n] for n in named.inputs} | instruments,
             outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
             window=None if f.window == "auto" else f.window,
@@ -92,7 +94,8 @@ def _read_flight(
     notes = (*_unstated_units(model, everything), *named.notes)
     flights = tuple(
         dataclasses.replace(
-            with_notches(flight, f.notch or (), f"{where}.notch"), choose_windows=f.window == "auto"
+            with_notches(with_instruments(flight, instruments), f.notch or (), f"{where}.notch"),
+            choose_windows=f.window == "auto",
         )
         for flight in flights
     )

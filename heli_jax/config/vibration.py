@@ -47,16 +47,18 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
                 f"{where}: output {name} has missing samples, which a notch would spread; expected "
                 "a window without them, or no notch"
             )
-    inputs, outputs = (
+    inputs, outputs, instruments = (
         {n: notched(x, flight.dt, frequencies, _Q) for n, x in signals.items()}
-        for signals in (flight.inputs, flight.outputs)
+        for signals in (flight.inputs, flight.outputs, flight.instruments)
     )
     source = flight.source
     if source is not None:
         listed = ", ".join(f"{hz:g}" for hz in frequencies)
         note = f"inputs and outputs notched at {listed} Hz (Q {_Q:g})"
         source = dataclasses.replace(source, notes=(*source.notes, note))
-    return dataclasses.replace(flight, inputs=inputs, outputs=outputs, source=source)
+    return dataclasses.replace(
+        flight, inputs=inputs, outputs=outputs, instruments=instruments, source=source
+    )
 
 
 def vibration_notes(

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 
-from heli_jax.analysis.transfer_fit import Measured, fit_transfer, mismatch
+from heli_jax.analysis.transfer_fit import Hold, Measured, fit_transfer, mismatch
 
 OMEGA = np.geomspace(0.5, 30.0, 60)
 
@@ -47,6 +48,21 @@ def test_intervals_cover_the_truth_and_chi_squared_is_near_one():
     # An upper limit too: chi-squared above one widens the intervals.
     assert 0.92 < np.mean(inside) < 0.985
     assert np.mean(chi) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("hold", "method"), [("zero-order", "zoh"), ("linear", "foh")])
+def test_of_samples_the_continuous_machine_comes_back(hold, method):
+    """SciPy's discrete equivalents, up to 0.8 of the Nyquist frequency, where images count."""
+    dt = 0.05
+    b, a, _ = scipy.signal.cont2discrete(([3.0, 40.0], [1.0, 9.0, 64.0]), dt, method=method)
+    omega = np.linspace(1.0, 0.8 * np.pi / dt, 80)
+    H = scipy.signal.freqz(b.ravel(), a, omega * dt)[1]
+    m = Measured(omega, H, 0.01 * np.abs(H), 1e3, np.ones(80), Hold(hold, dt))
+    fitted = fit_transfer(m, 1, 2)
+    found = [c.value for c in (*fitted.numerator, *fitted.denominator)]
+    assert found == pytest.approx([3.0, 40.0, 9.0, 64.0], rel=4e-3)
+    assert fitted.delay is not None
+    assert abs(fitted.delay.value) < 1e-4
 
 
 def test_too_low_an_order_is_seen_in_chi_squared():
