@@ -88,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
     windows = command("windows", _windows, "which parts of a log say most, before any fit")
     cli_options.add_windows_options(windows)
     _add_config(windows)
+    frf = command("frf", _frf, "frequency responses of a log, with coherence and intervals")
+    cli_options.add_frf_options(frf)
+    _add_config(frf)
     simulate = command("simulate", _simulate, "simulate the configuration's run, or its flights")
     _add_config(simulate)
     cli_options.add_simulate_options(simulate)
@@ -241,6 +244,25 @@ def _compatibility(options: argparse.Namespace) -> int:
 
     compatible = output.run_compatibility(options.config, options.out, options.set, _say)
     return DONE if compatible else NOT_CONVERGED
+
+
+def _frf(options: argparse.Namespace) -> int:
+    config = Path(options.config)
+    out = Path(options.out) if options.out else run_directory.default_directory(config)
+    run_directory.require_free(out)
+    _prepare_jax()
+    from heli_jax import log_responses, workflow
+    from heli_jax.report.responses import write_responses
+
+    experiment = workflow.load_config(config, options.set)
+    found = log_responses.responses_of_log(experiment, options.log, progress=_say)
+    with run_directory.whole(out) as temporary:
+        write_responses(temporary, found, log_responses.units_of(experiment), config.stem)
+    for note in found.notes:
+        _say(note)
+    log_responses.print_responses(found)
+    _say(f"wrote {out / 'responses.html'}")
+    return DONE
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -75,6 +75,14 @@ def selection(options: argparse.Namespace) -> "Selection":
     )
 
 
+def add_frf_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax frf`."""
+    command.add_argument(
+        "log", nargs="?", metavar="LOG", help="read as the configuration's first (default: its own)"
+    )
+    command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+
+
 def count(text: str) -> int:
     """An option's value that is a number from 1."""
     if not text.isdigit() or int(text) < 1:

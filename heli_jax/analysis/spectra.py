@@ -11,6 +11,8 @@ from jaxtyping import Complex, Float
 
 _ROUNDING = 1e-20
 """of a signal's power: less is what rounding leaves where others explain all of it"""
+OWN = 10.0
+"""times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
 
 
 class Spectra(NamedTuple):
@@ -113,3 +115,23 @@ def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:
     # The pseudoinverse: two sticks that move as one have no unique gains, but a projection.
     gains = np.linalg.pinv(others) @ x[:, :, None]
     return x - (others @ gains)[:, :, 0]
+
+
+def leakage(S: np.ndarray) -> np.ndarray:
+    """What the Hann window's sidelobes bring to each frequency from all others, (k,).
+
+    Args:
+        S: spectral density (k,) of segments in a Hann window.
+
+    Source: Harris (1978), Proceedings of the IEEE 66(1): the window's transform m lines away is at
+    most 1/(pi m (m^2 - 1)) of its height.
+    """
+    m = np.arange(S.size, dtype=float)
+    sidelobes = np.zeros(S.size)
+    # Up to two lines away is the main lobe: there a signal is itself.
+    far = m > 2
+    # Its square, and of that the mean of a squared sine: where between two lines a frequency lies
+    # is as good as random.
+    sidelobes[far] = 0.5 / (np.pi * m[far] * (m[far] ** 2 - 1.0)) ** 2
+    both = np.concatenate([sidelobes[:0:-1], sidelobes])
+    return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]

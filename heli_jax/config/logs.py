@@ -7,6 +7,7 @@ from typing import Any, Literal
 from heli_jax import naming, units
 from heli_jax.config.corrections import read_corrections, with_corrections
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import filter_cautions
 from heli_jax.config.preset_signals import Resolved, resolve
@@ -74,13 +75,14 @@ def _read_flight(
     # Of all logs together: what one lacks may stand in another.
     everything = _with_also(named, f, where)
     inputs, outputs = _of_model(model, everything, f"{where}.signals", gain)
+    instruments = instrument_signals(model, f.signals, f"{where}.signals")
     try:
         # A flight as it is unless asked otherwise: parts have initial states of their own.
         flights = (read_parts if f.gaps == "split" else _read_one)(
             path if log is None else log,
             # None is passed on: whether a log needs the name of its clock is known once it is open.
             time=None if time is None else Signal(time.signal, time.unit, "s"),
-            inputs={n: inputs[n] for n in named.inputs},
+            inputs={n: inputs[n] for n in named.inputs} | instruments,
             outputs={n: outputs[n] for n in named.outputs},
             rate=f.rate,
             window=None if f.window == "auto" else f.window,
@@ -96,6 +98,7 @@ def _read_flight(
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
     notes = (*_unstated_units(model, everything), *named.notes)
+    flights = tuple(with_instruments(flight, instruments) for flight in flights)
     first, *others = _treated(experiment, flights, f, where)
     cautions = filter_cautions(first.source, everything.outputs)
     cautions = (*cautions, *vibration_notes(experiment, first, f, where))

@@ -133,6 +133,11 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
+    if config.intervals.bootstrap and config.method == "frequency-error":
+        raise InputError(
+            f"{path}: fit.intervals.bootstrap: not available with method frequency-error, which "
+            "estimates the noise's spectrum; expected another method, or none"
+        )
     if config.intervals.bootstrap and config.nuisance.time_shift:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with nuisance.time_shift, expected "

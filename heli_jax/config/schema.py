@@ -7,6 +7,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 
 from heli_jax.config.design_section import DesignConfig, ReduceConfig, TrajectoriesConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
+from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
 from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
 from heli_jax.config.simulate_section import SimulateConfig, StartConfig
@@ -82,6 +83,9 @@ class SignalsConfig(PresetConfig):
     # here.
     inputs: dict[str, InputConfig] = Field(default={})
     outputs: dict[str, OutputConfig] = Field(default={})
+    instruments: dict[str, InputConfig] = Field(default={})
+    """by input, an excitation that was added to it and that no feedback reaches
+    (docs/frequency.md)"""
 
 
 class AlignConfig(_Strict):
@@ -101,6 +105,8 @@ class AlsoSignalsConfig(SignalsConfig):
     def _by_name(self) -> "AlsoSignalsConfig":
         if self.preset is not None or self.ccpm is not None:
             raise ValueError("expected inputs and outputs by name in a further log, got a preset")
+        if self.instruments:
+            raise ValueError("instruments: expected them among the flight's own signals")
         return self
 
 
@@ -312,5 +318,7 @@ class Config(_Strict):
     # On unless switched off by `rls: null`: the baseline of the paper costs little.
     rls: RLSConfig | None = RLSConfig()
     disturbance: DisturbanceConfig | None = None
+    frequency: FrequencyConfig | None = None
+    """of `heli-jax frf` (docs/frequency.md)"""
     simulate: SimulateConfig | None = None
     sweep: SweepConfig | None = None

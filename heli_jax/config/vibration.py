@@ -45,9 +45,9 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
                 f"{where}: expected less than half the rate of {1 / flight.dt:.4g} Hz, got "
                 f"{hz:g} Hz"
             )
-    inputs, outputs = (
+    inputs, outputs, instruments = (
         {n: notched(x, flight.dt, frequencies, _Q) for n, x in signals.items()}
-        for signals in (flight.inputs, flight.outputs)
+        for signals in (flight.inputs, flight.outputs, flight.instruments)
     )
     lost = _lost(flight, outputs, settling(frequencies, _Q), where)
     source = flight.source
@@ -55,7 +55,9 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
         listed = ", ".join(f"{hz:g}" for hz in frequencies)
         note = f"inputs and outputs notched at {listed} Hz (Q {_Q:g})"
         source = dataclasses.replace(source, notes=(*source.notes, note, *lost))
-    return dataclasses.replace(flight, inputs=inputs, outputs=outputs, source=source)
+    return dataclasses.replace(
+        flight, inputs=inputs, outputs=outputs, instruments=instruments, source=source
+    )
 
 
 def _lost(

@@ -29,6 +29,7 @@ def part(flight: Flight, first: int, last: int, name: str = "", note: str = "") 
         flight,
         inputs={n: u[first:last] for n, u in flight.inputs.items()},
         outputs={n: y[first:last] for n, y in flight.outputs.items()},
+        instruments={n: r[first:last] for n, r in flight.instruments.items()},
         t0=flight.t0 + first * flight.dt,
         name=name or flight.name,
         source=source,

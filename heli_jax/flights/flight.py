@@ -110,6 +110,8 @@ class Flight:
             sample), as all do that are not named, or "linear".
         hold_reason: by input, why the reader of a log took that hold, where the log decided.
         choose_windows: whether its most telling windows are to be fitted in its place.
+        instruments: by input, samples (N,) of an excitation that was added to it and that no
+            feedback reaches, such as a sweep of the autopilot, SI.
 
     Raises:
         ValueError: `dt` is not positive; there is no signal; a signal is not of shape (N,) or
@@ -129,6 +131,7 @@ class Flight:
     hold: dict[str, str] = field(default_factory=dict)
     hold_reason: dict[str, str] = field(default_factory=dict)
     choose_windows: bool = False
+    instruments: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dt) and self.dt > 0):
@@ -136,11 +139,12 @@ class Flight:
         if not math.isfinite(self.t0):
             raise ValueError(f"t0 is {self.t0}, expected a finite number of seconds")
         # By object.__setattr__, since the class is frozen: what was fitted must not change later.
-        for kind in ("inputs", "outputs"):
+        for kind in ("inputs", "outputs", "instruments"):
             gaps = kind == "outputs"
             signals = {name: _samples(name, x, gaps) for name, x in getattr(self, kind).items()}
             object.__setattr__(self, kind, signals)
         lengths = {name: x.size for name, x in (*self.inputs.items(), *self.outputs.items())}
+        lengths |= {f"instrument of {name}": x.size for name, x in self.instruments.items()}
         if not lengths:
             raise ValueError("a flight needs at least one input or output")
         # One grid for all: the time of a sample is its number times dt, and stands nowhere else.
@@ -152,6 +156,9 @@ class Flight:
         self._check_holds()
 
     def _check_numbers(self) -> None:
+        for name in self.instruments:
+            if name not in self.inputs:
+                raise ValueError(f"an instrument of {name!r}, which is no input of this flight")
         for name, sd in self.sd.items():
             if name not in self.outputs:
                 raise ValueError(f"sd is stated for {name!r}, which is no output of this flight")

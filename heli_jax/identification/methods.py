@@ -25,6 +25,7 @@ _ESTIMATION = "heli_jax.identification.estimation"
 METHODS = {
     "output-error": Method(f"{_ESTIMATION}.output_error:ESTIMATOR", "output error"),
     "filter-error": Method(f"{_ESTIMATION}.filter_error:ESTIMATOR", "filter error"),
+    "frequency-error": Method(f"{_ESTIMATION}.frequency_error:ESTIMATOR", "frequency error"),
 }
 
 

@@ -121,6 +121,9 @@ class Problem:
         for flight in self.flights:
             _check_flight(flight, self)
         _check_model(self)
+        refusal = estimator_of(self.method).refusal(self)
+        if refusal is not None:
+            raise ValueError(f"method {self.method}: {refusal}")
 
     @property
     def noise(self) -> dict[str, Free]:

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
-from heli_jax.analysis.spectra import spectra
+from heli_jax.analysis.spectra import OWN, leakage, spectra
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
@@ -29,8 +29,6 @@ SEGMENTS = 8
 """fewer half-overlapping segments than this make no average"""
 SHORTEST = 64
 """samples of a segment at least: fewer resolve nothing"""
-_OWN = 10.0
-"""times what the window's sidelobes bring, from which on a spectrum is the signal's own"""
 _BELOW = 1.0 - 1e-9
 """a frequency counts as the lowest itself although rounding has it below"""
 _LONGEST = 4096
@@ -284,31 +282,11 @@ def empirical(u: np.ndarray, y: np.ndarray, dt: float, memory: float) -> Empiric
     omega, Suu, Syy, Suy = spectra(u, y, dt, segments.length)
     # Where a signal has no power of its own the quotient is that of two window's sidelobes, which
     # are coherent as well; and of zero frequency the segments' straight lines left nothing.
-    own = (Suu > _OWN * leakage(Suu)) & (Syy > _OWN * leakage(Syy))
+    own = (Suu > OWN * leakage(Suu)) & (Syy > OWN * leakage(Syy))
     useful = (omega > 0) & (omega >= _BELOW * segments.lowest) & own & (Suu > 0) & (Syy > 0)
     omega, Suu, Syy, Suy = omega[useful], Suu[useful], Syy[useful], Suy[useful]
     coherence = np.abs(Suy) ** 2 / (Suu * Syy)
     return Empirical(omega, Suy / Suu, coherence, Suu, segments.count, segments.lowest)
-
-
-def leakage(S: np.ndarray) -> np.ndarray:
-    """What the Hann window's sidelobes bring to each frequency from all others, (k,).
-
-    Args:
-        S: spectral density (k,) of segments in a Hann window.
-
-    Source: Harris (1978), Proceedings of the IEEE 66(1): the window's transform m lines away is at
-    most 1/(pi m (m^2 - 1)) of its height.
-    """
-    m = np.arange(S.size, dtype=float)
-    sidelobes = np.zeros(S.size)
-    # Up to two lines away is the main lobe: there a signal is itself.
-    far = m > 2
-    # Its square, and of that the mean of a squared sine: where between two lines a frequency lies
-    # is as good as random.
-    sidelobes[far] = 0.5 / (np.pi * m[far] * (m[far] ** 2 - 1.0)) ** 2
-    both = np.concatenate([sidelobes[:0:-1], sidelobes])
-    return np.convolve(S, both)[S.size - 1 : 2 * S.size - 1]
 
 
 def phase(H: np.ndarray) -> np.ndarray:

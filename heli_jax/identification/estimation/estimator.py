@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run
 from heli_jax.identification.problem import Problem
@@ -98,6 +99,23 @@ class Estimator(abc.ABC):
         """Outputs whose noise is an unknown factor in z, and whether a common factor of all noise
         is taken out of the likelihood instead."""
         return (), False
+
+    def refusal(self, problem: Problem) -> str | None:
+        """Why the method cannot solve a problem and what can, in words; None where it can.
+
+        Args:
+            problem: its model and flights have been checked by themselves.
+        """
+        return None
+
+    def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """The first guess of the noise as the method needs it.
+
+        Args:
+            noise: standard deviations by flight and output.
+            flights: those fitted.
+        """
+        return noise
 
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level about which the likelihood is laid out in rows.

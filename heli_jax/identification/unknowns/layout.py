@@ -172,7 +172,10 @@ class Noise(NamedTuple):
     """of the measurement noise, by flight and output; `Layout.scaled` ones times their factors"""
     log_variance_ratio: Any
     """filter error: the mean over all measurements of log(innovation variance / sd^2) about which
-    the likelihood is laid out in rows, so that they have variance 1"""
+    the likelihood is laid out in rows, so that they have variance 1; frequency error: likewise the
+    mean over all lines of log det(spectrum)"""
+    whitening: Any = ()
+    """frequency error: by flight (K, p, p) what makes white noise of that at its lines; () else"""
 
 
 class Solution(NamedTuple):

@@ -1,0 +1,300 @@
+"""Frequency responses of flights together: every output to every input that moves."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
+from heli_jax.analysis.spectral import CrossSpectra, Responses, composite, cross_spectra, responses
+from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
+from heli_jax.flights.flight import Flight
+
+_LONGEST = 30.0
+"""window [s] unless one is stated: what rotorcraft responses are usually taken from"""
+_LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
+"""of the windows of a composite, in that one's length"""
+_HIGHEST = 0.4
+"""of the rate: above it an anti-aliasing filter has changed what was logged"""
+
+
+class Wanted(NamedTuple):
+    """A transfer function that is to be fitted to one response."""
+
+    input: str
+    output: str
+    zeros: int
+    poles: int
+    delay: bool = True
+    band: tuple[float, float] | None = None
+    """[Hz]"""
+    coherence: float = 0.6
+    """frequencies of less in the mean over an octave are left out: there feedback and what is not
+    linear have their way"""
+
+
+class Settings(NamedTuple):
+    """Which frequencies, in windows of which length."""
+
+    band: tuple[float, float] | None = None
+    """first and last frequency [Hz]; None: two periods in a window to 0.4 of the rate"""
+    window: float | None = None
+    """length [s]; None: a fifth of the longest flight, 30 s at most"""
+    points: int = 120
+    """frequencies, equally spaced in the logarithm"""
+    transfer_functions: tuple[Wanted, ...] = ()
+
+
+class Pair(NamedTuple):
+    """An output's response to an input; arrays (k,)."""
+
+    H: np.ndarray
+    """in SI units of output over input"""
+    sd: np.ndarray
+    """of its real and of its imaginary part"""
+    coherence: np.ndarray
+    """partial: what the other inputs explain is taken out"""
+    picture: np.ndarray
+    """H of the composite of several windows, for looking; NaN where there is none"""
+
+
+class Output(NamedTuple):
+    """What is known of one output."""
+
+    pairs: dict[str, Pair]
+    """by input"""
+    multiple: np.ndarray
+    """(k,) coherence with all inputs together"""
+    noise: np.ndarray
+    """(k,) density of what they leave [SI^2/Hz]"""
+    averages: float
+    """independent ones"""
+
+
+class FlightResponses(NamedTuple):
+    """All responses of some flights."""
+
+    omega: np.ndarray
+    """(k,) [rad/s]"""
+    outputs: dict[str, Output]
+    instruments: tuple[str, ...]
+    """inputs whose responses are taken by an excitation that was logged"""
+    window: float
+    """[s]"""
+    fits: tuple[tuple[Wanted, TransferFit], ...]
+    """in the order in which they were asked for"""
+    holds: dict[str, Hold]
+    """by input what it does between samples"""
+    notes: tuple[str, ...]
+
+
+def flight_responses(flights: Sequence[Flight], settings: Settings = Settings()) -> FlightResponses:
+    """Frequency responses of all flights together.
+
+    Inputs with an instrument in every flight (`Flight.instruments`) are taken by it.
+
+    Args:
+        flights: of one rate, with the same inputs; an output's parts without a missing sample
+            that are at least a window long are used.
+        settings: band, window and transfer functions.
+
+    Raises:
+        ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
+            no output has a part that is long enough.
+    """
+    dt = _one_rate(flights)
+    window = settings.window or min(max(f.duration for f in flights) / 5.0, _LONGEST)
+    omega = _frequencies(settings, window, dt)
+    inputs = [n for n in flights[0].inputs if any(np.std(f.inputs[n]) > 0 for f in flights)]
+    if not inputs:
+        raise ValueError("no input moves, expected one that does")
+    instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
+    notes = _notes(flights, inputs, instruments)
+    outputs: dict[str, Output] = {}
+    for name in dict.fromkeys(n for f in flights for n in f.outputs):
+        records = _records(flights, inputs, instruments, name, round(window / dt))
+        if isinstance(records, str):
+            notes.append(records)
+            continue
+        outputs[name] = _output(records, dt, omega, window, (inputs, instruments))
+    if not outputs:
+        raise ValueError("; ".join(notes[-3:]))
+    holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
+    fits = _fits(settings, omega, outputs, window, holds)
+    return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
+
+
+def _one_rate(flights: Sequence[Flight]) -> float:
+    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
+    if len(rates) > 1:
+        listed = ", ".join(f"{r:g}" for r in rates)
+        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
+    return flights[0].dt
+
+
+def _frequencies(settings: Settings, window: float, dt: float) -> np.ndarray:
+    # Fewer than two periods in a window are not told from its own shape.
+    low, high = settings.band or (2.0 / window, _HIGHEST / dt)
+    if not low < high:
+        raise ValueError(
+            f"window: expected one of more than {2.0 * dt / _HIGHEST:.3g} s, got {window:g} s"
+        )
+    if high >= 0.5 / dt:
+        raise ValueError(
+            f"band: expected frequencies below half the rate of {1.0 / dt:.4g} Hz, got {high:g} Hz"
+        )
+    if low < 2.0 / window * (1.0 - 1e-9):
+        raise ValueError(
+            f"band: expected at least two periods in a window of {window:g} s, from "
+            f"{2.0 / window:.3g} Hz on; got {low:g} Hz"
+        )
+    return 2.0 * np.pi * np.geomspace(low, high, settings.points)
+
+
+def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) -> list[str]:
+    still = [n for n in flights[0].inputs if n not in inputs]
+    notes = [f"{n} does not move: no response to it" for n in still]
+    # The bias has no sign of its own in any of the numbers below: it has to be said.
+    without = [n for n in inputs if n not in by]
+    if without:
+        notes.append(
+            f"{', '.join(without)}: taken for inputs that do not follow the outputs; where a pilot "
+            "or an autopilot closes a loop the response is biased towards minus one over its gain, "
+            "and a logged excitation (signals.instruments) or a fit by filter error is needed"
+        )
+    return notes
+
+
+def _records(
+    flights: Sequence[Flight],
+    inputs: list[str],
+    instruments: tuple[str, ...],
+    output: str,
+    window: int,
+) -> list[np.ndarray] | str:
+    """Parts (signals, N) without a missing sample, or why there are none in words."""
+    parts, longest = [], 0
+    for f in flights:
+        if output not in f.outputs:
+            continue
+        y = f.outputs[output]
+        signals = [*(f.inputs[n] for n in inputs), *(f.instruments[n] for n in instruments), y]
+        seen = np.concatenate([[False], np.isfinite(y), [False]])
+        edges = np.flatnonzero(np.diff(seen.astype(int)))
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            longest = max(longest, int(last - first))
+            if last - first >= window:
+                parts.append(np.stack([s[first:last] for s in signals]))
+    if parts:
+        return parts
+    return (
+        f"{output}: no response, expected a part of at least {window} samples (a window) without a "
+        f"missing one, got {longest} at most"
+    )
+
+
+def _output(
+    records: list[np.ndarray],
+    dt: float,
+    omega: np.ndarray,
+    window: float,
+    names: tuple[list[str], tuple[str, ...]],
+) -> Output:
+    inputs, instruments = names
+    m = len(inputs)
+    u, y = list(range(m)), [m + len(instruments)]
+    z = [m + instruments.index(n) if n in instruments else u[i] for i, n in enumerate(inputs)]
+    by = z if instruments else None
+    found = responses(cross_spectra(records, dt, omega, window), u, y, by)
+    own = _own(records, dt, omega, window)
+    found.H[~own], found.sd[~own], found.coherence[~own] = np.nan, np.nan, np.nan
+    picture = _picture(records, dt, omega, window, (u, y, by))
+    pairs = {
+        n: Pair(found.H[:, 0, j], found.sd[:, 0, j], found.coherence[:, 0, j], picture[:, j])
+        for j, n in enumerate(inputs)
+    }
+    return Output(pairs, found.multiple[:, 0], found.noise[:, 0], float(found.averages[0]))
+
+
+def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float) -> np.ndarray:
+    """At which frequencies (k,) every signal has power of its own.
+
+    Where one has none its spectrum is that of the window's sidelobes, which are coherent as well:
+    two signals behind low-pass filters would show a response far above them.
+    """
+    length = round(window / dt)
+    power = 0.0
+    for record in records:
+        lines, transforms = segment_transforms(record, dt, length)
+        power = power + np.sum(np.abs(transforms) ** 2, axis=1)
+    own = np.all([OWN * leakage(S) < S for S in np.transpose(power)], axis=0)
+    return own[np.clip(np.round(omega / lines[1]).astype(int), 0, own.size - 1)]
+
+
+def _picture(
+    records: list[np.ndarray],
+    dt: float,
+    omega: np.ndarray,
+    window: float,
+    which: tuple[list[int], list[int], list[int] | None],
+) -> np.ndarray:
+    """H (k, m) of several windows together; NaN where the record has no two of them."""
+    u, y, by = which
+    longest = max(r.shape[1] for r in records) * dt
+    several: list[CrossSpectra] = []
+    for length in _LENGTHS:
+        # Three windows are the least that a coherence can be taken from.
+        if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
+            continue
+        spectra = cross_spectra(records, dt, omega, length * window)
+        if np.min(spectra.averages) >= len(u) + 1:
+            several.append(spectra)
+    if len(several) < 2:
+        return np.full((omega.size, len(u)), np.nan)
+    found: Responses = responses(composite(several, u, y), u, y, by)
+    return found.H[:, 0]
+
+
+def _fits(
+    settings: Settings,
+    omega: np.ndarray,
+    outputs: dict[str, Output],
+    window: float,
+    holds: dict[str, Hold],
+) -> tuple[tuple[Wanted, TransferFit], ...]:
+    fits = []
+    for i, wanted in enumerate(settings.transfer_functions):
+        place = f"transfer_functions[{i}]"
+        output = outputs.get(wanted.output)
+        if output is None or wanted.input not in output.pairs:
+            raise ValueError(
+                f"{place}: no response from {wanted.input} to {wanted.output} is to be had of "
+                "these flights"
+            )
+        pair = output.pairs[wanted.input]
+        hz = omega / (2.0 * np.pi)
+        low, high = wanted.band or (0.0, np.inf)
+        used = (_smooth(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+        H = np.where(used, pair.H, np.nan)
+        # With its hold, which is half a sample late, so that the delay is the machine's own.
+        hold = holds[wanted.input]
+        measured = Measured(omega, H, pair.sd, window, pair.coherence, hold)
+        try:
+            fitted = fit_transfer(measured, wanted.zeros, wanted.poles, wanted.delay)
+        except ValueError as e:
+            raise ValueError(f"{place}: {e}") from e
+        fits.append((wanted, fitted))
+    return tuple(fits)
+
+
+def _smooth(omega: np.ndarray, coherence: np.ndarray) -> np.ndarray:
+    """Its mean (k,) over an octave; zero where there is none.
+
+    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
+    """
+    octaves = np.log2(omega)
+    near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
+    seen = np.isfinite(coherence)
+    count = near @ seen.astype(float)
+    mean = near @ np.where(seen, coherence, 0.0) / np.maximum(count, 1.0)
+    return np.where(seen, mean, 0.0)

@@ -1,0 +1,301 @@
+"""Frequency responses of records: several inputs at once, with coherence and random errors.
+
+Segments of a record in Hann windows are transformed to the frequencies asked for (a chirp-z
+transform: any band, any resolution), and their cross-spectra averaged over segments and flights.
+Inputs that move together are told apart (conditioned responses), and with an instrument, an
+excitation that was logged and that no feedback reaches, the responses are those of the machine
+where pilot or autopilot close the loop.
+
+Sources: Bendat and Piersol, Random Data (2010), chapters 7 and 9; Welch (1967); Rabiner, Schafer
+and Rader (1969) for the chirp-z transform; Wellstead (1981) for responses by instrument; Tischler
+and Remple (2012), chapters 7 to 10.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+_SINGULAR = 1e-9
+"""smallest singular value of the inputs' matrix of coherences, below which they move as one"""
+_ROUNDING = 1e-14
+"""of an output's density, what rounding leaves where the inputs explain all of it"""
+
+
+class CrossSpectra(NamedTuple):
+    """Spectral densities of several signals with one another."""
+
+    omega: np.ndarray
+    """(k,) [rad/s]"""
+    S: np.ndarray
+    """(k, c, c) one-sided densities per Hz: S[:, a, b] is the mean of conj(X_a) X_b"""
+    averages: float | np.ndarray
+    """independent averages that each is made of, a number or (k,): overlapping segments count for
+    less than one"""
+    seconds: float
+    """length of a segment"""
+
+
+class Responses(NamedTuple):
+    """From m inputs to l outputs at k frequencies."""
+
+    omega: np.ndarray
+    """(k,) [rad/s]"""
+    H: np.ndarray
+    """(k, l, m) complex"""
+    sd: np.ndarray
+    """(k, l, m) of the real and of the imaginary part of H: over |H| it is the relative random
+    error of the gain, and that of the phase [rad]"""
+    coherence: np.ndarray
+    """(k, l, m) partial coherence of each input, what the others explain taken out; by instrument
+    of that part of the input that follows the instruments"""
+    multiple: np.ndarray
+    """(k, l) of an output's power, the part that all inputs explain together"""
+    noise: np.ndarray
+    """(k, l) density of what they leave, per Hz"""
+    averages: np.ndarray
+    """(k,) independent ones"""
+
+
+def chirp_z(
+    x: Float[np.ndarray | Array, "... N"], dt: float, omega: Float[np.ndarray, " k"]
+) -> Complex[Array, "... k"]:
+    """The sums over n of x[n] exp(-i omega n dt), by Bluestein's (1970) convolution.
+
+    Args:
+        x: signals (..., N).
+        dt: between two samples [s].
+        omega: (k,) [rad/s], equally spaced.
+
+    Raises:
+        ValueError: they are not equally spaced.
+    """
+    k = omega.size
+    N = x.shape[-1]
+    spacing = (omega[-1] - omega[0]) / max(k - 1, 1)
+    if np.max(np.abs(omega - omega[0] - spacing * np.arange(k))) > 1e-9 * np.max(np.abs(omega)):
+        raise ValueError("omega: expected equally spaced frequencies")
+    # In extended precision: the squares of indices turn the angle millions of times.
+    j, step = np.arange(max(N, k)).astype(np.longdouble), np.longdouble(spacing) * dt
+    turn = np.longdouble(2.0) * np.arccos(np.longdouble(-1.0))
+    half = np.exp(1j * np.fmod(0.5 * step * j * j, turn).astype(float))
+    lead = np.exp(-1j * np.fmod(np.longdouble(omega[0]) * dt * j[:N], turn).astype(float))
+    rows = jnp.asarray(x).reshape(-1, N)
+    return _bluestein(rows, jnp.asarray(half), jnp.asarray(lead / half[:N]), k).reshape(
+        *x.shape[:-1], k
+    )
+
+
+@partial(jax.jit, static_argnames="k")
+def _bluestein(
+    x: Float[Array, "c N"], half: Complex[Array, " j"], lead: Complex[Array, " N"], k: int
+) -> Complex[Array, "c k"]:
+    """n j = (n^2 + j^2 - (j - n)^2) / 2 makes a convolution of the transform."""
+    N = x.shape[1]
+    length = 1 << (N + k - 2).bit_length()
+    b = jnp.zeros(length, half.dtype).at[:k].set(half[:k])
+    b = b.at[length - N + 1 :].set(half[N - 1 : 0 : -1])
+    transformed = jnp.fft.fft(x.astype(lead.dtype) * lead[None], length) * jnp.fft.fft(b)[None]
+    return jnp.fft.ifft(transformed)[:, :k] / half[None, :k]
+
+
+def cross_spectra(
+    records: Sequence[Float[np.ndarray, "c N"]],
+    dt: float,
+    omega: Float[np.ndarray, " k"],
+    seconds: float,
+    overlap: float = 0.5,
+) -> CrossSpectra:
+    """Averages over Hann windows of all records, each segment less its mean.
+
+    Args:
+        records: the same c signals in each, (c, N) with any N; no sample missing.
+        dt: between two samples [s].
+        omega: (k,) [rad/s], above zero and below the Nyquist frequency.
+        seconds: length of a segment; records that are shorter are left out.
+        overlap: of one segment with the next, from 0 to below 1.
+
+    Raises:
+        ValueError: no record has a segment, a sample is missing, or a frequency is out of range.
+    """
+    length = round(seconds / dt)
+    step = max(round(length * (1.0 - overlap)), 1)
+    _require(records, dt, omega, length)
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    counts = [max(1 + (r.shape[1] - length) // step, 0) for r in records]
+    total, averages = np.zeros(1), 0.0
+    for record, count in zip(records, counts, strict=True):
+        if count:
+            mean = _products(jnp.asarray(record), window, dt, omega, step)
+            total, averages = (
+                total + count * np.asarray(mean),
+                averages + _independent(window, step, count),
+            )
+    # One-sided: each frequency stands for its negative twin as well.
+    density = 2.0 * dt / np.sum(window**2)
+    return CrossSpectra(np.asarray(omega), density / sum(counts) * total, averages, length * dt)
+
+
+def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length: int) -> None:
+    longest = max((r.shape[1] for r in records), default=0)
+    if length < 8 or longest < length:
+        raise ValueError(
+            f"seconds: expected a segment of 8 samples at least and no longer than the longest "
+            f"record, {longest * dt:.6g} s; got {length * dt:.6g} s"
+        )
+    if not all(np.isfinite(r).all() for r in records):
+        raise ValueError("records: expected no missing sample; cut them where one is missing")
+    if not (np.all(omega > 0) and np.all(omega < np.pi / dt)):
+        raise ValueError(
+            f"omega: expected frequencies between 0 and the Nyquist frequency, "
+            f"{np.pi / dt:.6g} rad/s; got {np.min(omega):.6g} to {np.max(omega):.6g} rad/s"
+        )
+
+
+@partial(jax.jit, static_argnames="step")
+def _products(
+    record: Float[Array, "c N"],
+    window: Float[Array, " n"],
+    dt: float,
+    omega: Float[Array, " k"],
+    step: int,
+) -> Complex[Array, "k c c"]:
+    """Mean over the segments of conj(X_a) X_b."""
+    c, n = record.shape[0], window.shape[0]
+    count = 1 + (record.shape[1] - n) // step
+    segments = record[:, step * np.arange(count)[:, None] + np.arange(n)]
+    segments = segments - segments.mean(axis=-1, keepdims=True)
+    # One product of matrices: for the few hundred frequencies of a band faster than fast Fourier
+    # transforms of twice the length, and they may lie anywhere.
+    angles = jnp.outer(jnp.arange(n, dtype=record.dtype), omega * dt)
+    windowed = (segments * window[None, None]).reshape(c * count, n)
+    X = jax.lax.complex(windowed @ jnp.cos(angles), -(windowed @ jnp.sin(angles)))
+    X = X.reshape(c, count, -1)
+    return jnp.einsum("ask,bsk->kab", jnp.conj(X), X) / count
+
+
+def _independent(window: np.ndarray, step: int, count: int) -> float:
+    """Independent averages of overlapping segments (Welch 1967, for a flat spectrum)."""
+    # Of white noise the transforms of two segments correlate as the windows overlap, and their
+    # squares, which spectra are made of, as the square of that.
+    n, power, total = window.size, float(np.sum(window**2)), 1.0
+    for j in range(1, min(count, -(-n // step))):
+        shared = float(np.sum(window[: n - j * step] * window[j * step :])) / power
+        total += 2.0 * (1.0 - j / count) * shared**2
+    return count / total
+
+
+def responses(
+    spectra: CrossSpectra,
+    inputs: Sequence[int],
+    outputs: Sequence[int],
+    instruments: Sequence[int] | None = None,
+) -> Responses:
+    """Responses of each output to each input, the others taken into account.
+
+    Where inputs move as one (or one does not move) no response is determined: it is NaN there.
+
+    Args:
+        spectra: of the signals.
+        inputs: the m inputs, by their place among the signals.
+        outputs: the l outputs likewise.
+        instruments: as many excitations, outside of every feedback; without them the inputs are
+            taken for ones that do not follow the outputs.
+
+    Raises:
+        ValueError: too few averages for so many inputs, or not as many instruments as inputs.
+    """
+    u, y = list(inputs), list(outputs)
+    z = u if instruments is None else list(instruments)
+    m, S, n = len(u), spectra.S, np.broadcast_to(spectra.averages, spectra.omega.shape)[:, None]
+    if len(z) != m:
+        raise ValueError(f"instruments: expected {m}, one for each input, got {len(z)}")
+    if np.min(n) < m + 1:
+        raise ValueError(
+            f"expected at least {m + 1} independent averages for {m} inputs, got "
+            f"{np.min(n):.2f}: a longer record, or shorter segments"
+        )
+    # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
+    P = _inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
+    H = np.swapaxes(P @ S[:, z][:, :, y], 1, 2)
+    left = _left(S, u, y, H)
+    # Covariance of S_zu^-1 S_ze, where that of S_ze is S_zz times the noise over the averages.
+    spread = np.real(np.einsum("kjz,kzw,kjw->kj", P, S[:, z][:, :, z], np.conj(P)))
+    error = left[:, :, None] * spread[:, None, :]
+    power = np.real(S[:, y, y])
+    with np.errstate(all="ignore"):
+        coherence = np.abs(H) ** 2 / (np.abs(H) ** 2 + error)
+        multiple = np.clip(1.0 - left / power, 0.0, 1.0)
+    # Each input takes one of the averages for its own response.
+    sd = np.sqrt(0.5 * error / (n - m)[:, :, None])
+    noise = left * n / (n - m)
+    return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
+
+
+def _inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Of matrices (k, m, m); NaN where one is singular but for rounding.
+
+    Args:
+        M: cross-spectra.
+        rows: densities (k, m) of the signals of the rows.
+        columns: likewise.
+    """
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(rows[:, :, None] * columns[:, None, :])
+        scaled = M * scale
+        sound = np.isfinite(scaled).all((1, 2))
+        scaled = np.where(sound[:, None, None], scaled, np.eye(M.shape[1]))
+        # In coherences, so that units do not count.
+        sound &= np.linalg.svd(scaled, compute_uv=False)[:, -1] > _SINGULAR
+        inverse = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
+        return np.where(sound[:, None, None], inverse * np.swapaxes(scale, 1, 2), np.nan)
+
+
+def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarray:
+    """Density (k, l) of y - H u, not below what rounding leaves."""
+    power = np.real(S[:, y, y])
+    crossed = np.real(np.einsum("klm,klm->kl", H, S[:, y][:, :, u]))
+    explained = np.real(np.einsum("kla,kab,klb->kl", np.conj(H), S[:, u][:, :, u], H))
+    return np.maximum(power - 2.0 * crossed + explained, _ROUNDING * power)
+
+
+def composite(
+    several: Sequence[CrossSpectra], inputs: Sequence[int], outputs: Sequence[int]
+) -> CrossSpectra:
+    """One picture from several lengths of segments: long ones for low frequencies, short ones for
+    high, each by the fourth power of its random error.
+
+    It is for looking: no intervals are to be taken from it, since the lengths share the record.
+
+    Args:
+        several: of the same signals and frequencies, of segments of different length.
+        inputs: those whose responses decide, by their place among the signals.
+        outputs: likewise.
+
+    Raises:
+        ValueError: the frequencies differ.
+
+    Source: Tischler and Remple (2012), chapter 10, without its last search.
+    """
+    omega = several[0].omega
+    if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
+        raise ValueError("several: expected the same frequencies in all")
+    weights = np.stack([_weights(s, inputs, outputs) for s in several])
+    weights = weights / np.sum(weights, axis=0)
+    S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
+    n = np.stack([np.broadcast_to(s.averages, omega.shape) for s in several])
+    return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
+
+
+def _weights(s: CrossSpectra, inputs: Sequence[int], outputs: Sequence[int]) -> np.ndarray:
+    """(k,) one over the random error, to the fourth power."""
+    found = responses(s, inputs, outputs)
+    with np.errstate(all="ignore"):
+        information = np.nanmean(np.abs(found.H / found.sd) ** 2, axis=(1, 2))
+    # Two periods within a segment are the least that a window resolves.
+    resolved = s.omega >= 4.0 * np.pi / s.seconds * (1.0 - 1e-9)
+    return np.where(resolved, np.nan_to_num(information), 1e-12 / s.seconds) ** 2

@@ -1,0 +1,341 @@
+"""Transfer functions with a delay, fitted to one measured frequency response.
+
+Complex linear errors by the random error of each frequency: logarithmic ones (CIFER's) are biased
+where the coherence is low. Frequencies that one window cannot tell apart share what they say, so
+that intervals do not depend on how densely a response was drawn.
+
+Sources: Sanathanan and Koerner (1963) for the start; Pintelon and Schoukens (2012), chapter 9, for
+the weights and the covariance; Tischler and Remple (2012), chapter 11, for the cost J.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Complex, Float
+
+_ROUNDS = 12
+"""of Sanathanan and Koerner's iteration; it settles in a handful"""
+_DELAYS = 13
+"""from how many delays the search begins: the phase wraps, and each wrap has an optimum"""
+_SEARCHES = 3
+"""of them go on to the optimum"""
+_RESOLVED = 1.95
+"""frequencies closer than this over the window's length are not independent (Hann)"""
+_SINGULAR = 1e-10
+"""of the largest singular value of the Jacobian: below it a coefficient is not determined"""
+_IMAGES = 50
+"""on either side: their shares fall with the square of their number"""
+_FAR = 10.0
+"""sd of a coefficient past which nothing is known of it: of its own size, and in the middle of the
+band, where coefficients of the denominator and the delay's phase are of the order of 1"""
+Z95 = 1.959963984540054
+
+
+class Coefficient(NamedTuple):
+    """A number of a transfer function."""
+
+    value: float
+    sd: float
+    """inf where the response does not determine it"""
+    lower95: float
+    upper95: float
+
+    @property
+    def determined(self) -> bool:
+        """Whether the response says anything of it."""
+        return bool(np.isfinite(self.sd))
+
+
+class TransferFit(NamedTuple):
+    """(b_m s^m + ... + b_0) / (s^n + a_{n-1} s^{n-1} + ... + a_0) exp(-delay s)."""
+
+    numerator: tuple[Coefficient, ...]
+    """highest power first"""
+    denominator: tuple[Coefficient, ...]
+    """likewise, after the leading one"""
+    delay: Coefficient | None
+    """[s]; None where none was asked for"""
+    chi_squared: float
+    """squared errors over their random errors, per degree of freedom: near 1 where the order is
+    enough and the response is one of a linear machine"""
+    J: float
+    """Tischler's cost: below 100 usual for a good fit, below 50 for one as good as flight"""
+    converged: bool
+
+    @property
+    def poles(self) -> np.ndarray:
+        """(n,) complex [1/s]"""
+        return np.roots([1.0, *(c.value for c in self.denominator)])
+
+    @property
+    def zeros(self) -> np.ndarray:
+        """(m,) complex [1/s]"""
+        return np.roots([c.value for c in self.numerator])
+
+    def sampled(self, omega: Float[np.ndarray, " k"], hold: "Hold | None") -> np.ndarray:
+        """What a record of samples shows of it (k,), complex.
+
+        Args:
+            omega: (k,) [rad/s]
+            hold: what the input does between samples; None gives G(i omega).
+        """
+        at, share = images(omega, hold)
+        return np.sum(share * self.response(at), axis=1)
+
+    def response(self, omega: Float[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+        """G(i omega).
+
+        Args:
+            omega: any shape [rad/s]
+        """
+        s = 1j * omega
+        tau = 0.0 if self.delay is None else self.delay.value
+        num = np.polyval([c.value for c in self.numerator], s)
+        return num / np.polyval([1.0, *(c.value for c in self.denominator)], s) * np.exp(-s * tau)
+
+
+class Measured(NamedTuple):
+    """One response to be fitted; arrays (k,)."""
+
+    omega: np.ndarray
+    """[rad/s], rising"""
+    H: np.ndarray
+    """complex"""
+    sd: np.ndarray
+    """of its real and of its imaginary part"""
+    seconds: float
+    """length of the windows that it comes from"""
+    coherence: np.ndarray
+    hold: "Hold | None" = None
+    """what the input does between samples; None for a response in continuous time"""
+
+
+class Hold(NamedTuple):
+    """An input between its samples."""
+
+    kind: str
+    """"zero-order" or "linear" """
+    dt: float
+    """[s]"""
+
+
+def images(omega: Float[np.ndarray, " k"], hold: Hold | None) -> tuple[np.ndarray, np.ndarray]:
+    """The frequencies (k, M) whose response a sampled record shows at omega, and the share of each.
+
+    Samples do not tell a frequency from its images; a held input has power at all of them, and
+    falls off with their distance.
+
+    Args:
+        omega: (k,) [rad/s]
+        hold: of the input; None for a response in continuous time, which has no images.
+    """
+    if hold is None:
+        return omega[:, None], np.ones((omega.size, 1), complex)
+    angle = omega[:, None] * hold.dt
+    turned = angle + 2.0 * np.pi * np.arange(-_IMAGES, _IMAGES + 1)
+    if hold.kind == "linear":
+        share = 2.0 * (1.0 - np.cos(angle)) / turned**2 + 0j
+    else:
+        share = (1.0 - np.exp(-1j * angle)) / (1j * turned)
+    return turned / hold.dt, share
+
+
+class _Scaled(NamedTuple):
+    """The response in a time unit in which coefficients are of one size."""
+
+    s: np.ndarray
+    """(k,) i omega over `speed`"""
+    images: np.ndarray
+    """(k, M) likewise"""
+    share: np.ndarray
+    """(k, M)"""
+    H: np.ndarray
+    weight: np.ndarray
+    """(k,) of a complex error: root of the information of its real part"""
+    speed: float
+    """[rad/s]"""
+
+
+def fit_transfer(measured: Measured, zeros: int, poles: int, delay: bool = True) -> TransferFit:
+    """The transfer function of least squares.
+
+    Args:
+        measured: the response; frequencies whose numbers are not finite are left out.
+        zeros: order m of the numerator, at most n.
+        poles: order n of the denominator, from 1 to 8.
+        delay: whether a delay is fitted too.
+
+    Raises:
+        ValueError: orders out of range, or too few frequencies for so many coefficients.
+    """
+    if not (1 <= poles <= 8 and 0 <= zeros <= poles):
+        raise ValueError(
+            f"expected 1 to 8 poles and at most as many zeros, got {poles} poles and {zeros} zeros"
+        )
+    scaled = _scaled(measured)
+    unknowns = zeros + 1 + poles + delay
+    if 2.0 * np.sum(_shares(measured)) <= unknowns:
+        raise ValueError(
+            f"expected more than {unknowns / 2:g} independent frequencies for {unknowns} "
+            f"coefficients, got {np.sum(_shares(measured)):.3g}: a wider band or longer windows"
+        )
+    begun = [_begin(scaled, zeros, poles, tau) for tau in _first_delays(scaled, delay)]
+    # Those that begin nearest to the data: each search costs as much as all the starts.
+    begun.sort(key=lambda x: _cost(scaled, x, zeros))
+    best = min((_search(scaled, x, zeros, delay) for x in begun[:_SEARCHES]), key=lambda r: r.cost)
+    return _result(measured, scaled, best, zeros, delay)
+
+
+def _shares(m: Measured) -> np.ndarray:
+    """Of each frequency (k,) how much of an independent one it is."""
+    sound = np.isfinite(m.H) & np.isfinite(m.sd) & (m.sd > 0)
+    # Half of the way to each neighbour, used or not.
+    width = np.gradient(m.omega) if m.omega.size > 1 else np.ones(1)
+    return np.where(sound, np.minimum(width * m.seconds / (2.0 * np.pi * _RESOLVED), 1.0), 0.0)
+
+
+def _scaled(m: Measured) -> _Scaled:
+    share = _shares(m)
+    kept = share > 0
+    speed = float(np.exp(np.mean(np.log(m.omega[kept])))) if kept.any() else 1.0
+    weight = np.sqrt(share[kept]) / m.sd[kept]
+    at, share = images(m.omega[kept], m.hold)
+    return _Scaled(1j * m.omega[kept] / speed, 1j * at / speed, share, m.H[kept], weight, speed)
+
+
+def _first_delays(scaled: _Scaled, delay: bool) -> np.ndarray:
+    # Up to one turn of the phase at the highest frequency. Below zero too: logs hold sticks that
+    # were written later than they acted.
+    turns = np.linspace(-0.5, 1.0, _DELAYS)
+    return turns * 2.0 * np.pi / np.abs(scaled.s[-1]) if delay else np.zeros(1)
+
+
+def _begin(scaled: _Scaled, zeros: int, poles: int, tau: float) -> np.ndarray:
+    """Coefficients by linear least squares, the denominator of the round before as a weight."""
+    # The frequency itself has nearly all of what its images share.
+    own = scaled.share[:, scaled.share.shape[1] // 2]
+    s, H = scaled.s, scaled.H / own * np.exp(scaled.s * tau)
+    up, down = np.vander(s, zeros + 1), np.vander(s, poles)
+    weight, x = scaled.weight, np.zeros(zeros + 1 + poles)
+    for _ in range(_ROUNDS):
+        A = weight[:, None] * np.concatenate([up, -H[:, None] * down], axis=1)
+        b = weight * H * s**poles
+        x = np.linalg.lstsq(_rows(A), _rows(b), rcond=None)[0]
+        below = np.abs(s**poles + down @ x[zeros + 1 :])
+        weight = scaled.weight / np.maximum(below, 1e-9 * np.max(below))
+    return np.concatenate([x, [tau]])
+
+
+def _rows(v: np.ndarray) -> np.ndarray:
+    """Complex rows as twice as many real ones."""
+    return np.concatenate([np.real(v), np.imag(v)], axis=0)
+
+
+def _model(scaled: _Scaled, x: np.ndarray, zeros: int) -> tuple[np.ndarray, np.ndarray]:
+    """The response (k,) and its derivatives (k, unknowns); the last unknown is the delay."""
+    s, poles = scaled.images, x.size - zeros - 2
+    powers = np.vander(s.ravel(), poles + 1).reshape(*s.shape, poles + 1)
+    up, down = powers[..., poles - zeros :], powers[..., 1:]
+    below = powers[..., 0] + down @ x[zeros + 1 : -1]
+    turned = np.exp(-s * x[-1]) / below
+    G = (up @ x[: zeros + 1]) * turned
+    derivatives = [up * turned[..., None], -down * (G / below)[..., None], (-s * G)[..., None]]
+    share = scaled.share[..., None]
+    return np.sum(scaled.share * G, axis=1), np.sum(share * np.concatenate(derivatives, 2), axis=1)
+
+
+def _cost(scaled: _Scaled, x: np.ndarray, zeros: int) -> float:
+    """Sum of the squared rows; infinite where a start is no number."""
+    with np.errstate(all="ignore"):
+        error = scaled.weight * (_model(scaled, x, zeros)[0] - scaled.H)
+        cost = float(np.sum(np.abs(error) ** 2))
+    return cost if np.isfinite(cost) else np.inf
+
+
+# Any: SciPy's OptimizeResult has no types.
+def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
+    kept = x.size if delay else x.size - 1
+
+    def whole(part: np.ndarray) -> np.ndarray:
+        return np.concatenate([part, x[kept:]])
+
+    def residuals(part: np.ndarray) -> np.ndarray:
+        return _rows(scaled.weight * (_model(scaled, whole(part), zeros)[0] - scaled.H))
+
+    def jacobian(part: np.ndarray) -> np.ndarray:
+        derivatives = _model(scaled, whole(part), zeros)[1]
+        return _rows(scaled.weight[:, None] * derivatives)[:, :kept]
+
+    with np.errstate(all="ignore"):
+        return scipy.optimize.least_squares(
+            residuals,
+            x[:kept],
+            jacobian,  # pyright: ignore[reportArgumentType]
+            method="lm",
+            x_scale="jac",
+            max_nfev=400,
+        )
+
+
+def _result(measured: Measured, scaled: _Scaled, found, zeros: int, delay: bool) -> TransferFit:
+    poles = found.x.size - zeros - 1 - delay
+    # Back to seconds: a power of s less in a coefficient is a power of the scale more.
+    powers = np.concatenate(
+        [poles - np.arange(zeros, -1, -1), poles - np.arange(poles - 1, -1, -1), [-1] * delay]
+    )
+    units = scaled.speed ** powers.astype(float)
+    freedom = max(2.0 * float(np.sum(_shares(measured))) - found.x.size, 1.0)
+    chi_squared = 2.0 * float(found.cost) / freedom
+    # What the order leaves unexplained is no smaller than what it was measured to.
+    sd = _deviations(found.jac) * max(chi_squared, 1.0) ** 0.5
+    size = np.ones(found.x.size)
+    size[: zeros + 1] = np.max(np.abs(scaled.H))
+    sd = np.where(sd > _FAR * np.maximum(np.abs(found.x), size), np.inf, sd)
+    values = [
+        Coefficient(v, d, v - Z95 * d, v + Z95 * d)
+        for v, d in zip((found.x * units).tolist(), (sd * units).tolist(), strict=True)
+    ]
+    whole = TransferFit(
+        tuple(values[: zeros + 1]),
+        tuple(values[zeros + 1 : zeros + 1 + poles]),
+        values[-1] if delay else None,
+        chi_squared,
+        0.0,
+        bool(found.status > 0),
+    )
+    return whole._replace(J=mismatch(measured, whole.sampled(measured.omega, measured.hold)))
+
+
+def _deviations(J: np.ndarray) -> np.ndarray:
+    """Of each unknown; inf where the rows do not determine it."""
+    size = np.linalg.norm(J, axis=0)
+    if not (np.isfinite(J).all() and np.all(size > 0)):
+        return np.full(J.shape[1], np.inf)
+    _, s, V = np.linalg.svd(J / size, full_matrices=False)
+    lost = s <= _SINGULAR * s[0]
+    with np.errstate(all="ignore"):
+        variance = np.sum((V / np.where(lost, 1.0, s)[:, None]) ** 2, axis=0)
+    undetermined = np.any(np.abs(V[lost]) > 1e-6, axis=0)
+    return np.where(undetermined, np.inf, np.sqrt(variance)) / size
+
+
+def mismatch(measured: Measured, model: Complex[np.ndarray, " k"]) -> float:
+    """Tischler's cost J: 20 times the mean of squared errors in dB and in degrees, weighted by
+    coherence; NaN where nothing is measured.
+
+    Args:
+        measured: the response.
+        model: at the same frequencies (k,).
+
+    Source: Tischler and Remple (2012), section 11.2.
+    """
+    seen = np.isfinite(measured.H) & (np.abs(measured.H) > 0) & np.isfinite(measured.coherence)
+    if not seen.any():
+        return float("nan")
+    quotient = model[seen] / measured.H[seen]
+    weight = (1.58 * (1.0 - np.exp(-measured.coherence[seen]))) ** 2
+    decibels = 20.0 * np.log10(np.maximum(np.abs(quotient), 1e-300))
+    degrees = np.degrees(np.angle(quotient))
+    # A degree counts as much as 0.1317 dB squared: 7.57 dB and a radian are as bad.
+    return float(20.0 * np.mean(weight * (decibels**2 + 0.01745 * degrees**2)))

@@ -1,0 +1,54 @@
+"""What may stand in a configuration's section `frequency`: responses of the logs, before a fit."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+def increasing(band: Any) -> Any:
+    """Two rising frequencies, or what pydantic will say is none."""
+    if isinstance(band, list | tuple) and len(band) == 2:
+        numbers = [b for b in band if isinstance(b, int | float)]
+        if len(numbers) == 2 and not numbers[0] < numbers[1]:
+            raise ValueError(f"expected two increasing frequencies in Hz, got {list(band)}")
+    return band
+
+
+class TransferConfig(BaseModel):
+    """A transfer function to be fitted to one response."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    input: str
+    output: str
+    zeros: Annotated[int, Field(ge=0, le=8)] = 0
+    poles: Annotated[int, Field(ge=1, le=8)]
+    delay: StrictBool = True
+    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    """[Hz]; all frequencies unless given"""
+    coherence: Annotated[float, Field(ge=0, lt=1)] = 0.6
+    """frequencies of less are left out"""
+
+    @model_validator(mode="after")
+    def _proper(self) -> "TransferConfig":
+        if self.zeros > self.poles:
+            raise ValueError(
+                f"zeros: expected at most as many as poles ({self.poles}), got {self.zeros}"
+            )
+        return self
+
+
+class FrequencyConfig(BaseModel):
+    """Which frequencies, in windows of which length."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""
+    window: _Positive | None = None
+    """length [s]; unless given a fifth of the longest flight, 30 s at most"""
+    points: Annotated[int, Field(ge=8, le=2000)] = 120
+    """frequencies, equally spaced in the logarithm"""
+    transfer_functions: list[TransferConfig] = []

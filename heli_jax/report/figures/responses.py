@@ -1,0 +1,96 @@
+"""The Bode figure of a measured response: gain and phase with 95 % intervals, and coherence."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from heli_jax.report import style
+from heli_jax.report.coherence import COHERENT
+from heli_jax.report.figures.panels import Panels, panels
+from heli_jax.report.style import legend_above, subtitle
+
+_Z95 = 1.959963984540054
+_COLOURS = (style.VERMILLION, style.GREEN, style.PURPLE)
+_WIDE = 1.0
+"""relative random error past which a bin says nothing, and is not drawn"""
+
+
+def draw_response(
+    names: tuple[str, str],
+    omega: np.ndarray,
+    pair: Any,
+    unit: str,
+    note: str,
+    fits: Sequence[tuple[str, np.ndarray]] = (),
+) -> Figure:
+    """One response.
+
+    Args:
+        names: of the input and the output.
+        omega: (k,) [rad/s]
+        pair: with H, sd, coherence and picture, (k,) each (`heli_jax.log_responses.Pair`).
+        unit: of output over input.
+        note: below the title.
+        fits: transfer functions, each a label and its response (k,).
+    """
+    axes = panels(None, 6.0 + style.ROW, [1.4, 1.2, 0.6], top=style.TOP + style.ROW)
+    hz = omega / (2.0 * np.pi)
+    known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
+    _draw_measured(axes, hz, pair, known)
+    if np.isfinite(pair.picture).any():
+        _curve(axes, hz, pair.picture, known, color=style.SKY, lw=1.0, label="several windows")
+    for (label, H), color in zip(fits, itertools.cycle(_COLOURS), strict=False):
+        _curve(axes, hz, H, known, color=color, lw=1.4, label=label)
+    axes[2].plot(hz, pair.coherence, color=style.BLACK, lw=0.9)
+    axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
+    axes[2].set_ylim(0.0, 1.05)
+    axes[0].set_xscale("log")
+    axes[0].set_xlim(hz[0], hz[known][-1] if known.any() else hz[-1])
+    style.plain_log_ticks(axes[0].xaxis)
+    axes[0].set_ylabel(f"gain [dB re {unit}]" if unit != "1" else "gain [dB]")
+    axes[1].set_ylabel("phase [deg]")
+    axes[2].set_ylabel("coherence")
+    axes[2].set_xlabel("frequency [Hz]")
+    axes[0].set_title(f"{names[0]} to {names[1]}: measured response", loc="left")
+    legend_above(axes[0])
+    subtitle(axes[0], note, raised=True)
+    drawn = axes[0].figure
+    assert isinstance(drawn, Figure)
+    return drawn
+
+
+def _draw_measured(axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray) -> None:
+    f, H = hz[known], pair.H[known]
+    relative = _Z95 * pair.sd[known] / np.abs(H)
+    bars: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
+    # Where the error is large the two ends of the gain are not as far away in decibels.
+    down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
+    up = 20.0 * np.log10(1.0 + relative)
+    gain = 20.0 * np.log10(np.abs(H))
+    axes[0].errorbar(
+        f, gain, yerr=[down, up], color=style.BLUE, label="one window, 95 % intervals", **bars
+    )
+    axes[1].errorbar(
+        f, _phase(H), yerr=np.degrees(np.minimum(relative, np.pi)), color=style.BLUE, **bars
+    )
+    if f.size:
+        low, high = np.min(gain), np.max(gain)
+        axes[0].set_ylim(low - 6.0, high + 6.0)
+
+
+def _curve(
+    axes: Panels, hz: np.ndarray, H: np.ndarray, known: np.ndarray, **line_style: Any
+) -> None:
+    good = known & np.isfinite(H) & (np.abs(H) > 0)
+    axes[0].plot(hz[good], 20.0 * np.log10(np.abs(H[good])), **line_style)
+    axes[1].plot(hz[good], _phase(H[good]), **line_style)
+
+
+def _phase(H: np.ndarray) -> np.ndarray:
+    """Unwrapped [deg], begun between -270 and 90."""
+    from heli_jax.report.frequency import phase
+
+    return phase(H)

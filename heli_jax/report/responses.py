@@ -1,0 +1,230 @@
+"""The files of `heli-jax frf`: responses as NetCDF and CSV, transfer functions, figures, a page."""
+
+import base64
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
+from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
+from heli_jax.flights.write import write_table
+from heli_jax.numbers import number
+from heli_jax.report import style
+from heli_jax.report.coherence import COHERENT
+from heli_jax.report.figures.responses import draw_response
+from heli_jax.report.page import filled
+
+_DB = 20.0 / np.log(10.0)
+
+
+def write_responses(
+    directory: Path, found: FlightResponses, units: Mapping[str, str], title: str
+) -> None:
+    """Write responses.nc, responses.csv, transfer_functions.json, figures/ and responses.html.
+
+    Args:
+        directory: exists.
+        found: the responses.
+        units: SI, of inputs and outputs by name.
+        title: of the page.
+    """
+    write_table(directory / "responses.csv", table(found))
+    _write_netcdf(directory / "responses.nc", found, units)
+    fits = [_content(*fit) for fit in found.fits]
+    (directory / "transfer_functions.json").write_text(
+        json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
+    (directory / "figures").mkdir()
+    pictures = []
+    for name, output in found.outputs.items():
+        for input in output.pairs:
+            draw = functools.partial(_draw, found, units, input, name)
+            saved = style.save(draw, directory / "figures" / _stem(input, name))
+            if saved is not None:
+                data = base64.b64encode(saved[1]).decode()
+                pictures.append({"title": saved[0], "data": data})
+    page = filled(
+        "responses.html.j2",
+        title=title,
+        pictures=pictures,
+        notes=found.notes,
+        head=("input", "output", "averages", *FIT_HEAD),
+        rows=[
+            (w.input, w.output, f"{found.outputs[w.output].averages:.1f}", *fit_row(fit))
+            for w, fit in found.fits
+        ],
+        window=f"{found.window:g}",
+    )
+    (directory / "responses.html").write_text(page, encoding="utf-8")
+
+
+def _stem(input: str, output: str) -> str:
+    # A model's names are Python's: nothing in them that a file's name may not have.
+    return f"{output}-{input}"
+
+
+def _draw(found: FlightResponses, units: Mapping[str, str], input: str, output: str) -> Any:
+    measured = found.outputs[output]
+    curves = [
+        (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(found.omega, found.holds[input]))
+        for w, fit in found.fits
+        if (w.input, w.output) == (input, output)
+    ]
+    by = "by its instrument" if input in found.instruments else "direct"
+    note = f"{by}, windows of {found.window:g} s, {measured.averages:.1f} independent averages"
+    unit = quotient(units[output], units[input])
+    return draw_response((input, output), found.omega, measured.pairs[input], unit, note, curves)
+
+
+def quotient(output: str, input: str) -> str:
+    """The unit of output over input."""
+    if input == "1":
+        return output
+    return f"{output}/({input})" if "/" in input else f"{output}/{input}"
+
+
+def table(found: FlightResponses) -> dict[str, Any]:
+    """A row for each frequency of each pair: the columns of responses.csv."""
+    columns: dict[str, list[Any]] = {n: [] for n in ("input", "output")}
+    numbers: dict[str, list[np.ndarray]] = {}
+    for name, output in found.outputs.items():
+        for input, pair in output.pairs.items():
+            k = found.omega.size
+            columns["input"] += [input] * k
+            columns["output"] += [name] * k
+            with np.errstate(all="ignore"):
+                each = {
+                    "frequency_hz": found.omega / (2.0 * np.pi),
+                    "gain": np.abs(pair.H),
+                    "gain_db": 20.0 * np.log10(np.abs(pair.H)),
+                    "phase_deg": np.degrees(np.unwrap(np.angle(pair.H))),
+                    "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
+                    "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
+                    "coherence": pair.coherence,
+                    "multiple_coherence": output.multiple,
+                }
+            for n, v in each.items():
+                numbers.setdefault(n, []).append(v)
+    return {**columns, **{n: np.concatenate(v) for n, v in numbers.items()}}
+
+
+def _write_netcdf(path: Path, found: FlightResponses, units: Mapping[str, str]) -> None:
+    import xarray as xr
+
+    inputs = list(next(iter(found.outputs.values())).pairs)
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack(
+            [[getattr(o.pairs[i], name) for i in inputs] for o in found.outputs.values()]
+        )
+
+    pairs, each = ("output", "input", "frequency"), ("output", "frequency")
+    H, picture = stacked("H"), stacked("picture")
+    data = xr.Dataset(
+        {
+            # NetCDF 3 has no complex numbers.
+            "real": (pairs, np.real(H)),
+            "imaginary": (pairs, np.imag(H)),
+            "sd": (pairs, stacked("sd"), {"long_name": "of the real and of the imaginary part"}),
+            "coherence": (pairs, stacked("coherence"), {"long_name": "partial coherence"}),
+            "composite_real": (
+                pairs,
+                np.real(picture),
+                {"long_name": "of several windows"},
+            ),
+            "composite_imaginary": (pairs, np.imag(picture)),
+            "multiple_coherence": (each, np.stack([o.multiple for o in found.outputs.values()])),
+            "noise": (
+                each,
+                np.stack([o.noise for o in found.outputs.values()]),
+                {"long_name": "density of what the inputs leave", "units": "SI^2/Hz"},
+            ),
+        },
+        {
+            "output": list(found.outputs),
+            "input": inputs,
+            "frequency": ("frequency", found.omega / (2.0 * np.pi), {"units": "Hz"}),
+        },
+        {
+            "window_s": found.window,
+            "instruments": " ".join(found.instruments),
+            "units_of_outputs": " ".join(units[n] for n in found.outputs),
+            "units_of_inputs": " ".join(units[n] for n in inputs),
+        },
+    )
+    data.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+
+
+def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
+    return {
+        "input": wanted.input,
+        "output": wanted.output,
+        "numerator": [_number(c) for c in fit.numerator],
+        "denominator": [{"value": 1.0}, *(_number(c) for c in fit.denominator)],
+        "delay_s": None if fit.delay is None else _number(fit.delay),
+        "poles": [[p.real, p.imag] for p in fit.poles],
+        "zeros": [[z.real, z.imag] for z in fit.zeros],
+        "chi_squared_per_degree": fit.chi_squared,
+        "J": fit.J,
+        "converged": fit.converged,
+    }
+
+
+def _number(c: Coefficient) -> dict[str, float]:
+    # What the response does not determine has no number.
+    if not c.determined:
+        return {}
+    return {"value": c.value, "sd": c.sd, "lower95": c.lower95, "upper95": c.upper95}
+
+
+FIT_HEAD = ("numerator", "denominator", "delay [ms]", "chi² per degree", "J")
+
+
+def fit_row(fit: TransferFit) -> tuple[str, ...]:
+    """Numerator, denominator, delay with their sd, chi-squared and J, as text."""
+    delay = "–" if fit.delay is None else _measured(fit.delay, 1e3)
+    return (
+        _polynomial(fit.numerator, ""),
+        _polynomial(fit.denominator, f"s{_power(len(fit.denominator))}"),
+        delay,
+        number(fit.chi_squared, 3),
+        number(fit.J, 3),
+    )
+
+
+def _polynomial(coefficients: tuple[Coefficient, ...], lead: str) -> str:
+    terms = [lead] if lead else []
+    for i, c in enumerate(coefficients):
+        n = len(coefficients) - 1 - i
+        terms.append(f"({_measured(c)})" + (f" s{_power(n)}" if n else ""))
+    return " + ".join(terms)
+
+
+def _power(n: int) -> str:
+    return "" if n == 1 else str(n).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def _measured(c: Coefficient, factor: float = 1.0) -> str:
+    if not c.determined:
+        return "not determined"
+    return f"{number(c.value * factor, 4)} ± {number(c.sd * factor, 2)}"
+
+
+def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
+    """Mean coherence, and the widest band in which it stays above 0.6, as text."""
+    seen = np.isfinite(pair.coherence)
+    if not seen.any():
+        return "not determined", "–", "–"
+    mean = f"{np.mean(pair.coherence[seen]):.2f}"
+    good = np.concatenate([[False], np.where(seen, pair.coherence, 0.0) > COHERENT, [False]])
+    edges = np.flatnonzero(np.diff(good.astype(int)))
+    bands = list(zip(edges[::2], edges[1::2] - 1, strict=True))
+    if not bands:
+        return mean, "–", "–"
+    first, last = max(bands, key=lambda b: omega[b[1]] / omega[b[0]])
+    low, high = (number(float(omega[k]) / (2.0 * np.pi), 3) for k in (first, last))
+    return mean, low, high

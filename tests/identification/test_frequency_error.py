@@ -1,0 +1,152 @@
+"""Frequency error: the identity it rests on, estimates and intervals, and what it refuses."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
+from heli_jax.identification.estimation.frequency_error import smoothed
+from tests.identification.bench import BENCH, record, vehicle
+
+DT = 0.02
+
+
+def two_states(growth: float, hold: str, n: int = 400) -> tuple[np.ndarray, ...]:
+    """u and x (n + 1 samples) of x' = A x + B u by SciPy's exponential, exact for that hold."""
+    A, B = np.array([[growth, 1.0], [-9.0, -0.8]]), np.array([[0.5], [2.0]])
+    M = np.zeros((4, 4))
+    M[:2, :2], M[:2, 2:3], M[2, 3] = A, B, 1.0 / DT
+    E = scipy.linalg.expm(M * DT)
+    G, R = E[:2, 2], E[:2, 3]
+    u = np.cumsum(np.random.default_rng(0).standard_normal(n + 1)) * 0.1
+    x = np.zeros((n + 1, 2))
+    x[0] = 0.3, -1.0
+    for k in range(n):
+        # A ramp takes from this sample what it gives to the next one.
+        ramp = R * (u[k + 1] - u[k]) if hold == "linear" else 0.0
+        x[k + 1] = E[:2, :2] @ x[k] + G * u[k] + ramp
+    return E[:2, :2], G, R, u, x
+
+
+@pytest.mark.parametrize("hold", ["zero-order", "linear"])
+@pytest.mark.parametrize("growth", [-0.5, 1.3])
+def test_the_identity_holds_for_stable_and_unstable_machines(growth, hold):
+    Ad, G, R, u, x = two_states(growth, hold)
+    n = len(u) - 1
+    z = np.exp(2j * np.pi * np.arange(1, n // 2) / n)
+    X, U = (np.fft.fft(v[:n], axis=0)[1 : n // 2] for v in (x, u))
+    U_next = np.fft.fft(u[1:])[1 : n // 2]
+    drive = np.outer(U, G) + (np.outer(U_next - U, R) if hold == "linear" else 0.0)
+    drive = drive + z[:, None] * (x[0] - x[n])[None, :]
+    left = np.linalg.solve(z[:, None, None] * np.eye(2) - Ad, drive[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(left, X, atol=1e-12 * np.max(np.abs(X)) * n)
+
+
+def test_estimates_are_those_of_output_error_in_white_noise():
+    flight = record(BENCH, seed=3, n=3000)
+    free = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
+    by = {
+        method: fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free, method=method))
+        for method in ("output-error", "frequency-error")
+    }
+    assert by["frequency-error"].status == "converged"
+    for name, one in by["frequency-error"].estimates.items():
+        other = by["output-error"].estimates[name]
+        assert one.lower95 < BENCH[name] < one.upper95
+        assert one.sd == pytest.approx(other.sd, rel=0.2)
+        assert abs(one.value - other.value) < 1.5 * other.sd
+    # The simulation in time has initial state and bias of its own, though no line knows them.
+    assert by["frequency-error"].metrics[0].vaf > 0.999
+    assert by["frequency-error"].noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.05)
+
+
+def test_an_unstable_machine_needs_no_windows():
+    """Roll with a divergence of 1 1/s, flown for 30 s in which it grows by 1e13."""
+    model = linear_model(
+        {
+            "name": "falling",
+            "states": {"p": "rad/s", "phi": "rad"},
+            "inputs": {"lat": "1"},
+            "outputs": {"p": "rad/s", "phi": "rad"},
+            "parameters": {
+                "Lphi": {"value": 2.0, "unit": "1/s^2"},
+                "Lp": {"value": -1.0, "unit": "1/s"},
+                "Llat": {"value": 10.0, "unit": "rad/s^2"},
+            },
+            "A": {"p": {"p": "Lp", "phi": "Lphi"}, "phi": {"p": 1}},
+            "B": {"p": {"lat": "Llat"}},
+            "C": {"p": {"p": 1}, "phi": {"phi": 1}},
+        }
+    )
+    rng = np.random.default_rng(2)
+    M = np.zeros((3, 3))
+    M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
+    E = scipy.linalg.expm(M * DT)
+    n = 1500
+    steps = np.repeat(rng.uniform(-0.1, 0.1, n // 20 + 1), 20)[:n]
+    x, u, y = np.zeros(2), np.zeros(n), np.zeros((n, 2))
+    for k in range(n):
+        y[k] = x + rng.standard_normal(2) * [0.02, 0.005]
+        # A pilot who sees no noise, so that nothing of it comes back through the stick.
+        u[k] = steps[k] - 0.3 * x[0] - 0.9 * x[1]
+        x = E[:2, :2] @ x + E[:2, 2] * u[k]
+    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": y[:, 0], "phi": y[:, 1]})
+    truth = {"Lphi": 2.0, "Lp": -1.0, "Llat": 10.0}
+    free = {n: Free(1.4 * v) for n, v in truth.items()}
+    found = fit(
+        Problem(
+            model.model, model.vehicle().params, [flight], free, Nuisance(bias=False),
+            method="frequency-error",
+        )
+    )  # fmt: skip
+    assert found.verdict.identifiable
+    for name, one in found.estimates.items():
+        assert one.lower95 < truth[name] < one.upper95
+        assert one.sd < 0.1 * abs(truth[name])
+
+
+def test_the_noise_spectrum_of_two_outputs_is_found():
+    """A matrix over the outputs: correlated noise, white in one and slow in the other."""
+    rng = np.random.default_rng(1)
+    n = 20001
+    common = rng.standard_normal(n)
+    noise = np.stack([common, 0.5 * common + np.convolve(rng.standard_normal(n), [1, 0.9], "same")])
+    lines = np.fft.rfft(noise, axis=1)[:, 1:].T / np.sqrt(n)
+    [S] = smoothed([lines])
+    omega = np.pi * np.arange(1, len(S) + 1) / (n / 2)
+    middle = slice(2000, -2000)
+    np.testing.assert_allclose(S[middle, 0, 0].real, 1.0, rtol=0.2)
+    np.testing.assert_allclose(S[middle, 0, 1].real, 0.5, atol=0.2)
+    slow = 0.25 + np.abs(1 + 0.9 * np.exp(-1j * omega)) ** 2
+    np.testing.assert_allclose(S[middle, 1, 1].real, slow[middle], rtol=0.25)
+
+
+def test_what_it_cannot_do_is_refused_with_what_can():
+    flight = record(BENCH, seed=3, n=1500)
+    roll = flight.outputs["roll"].copy()
+    roll[7] = np.nan
+    gap = Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, name="first")
+    with pytest.raises(ValueError, match="first: output roll has 1 missing samples"):
+        Problem(
+            models.roll_on_stand, vehicle(BENCH), [gap], {"Ixx": Free(0.03)},
+            method="frequency-error",
+        )  # fmt: skip
+
+
+def test_a_shift_of_the_inputs_is_a_phase():
+    flight = record(BENCH, seed=5, n=3000)
+    late = np.concatenate([np.full(3, flight.outputs["roll"][0]), flight.outputs["roll"][:-3]])
+    found = fit(
+        Problem(
+            models.roll_on_stand,
+            vehicle(BENCH),
+            [Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": late})],
+            {"Ixx": Free(0.03), "kappa": Free(5.0)},
+            Nuisance(time_shift=True),
+            method="frequency-error",
+        )
+    )
+    shift = found.nuisance["time_shift"]
+    assert shift.lower95 < 3 * flight.dt < shift.upper95
+    assert jnp.isfinite(shift.sd)

@@ -1,0 +1,164 @@
+"""`heli-jax frf`: from a log to responses, by a known linear system that SciPy simulated."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import scipy.signal
+import xarray as xr
+
+from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.cli import main
+from heli_jax.flights import Flight
+
+DT = 0.02
+ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
+CONFIG = """
+model: {linear: roll-flybarless}
+vehicle:
+  tau_f: {value: 0.07, unit: s}
+  Lb: {value: 3600, unit: 1/s^2}
+  Blat: {value: 0.14, unit: rad}
+flights:
+  - log: log.csv
+    signals: &signals
+      time: {signal: t}
+      inputs: {lat: {signal: stick, unit: "1", hold: zero-order}}
+      outputs: {p: {signal: gyro, unit: rad/s}}
+      instruments: {lat: {signal: sweep}}
+frequency:
+  window: 10
+  transfer_functions:
+    - {input: lat, output: p, poles: 1}
+"""
+
+
+def record(seed: int, n: int = 6000, feedback: float = 0.0) -> dict[str, np.ndarray]:
+    """Twelve over s + 3 from a stick that is held, with gusts, and a stick that may follow."""
+    rng = np.random.default_rng(seed)
+    b, a = ROLL[0].ravel()[1], ROLL[1][1]
+    slow = scipy.signal.butter(1, 2.0, fs=1 / DT)
+    sweep = scipy.signal.lfilter(*slow, rng.standard_normal(n))
+    gust = scipy.signal.lfilter(*slow, rng.standard_normal(n))
+    p, u = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        u[k] = sweep[k] - (feedback * p[k] if k else 0.0)
+        if k + 1 < n:
+            p[k + 1] = -a * p[k] + b * (u[k] + 0.3 * gust[k])
+    return {"t": DT * np.arange(n), "stick": u, "gyro": p, "sweep": sweep}
+
+
+def flight(seed: int, **more: float) -> Flight:
+    r = record(seed, **more)
+    return Flight(
+        dt=DT, inputs={"lat": r["stick"]}, outputs={"p": r["gyro"]}, instruments={"lat": r["sweep"]}
+    )
+
+
+@pytest.fixture
+def config(tmp_path):
+    columns = record(3, feedback=0.4)
+    with (tmp_path / "log.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+    path = tmp_path / "roll.yaml"
+    path.write_text(CONFIG)
+    return path
+
+
+def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["frf", str(config), "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert "lat to p, 0 zeros, 1 poles" in printed.out
+    # By its instrument: nothing is to be said of feedback.
+    assert "do not follow" not in printed.err
+    (fitted,) = json.loads((out / "transfer_functions.json").read_text())
+    pole = fitted["denominator"][1]
+    assert pole["lower95"] < 3.0 < pole["upper95"]
+    assert pole["sd"] < 1.0
+    # The hold of the stick is half a sample late, which is not the machine's.
+    assert fitted["delay_s"]["lower95"] < 0.0 < fitted["delay_s"]["upper95"]
+    data = xr.open_dataset(out / "responses.nc", engine="scipy")
+    H = (data["real"] + 1j * data["imaginary"]).sel(input="lat", output="p").values
+    omega = 2.0 * np.pi * data.frequency.values
+    true = scipy.signal.freqz(ROLL[0].ravel(), ROLL[1], omega * DT)[1]
+    z = (H - true) / data.sd.values[0, 0]
+    assert np.mean(np.abs(np.stack([z.real, z.imag])) < 1.96) > 0.85
+    rows = list(csv.DictReader((out / "responses.csv").read_text().splitlines()))
+    assert len(rows) == 120
+    assert float(rows[7]["gain"]) == pytest.approx(abs(H[7]), rel=1e-12)
+    page = (out / "responses.html").read_text()
+    assert "lat to p" in page
+    assert (out / "figures/p-lat.png").exists()
+
+
+def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, capsys):
+    text = config.read_text().replace("      instruments: {lat: {signal: sweep}}\n", "")
+    config.write_text(text)
+    assert main(["frf", str(config), "--out", str(tmp_path / "direct")]) == 0
+    assert "lat: taken for inputs that do not follow the outputs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("frequency.band=[0.1, 5]", "at least two periods in a window of 10 s, from 0.2 Hz on"),
+        ("frequency.band=[1, 30]", "below half the rate of 50 Hz, got 30 Hz"),
+        ("frequency.band=[5, 1]", "expected two increasing frequencies in Hz, got [5, 1]"),
+        ("frequency.window=200", "a part of at least 10000 samples (a window)"),
+        ("frequency.transfer_functions.0.output=q", "has no output 'q'"),
+        ("frequency.transfer_functions.0.zeros=3", "expected at most as many as poles (1), got 3"),
+        ("flights.0.signals.instruments={ped: {signal: sweep}}", "has no input 'ped'"),
+        ("flights.0.signals.instruments={lat: {constant: 1}}", "expected a signal of the log"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_sentence(config, tmp_path, capsys, change, sentence):
+    out = tmp_path / "none"
+    assert main(["frf", str(config), "--set", change, "--out", str(out)]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_missing_samples_divide_a_record_and_too_many_leave_nothing():
+    whole = flight(0)
+    y = whole.outputs["p"].copy()
+    y[2000:2010] = np.nan
+    gap = Flight(dt=DT, inputs=whole.inputs, outputs={"p": y})
+    settings = Settings(window=10.0)
+    assert (
+        flight_responses([gap], settings).outputs["p"].averages
+        < flight_responses([whole], settings).outputs["p"].averages
+    )
+    y[::400] = np.nan
+    with pytest.raises(ValueError, match="p: no response, expected a part of at least 500 samples"):
+        flight_responses([Flight(dt=DT, inputs=whole.inputs, outputs={"p": y})], settings)
+
+
+def test_where_a_signal_has_no_power_of_its_own_there_is_no_response():
+    whole = flight(1)
+    b, a = scipy.signal.butter(4, 1.0, fs=1 / DT)
+    filtered = Flight(
+        dt=DT,
+        inputs={"lat": scipy.signal.lfilter(b, a, whole.inputs["lat"])},
+        outputs={"p": scipy.signal.lfilter(b, a, whole.outputs["p"])},
+    )
+    found = flight_responses([filtered], Settings(window=10.0))
+    H, hz = found.outputs["p"].pairs["lat"].H, found.omega / (2.0 * np.pi)
+    assert np.isfinite(H[hz < 1.0]).all()
+    assert np.isnan(H[hz > 15.0]).all()
+
+
+def test_flights_of_two_rates_are_refused():
+    other = Flight(dt=0.01, inputs=flight(0).inputs, outputs=flight(0).outputs)
+    with pytest.raises(ValueError, match="expected flights of one rate, got 50, 100 Hz"):
+        flight_responses([flight(0), other])
+
+
+def test_an_order_that_is_too_low_is_called_so():
+    quick = [flight(s) for s in range(2)]
+    wanted = Wanted("lat", "p", 0, 1, delay=False)
+    found = flight_responses(quick, Settings(window=10.0, transfer_functions=(wanted,)))
+    assert found.fits[0][1].chi_squared < 2.0
