@@ -182,15 +182,21 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "heli_jax"
 
 
-def _fit(options: argparse.Namespace) -> int:
-    began = time.perf_counter()  # before JAX is imported, which the user waits for too
+def _new_directory(options: argparse.Namespace) -> Path:
+    """Where a run's files go, known to be free."""
     config = Path(options.config)
     out = Path(options.out) if options.out else run_directory.default_directory(config)
     run_directory.require_free(out)  # at once, before the seconds of the imports
+    return out
+
+
+def _fit(options: argparse.Namespace) -> int:
+    began = time.perf_counter()  # before JAX is imported, which the user waits for too
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import output, workflow
 
-    experiment = workflow.load_config(config, options.set)
+    experiment = workflow.load_config(options.config, options.set)
     run = workflow.run_fit(experiment, out, progress=_say, began=began)
     output.print_fit(run)
     return _fit_code(run.fit)
@@ -247,21 +253,12 @@ def _compatibility(options: argparse.Namespace) -> int:
 
 
 def _frf(options: argparse.Namespace) -> int:
-    config = Path(options.config)
-    out = Path(options.out) if options.out else run_directory.default_directory(config)
-    run_directory.require_free(out)
+    out = _new_directory(options)
     _prepare_jax()
     from heli_jax import log_responses, workflow
-    from heli_jax.report.responses import write_responses
 
-    experiment = workflow.load_config(config, options.set)
-    found = log_responses.responses_of_log(experiment, options.log, progress=_say)
-    with run_directory.whole(out) as temporary:
-        write_responses(temporary, found, log_responses.units_of(experiment), config.stem)
-    for note in found.notes:
-        _say(note)
-    log_responses.print_responses(found)
-    _say(f"wrote {out / 'responses.html'}")
+    experiment = workflow.load_config(options.config, options.set)
+    log_responses.run_responses(experiment, out, options.log, _say)
     return DONE
 
 

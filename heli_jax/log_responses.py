@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from heli_jax import naming
+from heli_jax import naming, run_directory
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.frequency_section import FrequencyConfig
@@ -65,6 +65,28 @@ def _check_pairs(experiment: Experiment, config: FrequencyConfig) -> None:
                     f"{experiment.path}: frequency.transfer_functions[{i}].{role}: model "
                     f"{experiment.model.name} has no {role} {name!r}{nearest(name, known)}"
                 )
+
+
+def run_responses(
+    experiment: Experiment, out: Path, log: str | None, say: Callable[[str], None]
+) -> None:
+    """Write the responses into a new directory, and print them.
+
+    Args:
+        experiment: the configuration.
+        out: the directory.
+        log: in place of the configuration's.
+        say: called with notes, and where the page is.
+    """
+    from heli_jax.report.responses import write_responses
+
+    found = responses_of_log(experiment, log, say)
+    with run_directory.whole(out) as temporary:
+        write_responses(temporary, found, units_of(experiment), Path(experiment.path).stem)
+    for note in found.notes:
+        say(note)
+    print_responses(found)
+    say(f"wrote {out / 'responses.html'}")
 
 
 def units_of(experiment: Experiment) -> dict[str, str]:
