@@ -59,7 +59,9 @@ def rotor_lines(log: ChannelLog) -> RotorLines | None:
     """
     with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
         for name in fitting_presets(log.format, log.names):
-            found = _by_preset(with_derived(log), preset(name))
+            derived = with_derived(log)
+            assert isinstance(derived, DerivedLog)  # of a ChannelLog it is one
+            found = _by_preset(derived, preset(name))
             if found is not None:
                 return found
     return None

@@ -10,6 +10,19 @@ from heli_jax.identification.estimation.frequency_error import smoothed
 from tests.identification.bench import BENCH, record, vehicle
 
 DT = 0.02
+FALLING = """
+name: falling
+states: {p: rad/s, phi: rad}
+inputs: {lat: "1"}
+outputs: {p: rad/s, phi: rad}
+parameters:
+  Lphi: {value: 2.0, unit: 1/s^2, source: none}
+  Lp: {value: -1.0, unit: 1/s, source: none}
+  Llat: {value: 10.0, unit: rad/s^2, source: none}
+A: {p: {p: Lp, phi: Lphi}, phi: {p: 1}}
+B: {p: {lat: Llat}}
+C: {p: {p: 1}, phi: {phi: 1}}
+"""
 
 
 def two_states(growth: float, hold: str, n: int = 400) -> tuple[np.ndarray, ...]:
@@ -57,28 +70,15 @@ def test_estimates_are_those_of_output_error_in_white_noise():
         assert one.sd == pytest.approx(other.sd, rel=0.2)
         assert abs(one.value - other.value) < 1.5 * other.sd
     # The simulation in time has initial state and bias of its own, though no line knows them.
-    assert by["frequency-error"].metrics[0].vaf > 0.999
+    assert by["frequency-error"].metrics["roll"].vaf > 0.999
     assert by["frequency-error"].noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.05)
 
 
-def test_an_unstable_machine_needs_no_windows():
+def test_an_unstable_machine_needs_no_windows(tmp_path):
     """Roll with a divergence of 1 1/s, flown for 30 s in which it grows by 1e13."""
-    model = linear_model(
-        {
-            "name": "falling",
-            "states": {"p": "rad/s", "phi": "rad"},
-            "inputs": {"lat": "1"},
-            "outputs": {"p": "rad/s", "phi": "rad"},
-            "parameters": {
-                "Lphi": {"value": 2.0, "unit": "1/s^2"},
-                "Lp": {"value": -1.0, "unit": "1/s"},
-                "Llat": {"value": 10.0, "unit": "rad/s^2"},
-            },
-            "A": {"p": {"p": "Lp", "phi": "Lphi"}, "phi": {"p": 1}},
-            "B": {"p": {"lat": "Llat"}},
-            "C": {"p": {"p": 1}, "phi": {"phi": 1}},
-        }
-    )
+    path = tmp_path / "falling.yaml"
+    path.write_text(FALLING)
+    model = linear_model(path)
     rng = np.random.default_rng(2)
     M = np.zeros((3, 3))
     M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
@@ -109,13 +109,13 @@ def test_an_unstable_machine_needs_no_windows():
 def test_the_noise_spectrum_of_two_outputs_is_found():
     """A matrix over the outputs: correlated noise, white in one and slow in the other."""
     rng = np.random.default_rng(1)
-    n = 20001
+    n = 8001
     common = rng.standard_normal(n)
     noise = np.stack([common, 0.5 * common + np.convolve(rng.standard_normal(n), [1, 0.9], "same")])
     lines = np.fft.rfft(noise, axis=1)[:, 1:].T / np.sqrt(n)
     [S] = smoothed([lines])
     omega = np.pi * np.arange(1, len(S) + 1) / (n / 2)
-    middle = slice(2000, -2000)
+    middle = slice(800, -800)
     np.testing.assert_allclose(S[middle, 0, 0].real, 1.0, rtol=0.2)
     np.testing.assert_allclose(S[middle, 0, 1].real, 0.5, atol=0.2)
     slow = 0.25 + np.abs(1 + 0.9 * np.exp(-1j * omega)) ** 2
@@ -134,8 +134,9 @@ def test_what_it_cannot_do_is_refused_with_what_can():
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_shift_of_the_inputs_is_a_phase():
-    flight = record(BENCH, seed=5, n=3000)
+    flight = record(BENCH, seed=6, n=3000)
     late = np.concatenate([np.full(3, flight.outputs["roll"][0]), flight.outputs["roll"][:-3]])
     found = fit(
         Problem(

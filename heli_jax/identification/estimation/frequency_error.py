@@ -293,7 +293,7 @@ def _rows(lines: _Lines, whitening: Complex[Array, "K p p"]) -> Float[Array, " r
     Q = jnp.linalg.qr(_real(lines.basis.reshape(-1, lines.basis.shape[2])))[0]
     Q = jax.lax.stop_gradient(Q)
     # Of a complex normal error each part has half of the variance.
-    return jnp.sqrt(2.0) * (stacked - Q @ (Q.T @ stacked))
+    return 2.0**0.5 * (stacked - Q @ (Q.T @ stacked))
 
 
 def _real(v: Complex[Array, "r n"]) -> Float[Array, "s n"]:
@@ -314,12 +314,12 @@ def _lines(layout: Layout, data: Data, u: Unknowns, i: int, whitening: Array) ->
 
     def lines(v: Array) -> Array:
         # Without a mean: the zero line is not used, and rounding would carry it to the others.
-        return jnp.fft.rfft(v - jnp.mean(v, axis=0), axis=0)[k] / np.sqrt(N)
+        return jnp.fft.rfft(v - jnp.mean(v, axis=0, keepdims=True), axis=0)[k] * float(N) ** -0.5
 
     y = jnp.stack([flight.outputs[n] for n in names], axis=1)
     identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
     still = jax.lax.stop_gradient(Ad).astype(z.dtype)
-    P = jnp.linalg.inv(z[:, None, None] * identity - still)
+    P = jnp.linalg.inv(z[:, None, None] * identity[None] - still[None])
     X = _states(P, Ad, lines(U) @ B.T.astype(z.dtype))
     error = lines(y) - X @ C.T.astype(z.dtype) - lines(acting) @ D.T.astype(z.dtype)
     ends = z[:, None, None] * jnp.einsum("pn,knm->kpm", jax.lax.stop_gradient(C).astype(z.dtype), P)
