@@ -42,8 +42,13 @@ class _TrustRegion(optx.ClassicalTrustRegion):
     make.
     """
 
-    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> _Region:
-        """As optimistix: without a radius."""
+    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
+        """As optimistix: a `_Region` without a radius.
+
+        Args:
+            y: the unknowns.
+            f_info_struct: shapes of residuals and Jacobian.
+        """
         begin = super().init(y, f_info_struct)
         return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
 
