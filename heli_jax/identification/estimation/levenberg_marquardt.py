@@ -151,8 +151,7 @@ def _advance(constants: _Constants, state: _State, R: Float[Array, "k k"]) -> _S
     new = trust_region.within_radius(new, xi)
     new = trust_region.within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
-    norm = constants.scaling.residual_norm
-    done |= trust_region.arrived(new.f_info, constants.convergence_mask, norm)
+    done |= trust_region.arrived(new.f_info, constants.scaling.residual_norm)
     fine = result == optx.RESULTS.successful
     stepped = _State(xi, new, done | ~fine, done & fine)
     # Side by side a run that is done stays, while the slowest goes on.

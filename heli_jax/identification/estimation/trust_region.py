@@ -42,8 +42,13 @@ class _TrustRegion(optx.ClassicalTrustRegion):
     make.
     """
 
-    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> _Region:
-        """As optimistix: without a radius."""
+    def init(self, y: Float[Array, " q"], f_info_struct: Any) -> Any:
+        """As optimistix: a `_Region` without a radius.
+
+        Args:
+            y: the unknowns.
+            f_info_struct: shapes of residuals and Jacobian.
+        """
         begin = super().init(y, f_info_struct)
         return _Region(begin.step_size, jnp.asarray(jnp.inf, y.dtype))
 
@@ -151,27 +156,25 @@ def within_radius(state: Any, y: Float[Array, " q"]) -> Any:
     return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
 
 
-def arrived(
-    f_info: Any, convergence_mask: Bool[Array, " q"], residual_norm: Float[Array, ""]
-) -> Bool[Array, ""]:
+def arrived(f_info: Any, residual_norm: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a full Gauss-Newton step would take next to nothing off the sum of squares.
 
     That gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations.
     Unlike the length of a step it asks for no unit, and a direction that the data leave all but
-    open is not polished.
+    open is not polished. An unknown that runs off, as the size of a disturbance that is none, has
+    such a gain for ever: then the length of the others' steps has to tell.
 
     Args:
         f_info: residuals and Jacobian at the last point that was accepted.
-        convergence_mask: the unknowns that count; the others go where they like.
         residual_norm: by which the residuals are divided, those of a variance of 1.
     """
     J = f_info.jac.as_matrix()
-    counts = convergence_mask & jnp.any(J != 0, axis=0)
-    # In a triangle each unknown is freed of those before it: first the ones that do not count, then
-    # the ones that do. A column of zeros, that of an unknown that stays put, has no direction.
-    order = jnp.argsort(jnp.where(convergence_mask, jnp.where(counts, 1, 2), 0))
+    # A column of zeros, that of an unknown that stays put, has no direction: behind the others in
+    # the triangle it takes nothing from them.
+    moves = jnp.any(J != 0, axis=0)
+    order = jnp.argsort(~moves)
     R = jnp.linalg.qr(jnp.concatenate([J[:, order], f_info.residual[:, None]], axis=1), mode="r")
-    gain = jnp.sum(jnp.where(counts[order], jnp.square(R[:-1, -1]), 0.0))
+    gain = jnp.sum(jnp.where(moves[order], jnp.square(R[:-1, -1]), 0.0))
     return gain * residual_norm**2 < _ARRIVED
 
 

@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.analysis.trim import is_full_nonlinear, trim
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Data, FlightData, Layout
@@ -42,16 +44,16 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
 
 
 def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
-    """The model's own initial state, or for one that is not linear the nearest that shows the
-    measured outputs at the first sample of the window."""
+    """The model's own initial state (of a whole helicopter its hover), or for one that is not
+    linear the nearest that shows the measured outputs at the first sample of the window."""
     at, names = layout.first_nuisance, naming.names(layout.model.State)
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
     for i, flight in enumerate(data.flights):
         count, m = layout.windows[i]
         # What is known of this flight alone stands over what is free in all of them.
         params = layout.model.Params(**{**data.base, **values, **flight.known})
-        by_model = naming.asdict(layout.model.initial_state(params))
-        first = np.array([float(by_model[n]) for n in names])
+        by_model = own_start(layout.model, params)
+        first = np.array([by_model[n] for n in names])
         for k in range(count):
             x0 = first
             # The residual of a linear model is linear in its initial states: one step finds them
@@ -66,6 +68,25 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> A
             at += len(layout.states)
         at += layout.constants(layout.outputs[i])
     return z
+
+
+def own_start(model: Model, params: Any) -> dict[str, float]:
+    """Where the model begins, by state; what a whole helicopter begins at zero is as in hover.
+
+    Args:
+        model: of any machine.
+        params: its Params, concrete numbers, SI.
+    """
+    start = {n: float(v) for n, v in naming.asdict(model.initial_state(params)).items()}
+    if not is_full_nonlinear(model):
+        return start
+    # With its tail's side force a helicopter hovers on a bank, with its rotor tilted. From level it
+    # would slide away, and what no output shows would have to be searched for from there.
+    try:
+        hover = trim(model, params).state
+    except ValueError:  # the start values cannot fly; the optimum may
+        return start
+    return {n: v if v != 0.0 else float(getattr(hover, n)) for n, v in start.items()}
 
 
 _LINE = 5
