@@ -146,6 +146,8 @@ def _given(content: dict[str, Any]) -> set[str]:
 
 _STRAIGHT_UP = 1.6
 """rad"""
+_FASTEST = 75.0
+"""rad/s; gyros go to 2000 deg/s, a few to 4000"""
 
 
 def prepared(model: Model, flight: Flight, where: str) -> Flight:
@@ -157,7 +159,8 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         where: what an error begins with.
 
     Raises:
-        InputError: the machine points so steeply up or down that its angles mean nothing.
+        InputError: the machine points so steeply up or down that its angles mean nothing, or turns
+            faster than gyros measure.
     """
     if not is_kinematic(model):
         return flight
@@ -170,11 +173,23 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
             f"{where}: theta reaches {np.degrees(reached):.0f} deg, expected at most "
             f"{np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: {remedy}"
         )
+    _check_rates(flight, where)
     # The kinematics turn on where a log begins again at -180 deg.
     turned = {n: _unwrapped(y) for n, y in flight.outputs.items() if n in ANGLES}
     if all(np.array_equal(y, flight.outputs[n], equal_nan=True) for n, y in turned.items()):
         return flight
     return dataclasses.replace(flight, outputs={**flight.outputs, **turned})
+
+
+def _check_rates(flight: Flight, where: str) -> None:
+    for n in RATES:
+        rate = flight.inputs.get(n)
+        fastest = 0.0 if rate is None else np.nanmax(np.abs(rate), initial=0.0)
+        if fastest > _FASTEST:
+            raise InputError(
+                f"{where}: {n} reaches {fastest:.0f} rad/s, expected at most {_FASTEST:g} rad/s, "
+                "more than gyros show: is its unit another?"
+            )
 
 
 def _unwrapped(angle: np.ndarray) -> np.ndarray:

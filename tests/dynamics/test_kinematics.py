@@ -191,3 +191,13 @@ def test_noise_of_the_gyros_is_a_random_walk_of_the_angle():
     # An independent count: the spread of many angles after a second of such noise.
     drift = np.std(dt * sd * rng.standard_normal((4000, 100)).sum(axis=1))
     assert noise_of(kinematics.attitude, [flight])["noise_gyro"] == pytest.approx(drift, rel=0.05)
+
+
+def test_degrees_that_are_read_as_radians_are_refused():
+    rates = dict.fromkeys("pqr", np.linspace(-100.0, 80.0, 50))
+    flight = Flight(dt=0.1, inputs=rates, outputs={"phi": np.zeros(50)})
+    with pytest.raises(InputError, match=r"a: p reaches 100 rad/s, .*: is its unit another\?"):
+        prepared(kinematics.attitude, flight, "a")
+    far = Flight(dt=0.1, inputs={}, outputs={"theta": np.linspace(0, 30, 50)})
+    with pytest.raises(InputError, match=r"theta reaches 1719 deg, .*: is its unit another\?"):
+        prepared(kinematics.attitude, far, "a")
