@@ -159,8 +159,8 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         where: what an error begins with.
 
     Raises:
-        InputError: the machine points so steeply up or down that its angles mean nothing, or turns
-            faster than gyros measure.
+        InputError: the machine points so steeply up or down that its angles mean nothing, turns
+            faster than gyros measure, or a channel never moves.
     """
     if not is_kinematic(model):
         return flight
@@ -174,6 +174,7 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
             f"{np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: {remedy}"
         )
     _check_rates(flight, where)
+    _check_moving(flight, where)
     # The kinematics turn on where a log begins again at -180 deg.
     turned = {n: _unwrapped(y) for n, y in flight.outputs.items() if n in ANGLES}
     if all(np.array_equal(y, flight.outputs[n], equal_nan=True) for n, y in turned.items()):
@@ -189,6 +190,19 @@ def _check_rates(flight: Flight, where: str) -> None:
             raise InputError(
                 f"{where}: {n} reaches {fastest:.0f} rad/s, expected at most {_FASTEST:g} rad/s, "
                 "more than gyros show: is its unit another?"
+            )
+
+
+def _check_moving(flight: Flight, where: str) -> None:
+    signals = {} if flight.source is None else flight.source.inputs
+    stated = {n for n, u in signals.items() if u.constant is not None}
+    for n, x in {**flight.inputs, **flight.outputs}.items():
+        seen = x[np.isfinite(x)]
+        # Fitted to a channel that stands still, every scale of the others would run away.
+        if n not in stated and seen.size and np.ptp(seen) == 0.0:
+            raise InputError(
+                f"{where}: {n} is {seen[0]:g} in all samples, expected one that moves: a sensor "
+                "that is dead says nothing of the others; leave it out, or choose another window"
             )
 
 
