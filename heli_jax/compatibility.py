@@ -29,6 +29,8 @@ AGREES = 0.9
 """R^2 of a channel from which on its sensors agree (the acceptance card's gate)"""
 _RESTS = 0.5
 """share of the prior in what is known of an error from which on the record does not determine it"""
+_NO_NOISE = 1e-9
+"""part of a signal below which noise is none: no log has so many digits"""
 _LARGEST_SCALE = 0.1
 """scale error beyond which it is hardly the sensor's own: a cheap one is good to some percent"""
 
@@ -100,10 +102,11 @@ def run_compatibility(
         )
     run = workflow.run_fit(experiment, progress=progress)
     found = judged(run)
-    if _smoother_than_noise(run):
-        progress("the log is smooth: once more by output error")
+    if _without_noise(run):
+        reason = _SMOOTH if _smooth(run) else _BEYOND_NOISE
+        progress("filter error has no end: once more by output error")
         found = judged(workflow.run_fit(_by_output_error(experiment), progress=_silent))
-        found = dataclasses.replace(found, doubts=(_SMOOTH, *found.doubts))
+        found = dataclasses.replace(found, doubts=(reason, *found.doubts))
         run = found.run
     if out is None:
         return found
@@ -120,12 +123,22 @@ _SMOOTH = (
     "noise of gyros and angles cannot be told: fitted by output error, whose intervals go by the "
     "autocorrelation of the residuals."
 )
+_BEYOND_NOISE = (
+    "Filter error, which estimates the noise too, did not converge: the signals differ by more "
+    "than these errors and noise. Fitted by output error."
+)
 
 
-def _smoother_than_noise(run: FitRun) -> bool:
-    """Whether filter error found no noise to hold its innovations against."""
+def _without_noise(run: FitRun) -> bool:
+    """Whether filter error looked for noise to hold its innovations against, and found none."""
     searched = {*NOISES} & {*run.problem.free}
     return run.fit.method == "filter-error" and bool(searched) and run.fit.status == "not-converged"
+
+
+def _smooth(run: FitRun) -> bool:
+    """Whether the noise of an output ran to zero, beside that of the gyros."""
+    sizes = [np.nanstd(y) for s in run.fit.signals for y in s.measured.values()]
+    return min(run.fit.noise.values(), default=1.0) < _NO_NOISE * max(sizes, default=0.0)
 
 
 def _by_output_error(experiment: Experiment) -> Experiment:
@@ -145,15 +158,13 @@ def judged(run: FitRun) -> Compatibility:
     r_squared = r_squared_of(run)
     bad = [n for n, r in r_squared.items() if not r >= AGREES]
     converged = run.fit.status != "not-converged"
-    return Compatibility(
-        run,
-        errors,
-        r_squared,
-        converged and not bad,
-        _verdict(errors, r_squared, bad, converged),
-        _doubts(run, errors),
-        _corrections(run, {e.name: e.estimate.value for e in errors if e.determined}, errors),
-    )
+    compatible, verdict = converged and not bad, _verdict(errors, r_squared, bad, converged)
+    # Of signals that do not fit together the errors are those of a wrong model: none to take off.
+    known = {e.name: e.estimate.value for e in errors if e.determined and compatible}
+    corrections = _corrections(run, known, errors)
+    corrections["verdict"] = verdict
+    doubts = _doubts(run, errors)
+    return Compatibility(run, errors, r_squared, compatible, verdict, doubts, corrections)
 
 
 def _error(run: FitRun, name: str, estimate: Estimate) -> SensorError:
@@ -199,19 +210,21 @@ def _verdict(
 
 def _doubts(run: FitRun, errors: Sequence[SensorError]) -> tuple[str, ...]:
     """What a fit says of itself, and errors that no sensor has."""
+    # That a simulation misses a channel is in the verdict, and its remedies are those of a machine.
+    notes = tuple(n for n in run.fit.notes if n not in run.fit.adequacy.sentences)
     scales = [
         e
         for e in errors
         if e.shows and e.name.startswith("lambda_") and abs(e.estimate.value) > _LARGEST_SCALE
     ]
     if not scales:
-        return run.fit.notes
+        return notes
     words = ", ".join(f"{e.name} {e.estimate.value:+.0%}" for e in scales)
     return (
         f"{words}: more than a sensor's own error. Is it a unit, a filter in front of one of the "
         "two signals, or an angle that is an estimator's and not the machine's? Such numbers bring "
         "the log's signals together; which of them is wrong they do not say.",
-        *run.fit.notes,
+        *notes,
     )
 
 

@@ -133,7 +133,8 @@ def fitted(folder, estimates, shares, status="converged") -> Any:
         verdict=SimpleNamespace(resting=()),
         status=status,
         signals=[signals],
-        notes=("of the fit",),
+        notes=("of the fit", "of a machine"),
+        adequacy=SimpleNamespace(sentences=("of a machine",)),
     )
     problem = SimpleNamespace(flights=config.read_flights(experiment))
     return SimpleNamespace(config=experiment, fit=fit, problem=problem)
@@ -148,7 +149,7 @@ def test_a_fit_is_put_in_words(folder):
         "Compatible once lambda_p, delay_gyro are corrected: R2 0.9500 or more."
     )
     assert judged.doubts[0].startswith("lambda_p +23%: more than a sensor's own error.")
-    assert judged.doubts[1] == "of the fit"
+    assert judged.doubts[1:] == ("of the fit",)
     rows = [row[:2] + row[3:4] for row in compatibility.table(judged)[1]]
     assert rows == [
         ("lambda_p", "0.2300 +- 0.0040", "yes"), ("b_p", "0.0010 +- 0.0020", "no"),
@@ -159,6 +160,8 @@ def test_a_fit_is_put_in_words(folder):
     bad = compatibility.judged(fitted(folder, found, {"phi": 0.99, "psi": 0.2}))
     assert not bad.compatible
     assert "bring psi (R2 0.200) to R2 0.9" in bad.verdict
+    assert bad.corrections["verdict"] == bad.verdict
+    assert not bad.corrections["signals"]
     lost = compatibility.judged(fitted(folder, found, {"phi": 0.99}, "not-converged"))
     assert not lost.compatible
     assert not lost.corrections["signals"]

@@ -57,6 +57,8 @@ class Corrections(_Strict):
     """A file of corrections."""
 
     found_by: str = ""
+    verdict: str = ""
+    """for the reader; without corrections where the log's signals do not fit together"""
     signals: dict[str, SignalCorrection] = {}
     """by name in the log"""
     lever_arm: dict[str, Finite] = {}

@@ -144,6 +144,12 @@ def _given(content: dict[str, Any]) -> set[str]:
     return {str(n) for n in vehicle} if isinstance(vehicle, dict) else set()
 
 
+_STRAIGHT_UP = 1.6
+"""rad"""
+_FASTEST = 75.0
+"""rad/s; gyros go to 2000 deg/s, a few to 4000"""
+
+
 def prepared(model: Model, flight: Flight, where: str) -> Flight:
     """A flight for a kinematic model: roll and yaw without jumps of a turn.
 
@@ -153,22 +159,51 @@ def prepared(model: Model, flight: Flight, where: str) -> Flight:
         where: what an error begins with.
 
     Raises:
-        InputError: the machine points so steeply up or down that its angles mean nothing.
+        InputError: the machine points so steeply up or down that its angles mean nothing, turns
+            faster than gyros measure, or a channel never moves.
     """
     if not is_kinematic(model):
         return flight
     theta = flight.outputs.get("theta")
-    if theta is not None and np.nanmax(np.abs(theta), initial=0.0) > STEEPEST:
+    reached = 0.0 if theta is None else np.nanmax(np.abs(theta), initial=0.0)
+    if reached > STEEPEST:
+        # No pitch angle is beyond 90 degrees.
+        remedy = "choose another window" if reached < _STRAIGHT_UP else "is its unit another?"
         raise InputError(
-            f"{where}: theta reaches {np.degrees(np.nanmax(np.abs(theta))):.0f} deg, expected at "
-            f"most {np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: choose "
-            "another window"
+            f"{where}: theta reaches {np.degrees(reached):.0f} deg, expected at most "
+            f"{np.degrees(STEEPEST):.0f} deg, beyond which roll and yaw are one turn: {remedy}"
         )
+    _check_rates(flight, where)
+    _check_moving(flight, where)
     # The kinematics turn on where a log begins again at -180 deg.
     turned = {n: _unwrapped(y) for n, y in flight.outputs.items() if n in ANGLES}
     if all(np.array_equal(y, flight.outputs[n], equal_nan=True) for n, y in turned.items()):
         return flight
     return dataclasses.replace(flight, outputs={**flight.outputs, **turned})
+
+
+def _check_rates(flight: Flight, where: str) -> None:
+    for n in RATES:
+        rate = flight.inputs.get(n)
+        fastest = 0.0 if rate is None else np.nanmax(np.abs(rate), initial=0.0)
+        if fastest > _FASTEST:
+            raise InputError(
+                f"{where}: {n} reaches {fastest:.0f} rad/s, expected at most {_FASTEST:g} rad/s, "
+                "more than gyros show: is its unit another?"
+            )
+
+
+def _check_moving(flight: Flight, where: str) -> None:
+    signals = {} if flight.source is None else flight.source.inputs
+    stated = {n for n, u in signals.items() if u.constant is not None}
+    for n, x in {**flight.inputs, **flight.outputs}.items():
+        seen = x[np.isfinite(x)]
+        # Fitted to a channel that stands still, every scale of the others would run away.
+        if n not in stated and seen.size and np.ptp(seen) == 0.0:
+            raise InputError(
+                f"{where}: {n} is {seen[0]:g} in all samples, expected one that moves: a sensor "
+                "that is dead says nothing of the others; leave it out, or choose another window"
+            )
 
 
 def _unwrapped(angle: np.ndarray) -> np.ndarray:
@@ -244,8 +279,9 @@ def _second_difference(u: np.ndarray) -> np.ndarray:
     return np.pad(np.diff(u, 2), 1, mode="edge") if u.size > 2 else np.zeros_like(u)
 
 
-_STEP = 0.02
-"""s; within one of this length a machine turns too little for a step's error to count"""
+_STEP = 0.005
+"""s; a filter's step holds the derivatives of the kinematics as they are at its begin, and misses
+r' theta' h^2/3 of a rate: at 20 ms as much as the noise of a gyro leaves unknown of its bias"""
 
 
 def substeps_of(flights: Sequence[Flight]) -> int:

@@ -175,7 +175,7 @@ def test_yaw_is_unwrapped_and_steep_flight_refused():
     yaw = np.linspace(0.0, 12.0, 50)
     wrapped = (yaw + np.pi) % (2 * np.pi) - np.pi
     wrapped[20] = np.nan
-    flight = Flight(dt=0.1, inputs={}, outputs={"psi": wrapped, "theta": 0 * yaw})
+    flight = Flight(dt=0.1, inputs={}, outputs={"psi": wrapped, "theta": 0.1 * yaw})
     y = prepared(kinematics.attitude, flight, "a").outputs["psi"]
     assert np.isnan(y[20])
     np.testing.assert_allclose(np.delete(y, 20), np.delete(yaw, 20), atol=1e-12)
@@ -191,3 +191,16 @@ def test_noise_of_the_gyros_is_a_random_walk_of_the_angle():
     # An independent count: the spread of many angles after a second of such noise.
     drift = np.std(dt * sd * rng.standard_normal((4000, 100)).sum(axis=1))
     assert noise_of(kinematics.attitude, [flight])["noise_gyro"] == pytest.approx(drift, rel=0.05)
+
+
+def test_what_no_sensor_shows_is_refused():
+    rates = dict.fromkeys("pqr", np.linspace(-100.0, 80.0, 50))
+    flight = Flight(dt=0.1, inputs=rates, outputs={"phi": np.zeros(50)})
+    with pytest.raises(InputError, match=r"a: p reaches 100 rad/s, .*: is its unit another\?"):
+        prepared(kinematics.attitude, flight, "a")
+    dead = Flight(dt=0.1, inputs={}, outputs={"psi": np.full(50, 0.5)})
+    with pytest.raises(InputError, match=r"a: psi is 0\.5 in all samples, expected one that moves"):
+        prepared(kinematics.attitude, dead, "a")
+    far = Flight(dt=0.1, inputs={}, outputs={"theta": np.linspace(0, 30, 50)})
+    with pytest.raises(InputError, match=r"theta reaches 1719 deg, .*: is its unit another\?"):
+        prepared(kinematics.attitude, far, "a")
