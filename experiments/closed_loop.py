@@ -135,8 +135,10 @@ def row(gain: float, gust: float, runs: int, truth: dict[str, float]) -> str:
         for name in truth:
             e = 100.0 * np.array([one[method][name] for one in found])
             fine = e[np.isfinite(e)]
-            spread = f"{fine.mean():+.1f} ± {fine.std() / max(fine.size, 1) ** 0.5:.1f} %"
-            cells.append(spread if fine.size else "none")
+            if not fine.size:
+                cells.append("none")
+                continue
+            cells.append(f"{fine.mean():+.1f} ± {fine.std() / fine.size**0.5:.1f} %")
     return f"| {gain:g} | {gust:g} | {closed} of {runs} | " + " | ".join(cells) + " |"
 
 

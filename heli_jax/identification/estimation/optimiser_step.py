@@ -1,0 +1,169 @@
+"""One step of Levenberg-Marquardt, by optimistix on a triangle of the residuals."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from heli_jax.identification.estimation.scaling import COLUMN, Scaling, without_size
+from heli_jax.identification.estimation.trust_region import (
+    LevenbergMarquardt,
+    arrived,
+    within_radius,
+    within_reach,
+)
+from heli_jax.identification.unknowns.layout import Layout
+
+_TIKHONOV_SD = 100.0
+"""sd, in the coordinates of the free parameters (logarithms), of the Tikhonov regularisation that
+ties them to the start: a factor of e^100 is no prior, but it tells one end of a valley from the
+other"""
+
+_TIKHONOV_SDS_LINEAR = 1e6
+"""the same for a coordinate that is no logarithm and so has no size of its own, in units of the sd
+that the data would give it at the start if all else were known"""
+
+_REACH = 3.0
+"""of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
+
+
+class Constants(NamedTuple):
+    """What stays the same throughout one run."""
+
+    z0: Float[Array, " q"]
+    scaling: Scaling
+    tikhonov: Float[Array, " q"]
+    """one over the sd of the tie to the start, 0 without"""
+    convergence_mask: Bool[Array, " q"]
+    """the unknowns whose steps say whether the optimiser has arrived"""
+    reach: Float[Array, " q"]
+    """how far one step may go, by unknown"""
+
+
+class _Rows(NamedTuple):
+    """The residuals about one point, as the optimiser sees them: r + J (xi - at)."""
+
+    at: Float[Array, " q"]
+    r: Float[Array, " k"]
+    J: Float[Array, "k q"]
+
+
+class State(NamedTuple):
+    """Where a run stands."""
+
+    xi: Float[Array, " q"]
+    """the last point that was accepted, in the optimiser's units"""
+    solver: Any
+    """optimistix's own"""
+    done: Bool[Array, ""]
+    arrived: Bool[Array, ""]
+    """whether it is done because it arrived"""
+
+
+def _linear(xi: Array, rows: _Rows) -> tuple[Array, None]:
+    return rows.r + jnp.sum(rows.J * (xi - rows.at)[None, :], axis=1), None
+
+
+_OPTIONS: dict[str, Any] = {"jac": "bwd"}
+"""a Jacobian of numbers, which can be handed from step to step"""
+
+
+def _solver(constants: Constants) -> LevenbergMarquardt:
+    # A step below a thousandth of a standard deviation is the last: what it leaves is far less,
+    # and smaller gains drown in the rounding of the sum of squares. In the optimiser's units a
+    # standard deviation is 1 / (column norm * residual norm).
+    atol = 1e-3 / (COLUMN * constants.scaling.residual_norm)
+    return LevenbergMarquardt(1e-9, atol, constants.convergence_mask)
+
+
+def compressed(
+    constants: Constants, r: Float[Array, " n"], J: Float[Array, "n q"]
+) -> Float[Array, "k k"]:
+    # What a step needs of the residuals r and their Jacobian J is in the triangle of the QR
+    # decomposition of [r J]: as many rows as unknowns, and one. The optimiser sees these rows; the
+    # first is the size of r, the others are zero but for their derivatives. Its program is then
+    # the same for records of any length.
+    columns = jnp.concatenate([r[:, None], J * constants.scaling.unit[None, :]], axis=1)
+    R = jnp.linalg.qr(columns / constants.scaling.residual_norm, mode="r")
+    # QR leaves the sign open; a size that changed it would look like a change of the residuals.
+    return R * jnp.where(R[0, 0] < 0, -1.0, 1.0).astype(R.dtype)
+
+
+def _rows(constants: Constants, R: Float[Array, "k k"], xi: Float[Array, " q"]) -> _Rows:
+    # Where the data leave a direction of the parameters open, the weakest of regularisations keeps
+    # them from drifting along it.
+    (unit, norm), tikhonov = constants.scaling, constants.tikhonov
+    tie = -unit * xi * tikhonov / norm
+    pull = -jnp.diag(tikhonov * unit) / norm
+    return _Rows(xi, jnp.concatenate([R[:, 0], tie]), jnp.concatenate([R[:, 1:], pull]))
+
+
+def begin(constants: Constants) -> State:
+    q = constants.z0.shape[0]
+    xi = jnp.zeros_like(constants.z0)
+    # The first step accepts whatever is at z0, so that of these rows only the shapes count.
+    rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
+    shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
+    solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
+    return State(xi, solver, jnp.asarray(False), jnp.asarray(False))
+
+
+def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
+    """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
+    rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
+    xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
+    new = within_radius(new, xi)
+    new = within_reach(new, xi, constants.reach, constants.scaling.unit)
+    done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
+    done |= arrived(new.f_info, constants.scaling.residual_norm)
+    fine = result == optx.RESULTS.successful
+    stepped = State(xi, new, done | ~fine, done & fine)
+    # Side by side a run that is done stays, while the slowest goes on.
+    return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), stepped, state)
+
+
+def point(constants: Constants, xi: Array) -> Array:
+    return constants.z0 + constants.scaling.unit * xi
+
+
+class Compiled(NamedTuple):
+    """The optimiser's own arithmetic, for one run or for many side by side."""
+
+    compressed: Callable[..., Array]
+    begin: Callable[..., State]
+    advance: Callable[..., State]
+    point: Callable[..., Array]
+
+
+# Compiled apart from the residuals: the same for all problems of as many unknowns and rows.
+_ARITHMETIC = (compressed, begin, advance, point)
+SINGLE = Compiled(*(jax.jit(f) for f in _ARITHMETIC))
+BATCHED = Compiled(*(jax.jit(jax.vmap(f)) for f in _ARITHMETIC))
+
+
+def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
+    at = np.arange(layout.size)
+    # Nuisances have weak priors of their own; time shift and disturbance have limits.
+    logarithmic = np.where(at < len(layout.free), 1.0 / _TIKHONOV_SD, 0.0)
+    tikhonov = jnp.asarray(logarithmic, z0.dtype)
+    # Not the noise's: a disturbance that is hardly there may wander on where it changes nothing
+    # else, since no likelihood has a maximum there.
+    mask = (at < len(layout.of_interest)) | (at >= layout.first_nuisance)
+    # A gain is tied as well: with the effectiveness free it runs along a curved valley without end.
+    linear = without_size(layout)
+    if linear.any():
+        usable = units.unit > 0
+        # The norms of the columns at the start, that is one over the sd of each unknown alone.
+        norms = COLUMN * units.residual_norm / jnp.where(usable, units.unit, 1.0)
+        ties = jnp.where(usable, norms / _TIKHONOV_SDS_LINEAR, 0.0)
+        tikhonov = jnp.where(linear, ties, tikhonov)
+    # Of several disturbances one may vanish, where its logarithm runs off: each by itself.
+    noises = (at >= len(layout.of_interest)) & (
+        at < len(layout.of_interest) + len(layout.disturbance)
+    )
+    reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
+    return Constants(z0, units, tikhonov, jnp.asarray(mask), jnp.asarray(reach, z0.dtype))
