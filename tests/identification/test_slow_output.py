@@ -71,6 +71,7 @@ def test_the_estimates_are_those_of_the_full_rate(fits):
     assert slow.noise["flight 1/roll"] == pytest.approx(NOISE["roll"], rel=0.2)
     assert slow.whiteness["flight 1/roll"].white
     assert slow.adequacy.adequate
+    assert any("lacks dynamics was not asked of roll," in note for note in slow.notes)
     assert slow.metrics["roll"].vaf > 0.99
 
 
@@ -85,10 +86,15 @@ def test_slow_residuals_that_are_not_white_are_told(fits):
 
 def test_feedback_that_cannot_be_told_is_said(fits):
     flight = record(0, slow=True)
-    assert untested(problem(flight)) == []
+    (words,) = untested(problem(flight))
+    assert words == (
+        "flight 1: whether the inputs follow roll was not tested, since more than 20% of the "
+        "samples are missing."
+    )
     alone = dataclasses.replace(flight, outputs={"roll": flight.outputs["roll"]})
     (words,) = untested(problem(alone))
-    assert "was not tested" in words
+    assert "roll was not tested" in words
+    assert "no other output was measured" in words
 
 
 def test_an_equation_error_start_has_something_to_smooth():

@@ -63,12 +63,19 @@ def missing_dynamics(flights: tuple[Left, ...]) -> list[str]:
         known = found.get((output, name))
         if known is None or one.share > known.share:
             found[output, name] = one
-    return [
+    sentences = [
         f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
         f"{one.lag:.2g} s after it moved: the model lacks dynamics between the two, which its "
         "estimates then stand for. Is a servo, a rate loop or a filter missing (onboard)?"
         for (output, name), one in found.items()
     ]
+    gappy = {n: None for f in flights for n, r in f.residuals.items() if not np.isfinite(r).all()}
+    if gappy:
+        sentences.append(
+            f"Whether the model lacks dynamics was not asked of {', '.join(gappy)}, of which "
+            "samples are missing."
+        )
+    return sentences
 
 
 def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:
