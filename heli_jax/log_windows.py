@@ -50,9 +50,15 @@ def rank_log(
             if progress is not None:
                 progress(note)
     try:
-        return windows(problem, length)
+        ranking = windows(problem, length)
     except ValueError as e:
         raise InputError(f"{path}: {e}") from e
+    ranked = {window.flight for window in ranking.windows}
+    for i, flight in enumerate(problem.training):
+        if i not in ranked and progress is not None:
+            words = f"is shorter than a window of {ranking.length:.3g} s, and left out"
+            progress(f"{flight.name}: {flight.duration:.4g} s {words}")
+    return ranking
 
 
 def print_ranking(ranking: Ranking) -> None:

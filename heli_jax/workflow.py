@@ -126,13 +126,10 @@ def run_fit(
         progress(note)
     options = config.config.fit
     assert options is not None  # `problem` refuses a configuration without
-    for finding in rates(problem):
-        # Its estimates would look like any others, so what `check` refuses is not fitted.
-        if finding.severity == "refuse":
-            raise InputError(f"{config.path}: fit: {finding.sentence}")
-    # Part of the report, which a script that asks for none need not wait for.
-    enough = findings(problem) if out is not None else ()
     try:
+        _require_rates(problem)
+        # Part of the report, which a script that asks for none need not wait for.
+        enough = findings(problem) if out is not None else ()
         fitted = fit(
             problem,
             starts=options.starts,
@@ -154,6 +151,17 @@ def run_fit(
         return run
     progress("writing the report")
     return write_report(run, out)
+
+
+def _require_rates(problem: Problem) -> None:
+    """Refuse what `check` refuses: its estimates would look like any others.
+
+    Raises:
+        ValueError: a log is too slow for the model at its start values.
+    """
+    for finding in rates(problem):
+        if finding.severity == "refuse":
+            raise ValueError(finding.sentence)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:

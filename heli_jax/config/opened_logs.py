@@ -56,10 +56,9 @@ class OpenedLogs:
 
 
 def _key(path: Path, number: int | None) -> _Key:
+    # With time and size: a log that was written anew is another one.
     try:
         stat = path.stat()
-        written, size = stat.st_mtime_ns, stat.st_size
     except OSError:  # the reader says what is wrong with it
-        written, size = 0, 0
-    # With time and size: a log that was written anew is another one.
-    return str(path.absolute()), number, written, size
+        return str(path.absolute()), number, 0, 0
+    return str(path.absolute()), number, stat.st_mtime_ns, stat.st_size

@@ -79,6 +79,7 @@ class Source:
         cautions: sentences on what biases a fit to the log as it is used, which every fit repeats.
         inputs: by the model's name, what each is in the log.
         outputs: likewise.
+        first_time: from which windows of the log count [s], in the log's own count.
     """
 
     path: str
@@ -90,6 +91,7 @@ class Source:
     cautions: tuple[str, ...] = ()
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
+    first_time: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,12 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
     return holds
 
 
-def missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
+def sample_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
+    """What is to be said of the signals (N,) as they were logged, in sentences."""
+    return [*_missing_notes(request, values), *_turn_notes(request, values)]
+
+
+def _missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
     """A note for every output (N,) with missing samples."""
     notes = []
     for key, samples in values.items():
@@ -70,6 +75,27 @@ def missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[st
         if count:
             name = shown(request.signals[key].name)
             notes.append(f"{count} of {samples.size} samples of {name} are missing")
+    return notes
+
+
+def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
+    """A note for every angle (N,) that jumps by a turn, as a heading from -pi to pi does."""
+    notes = []
+    for key, samples in values.items():
+        signal = request.signals[key]
+        if signal.si != "rad":
+            continue
+        jumps = np.abs(np.diff(samples[np.isfinite(samples)]))
+        # To within a radian: the machine goes on turning between two samples.
+        count = int(np.count_nonzero(np.abs(jumps - 2 * np.pi) < 1.0))
+        if count:
+            turn = float(np.ptp(signal.from_si(np.array([0.0, 2 * np.pi]))))
+            often = "once" if count == 1 else f"{count} times"
+            notes.append(
+                f"{shown(signal.name)} jumps by a turn {often}, which no model does, and between "
+                "samples it is drawn through the jump: name the channel "
+                f"unwrap({shown(signal.name)[1:-1]}, {turn:.6g}) instead"
+            )
     return notes
 
 

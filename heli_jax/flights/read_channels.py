@@ -20,7 +20,7 @@ from heli_jax.flights.onto_grid import (
     flight_of,
     long_gap,
     measured_once,
-    missing_notes,
+    sample_notes,
 )
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
@@ -101,9 +101,9 @@ def flight_of_signals(
     values, repeated = measured_once(request, values)
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
     start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
-    notes = (*source.notes, *repeated, *missing_notes(request, values), *notes)
+    notes = (*source.notes, *repeated, *sample_notes(request, values), *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
-    source = replace(source, notes=notes, rates=rates)
+    source = replace(source, notes=notes, rates=rates, first_time=first_time)
     return flight_of(request, samples, dt, first_time + start, holds, source)
 
 

@@ -31,7 +31,7 @@ from heli_jax.flights.onto_grid import (
     flight_of,
     long_gap,
     measured_once,
-    missing_notes,
+    sample_notes,
 )
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
@@ -90,8 +90,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
-    notes = (*notes, *repeated, *missing_notes(request, signals), *more)
-    source = Source(table.path, table.sha256, notes)
+    notes = (*notes, *repeated, *sample_notes(request, signals), *more)
+    source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
 

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.derived import DerivedLog, with_derived
 from heli_jax.flights.log import Channel, ChannelLog
 from heli_jax.flights.preset import Preset, choose, fitting_presets, preset
 from heli_jax.flights.vibration import SEGMENT, Line, lines
@@ -59,15 +58,13 @@ def rotor_lines(log: ChannelLog) -> RotorLines | None:
     """
     with np.errstate(all="ignore"):  # damage can make numbers that no sum holds
         for name in fitting_presets(log.format, log.names):
-            derived = with_derived(log)
-            assert isinstance(derived, DerivedLog)  # of a ChannelLog it is one
-            found = _by_preset(derived, preset(name))
+            found = _by_preset(log, preset(name))
             if found is not None:
                 return found
     return None
 
 
-def _by_preset(log: DerivedLog, table: Preset) -> RotorLines | None:
+def _by_preset(log: ChannelLog, table: Preset) -> RotorLines | None:
     speed = choose(log, table.signals.get("rotor_speed", ()))
     if speed is None or speed.unit not in _TURNS:
         return None
@@ -77,11 +74,12 @@ def _by_preset(log: DerivedLog, table: Preset) -> RotorLines | None:
     if span is None:
         return RotorLines(speed.channel, np.nan, np.nan, np.nan, ())
     start, end = span
-    rotor = float(np.mean(hz[(times >= start) & (times <= end)]))
+    rotor = float(np.nanmean(hz[(times >= start) & (times <= end)]))
     found = []
     for signal in _SIGNALS:
         chosen = choose(log, table.signals.get(signal, ()))
-        if chosen is None:
+        # One that is computed from others is none that a sensor shook in.
+        if chosen is None or chosen.channel not in log.names:
             continue
         sampled = _evenly(log.channel(chosen.channel), start, end)
         if sampled is not None:

@@ -10,8 +10,10 @@ from heli_jax.cli import main
 from heli_jax.config import load
 from heli_jax.config import problem as configured
 from heli_jax.errors import InputError
+from heli_jax.flights import Source
 from heli_jax.flights.cut import part
 from heli_jax.identification.fit import check, windows
+from heli_jax.identification.validation import record_windows
 from heli_jax.identification.validation.record_windows import window_flights
 from heli_jax.identification.validation.usable_windows import Exclusions
 from tests.identification.test_enough import DT, flight, problem, response, steps
@@ -58,6 +60,13 @@ def test_the_expected_sd_is_that_of_a_check_of_the_window_alone(ranked):
     np.testing.assert_allclose(window.sd, sd, rtol=0.1)
     (flights,) = window_flights(problem(whole), ranked).values()
     assert [f.t0 for f in flights] == sorted(c.window.start for c in ranked.taken)
+
+
+def test_windows_of_a_part_count_from_the_beginning_of_its_log():
+    late = replace(excited(100, 400, 500), t0=112.0, source=Source("log", "0", first_time=100.0))
+    span = record_windows._Span(0, 100, 200)
+    window = record_windows._window(problem(late), span, np.ones(3), "")
+    assert (window.start, window.end) == pytest.approx((14.0, 15.98))
 
 
 def test_damaged_windows_are_left_out_with_the_reason(ranked):

@@ -7,7 +7,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes
+from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes, untested
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
@@ -51,12 +51,15 @@ def is_it_enough(
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:
+    # What is not tested is said: "no input follows" would be taken for all outputs.
+    aside = [Finding("feedback", "ok", words) for words in untested(problem)]
     if not feedback:
-        return []
+        return aside
     least = min(feedback, key=lambda f: f.p_value)
     criterion = f"p value of the surest input, {LEVEL:g}"
     present = feedback_notes(problem, feedback)
     if present:
-        return [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
+        doubts = [Finding("feedback", "doubt", s, least.p_value, criterion) for s in present]
+        return [*doubts, *aside]
     words = f"no input follows the response (p {least.p_value:.2g} of {least.input})."
-    return [Finding("feedback", "ok", words, least.p_value, criterion)]
+    return [Finding("feedback", "ok", words, least.p_value, criterion), *aside]

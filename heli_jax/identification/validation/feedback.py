@@ -167,18 +167,19 @@ def _delay(
 
 
 def untested(problem: Problem) -> list[str]:
-    """A sentence for the flights of which feedback cannot be told, since too much is missing."""
-    flights = problem.training
-    sparse = [
-        label
-        for label, f in zip(labels(flights), flights, strict=True)
-        if all(np.mean(np.isfinite(y)) < _SEEN for y in f.outputs.values())
-    ]
-    if not sparse:
-        return []
+    """A sentence for the outputs of which feedback cannot be told, since too much is missing."""
+    flights, lacking = problem.training, {}
+    for label, flight in zip(labels(flights), flights, strict=True):
+        tested = _decimated(flight, {})[1]
+        gappy = [n for n, y in flight.outputs.items() if n not in tested and np.isnan(y).any()]
+        if gappy:
+            # Flights that lack the same in one sentence: parts of a run do.
+            lacking.setdefault((tuple(gappy), not tested), []).append(label)
     return [
-        f"{', '.join(sparse)}: whether the inputs follow the response was not tested, since of "
-        f"every output more than {1 - _SEEN:.0%} of the samples are missing."
+        f"{', '.join(those)}: whether the inputs follow {' or '.join(outputs)} was not tested, "
+        f"since more than {1 - _SEEN:.0%} of the samples are missing"
+        + (", and no other output was measured." if alone else ".")
+        for (outputs, alone), those in lacking.items()
     ]
 
 

@@ -80,11 +80,18 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
         }
         found = {pair: e for pair, e in found.items() if e.share == most[pair[0]]}
     remedy = _OF_SENSORS if sensors else _OF_A_MACHINE
-    return [
+    sentences = [
         f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
         f"{one.lag:.2g} s after it moved: {remedy}"
         for (output, name), one in found.items()
     ]
+    gappy = {n: None for f in flights for n, r in f.residuals.items() if not np.isfinite(r).all()}
+    if gappy:
+        sentences.append(
+            f"Whether the model lacks dynamics was not asked of {', '.join(gappy)}, of which "
+            "samples are missing."
+        )
+    return sentences
 
 
 def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:

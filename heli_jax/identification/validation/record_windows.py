@@ -59,7 +59,8 @@ class Window:
     """samples from `first` up to but not including `last`"""
     start: float
     end: float
-    """[s] from the beginning of the flight"""
+    """[s] from the beginning of the log, as `window` of a configuration counts; of a flight that is
+    from no log from its own"""
     sd: Float[np.ndarray, " q"]
     """expected by this window alone, relative; inf where it does not determine a parameter"""
     excluded: str = ""
@@ -179,7 +180,9 @@ class _Span(NamedTuple):
 def _window(problem: Problem, span: _Span, sd: np.ndarray, excluded: str) -> Window:
     flight = problem.training[span.flight]
     label = labels(problem.training)[span.flight]
-    start, end = span.first * flight.dt, (span.last - 1) * flight.dt
+    # A flight is later than its log where it is a part of it, or where a topic begins late.
+    later = 0.0 if flight.source is None else flight.t0 - flight.source.first_time
+    start, end = later + span.first * flight.dt, later + (span.last - 1) * flight.dt
     return Window(span.flight, label, span.first, span.last, start, end, sd, excluded)
 
 
