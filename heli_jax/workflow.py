@@ -21,6 +21,7 @@ from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
+from heli_jax.identification.validation.enough import judged_again
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.yaml_file import as_yaml
@@ -142,7 +143,9 @@ def run_fit(
         problem,
         fitted,
         _baseline(config, problem, fitted, progress),
-        _supplementary(config, problem, fitted, progress)._replace(findings=enough),
+        _supplementary(config, problem, fitted, progress)._replace(
+            findings=judged_again(problem, enough, fitted) if enough else ()
+        ),
         began=began,
     )
     if out is None:

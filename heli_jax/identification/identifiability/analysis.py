@@ -92,6 +92,9 @@ def _determined(
     # What one direction leaves open says nothing of the parameters that take no part in it.
     null += further(weakly_held(without_weak, covariance, unknowns), null)
     null += further(single_too_wide(without_weak, unknowns), null)
+    # An alias is another optimum, of which no slope at this one tells.
+    aliased = [np.eye(len(unknowns))[i] for i, u in enumerate(unknowns) if u.aliased]
+    null += further(aliased, null)
     if reported is not None:
         wide = single_too_wide if null else reported_too_wide
         null += further(wide(reported, unknowns), null)

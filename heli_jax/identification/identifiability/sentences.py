@@ -191,6 +191,12 @@ def _not_determined(group: Inseparable, facts: Facts) -> str:
         what = f"the data determine no part of {listed(names)}"
     if group.nuisances:
         what = f"{listed([*names, *group.nuisances])} are exchangeable, so {what}"
+    aliased = [u.name for u in facts.unknowns if u.aliased and u.name in names]
+    if aliased:
+        it = "it moves" if names == tuple(aliased[:1]) else f"{listed(aliased)} move"
+        if len(aliased) == 1 and len(names) > 1:
+            it = f"{aliased[0]} moves"
+        what += f", since {it} a mode past the Nyquist frequency, whose aliases fit as well"
     # Not capitalize(): that would lower the names' capitals.
     what = what[0].upper() + what[1:] if what.startswith("the ") else what
     return f"{what}: {way_out(names, facts, group.count, group.switches)}."

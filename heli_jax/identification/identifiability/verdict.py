@@ -30,6 +30,8 @@ class Unknown(NamedTuple):
     symmetric: bool = False
     """whether it may have either sign: its interval is then symmetric about the value, and
     determines nothing where it reaches further than log 10 times its size to either side"""
+    aliased: bool = False
+    """whether it moves a mode that the samples do not tell from its aliases"""
 
 
 class Combination(NamedTuple):

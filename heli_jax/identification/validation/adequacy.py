@@ -13,7 +13,7 @@ error the simulation does not know the disturbance, so it is judged against what
 disturbance lets expect.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,6 +64,12 @@ class Adequacy(NamedTuple):
     advice: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     """what looks bad and is as expected"""
+    doubts: tuple[str, ...] = ()
+    """what forbids to call it adequate, however well it fits"""
+
+    def doubted(self, doubts: Sequence[str]) -> "Adequacy":
+        """The same, not adequate where there is such a doubt, each in a few words."""
+        return self._replace(adequate=False, doubts=tuple(doubts)) if doubts else self
 
     @property
     def doubtful(self) -> bool:
@@ -81,7 +87,7 @@ class Adequacy(NamedTuple):
             ]
             return f"yes, with doubts ({'; '.join(doubts)})" if doubts else "yes"
         bad = [output for output in self.judged if not output.adequate]
-        words = [
+        words = list(self.doubts) + [
             f"VAF of {output.output} is {output.vaf:.3g}"
             + (", less than its mean" if output.vaf < 0 else "")
             for output in bad

@@ -1,6 +1,7 @@
 """Is this log enough? What can be said of a record before any fit, each answer one sentence."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.problem import Problem
@@ -13,6 +14,9 @@ from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, saturation
+
+if TYPE_CHECKING:
+    from heli_jax.identification.result import Fit
 
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2}
 
@@ -48,6 +52,22 @@ def is_it_enough(
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
         found.append(Finding("next flight", "ok", words))
     return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))
+
+
+def judged_again(problem: Problem, found: Sequence[Finding], fitted: "Fit") -> tuple[Finding, ...]:
+    """The findings with the logging rate at the estimates, where the optimiser arrived there.
+
+    Args:
+        problem: what was fitted.
+        found: at the start values.
+        fitted: the estimates.
+    """
+    if fitted.status == "not-converged":
+        return tuple(found)
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    again = logging_rate(problem, flights, fitted.reached.noise.sd, fitted.params)
+    kept = [f for f in found if f.topic != "logging rate"]
+    return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:
