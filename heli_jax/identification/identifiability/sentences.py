@@ -1,6 +1,7 @@
 """The identifiability analysis in sentences; each names a way out that exists."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
@@ -56,6 +57,8 @@ class Facts(NamedTuple):
     """by name, the share of what is known that its own prior contributes"""
     remedies: Mapping[str, str]
     """by name, a further way out, as 'add a run with a known inertia'"""
+    roughly: Mapping[str, float] = MappingProxyType({})
+    """by name, the factor to the ends of a 95 % interval that is wide"""
 
 
 def sentences(facts: Facts) -> tuple[str, ...]:
@@ -94,8 +97,18 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
     by_data = [
         u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
     ]
-    lines = [f"The data determine {listed(by_data)}."] if by_data else []
+    lines = [_by_data(by_data, facts.roughly)] if by_data else []
     return lines + _by_prior(by_prior)
+
+
+def _by_data(names: list[str], roughly: Mapping[str, float]) -> str:
+    well = [n for n in names if n not in roughly]
+    wide = [f"{n} (95 % within a factor of {roughly[n]:.2g})" for n in names if n in roughly]
+    if not wide:
+        return f"The data determine {listed(well)}."
+    if not well:
+        return f"The data determine only roughly {listed(wide)}."
+    return f"The data determine {listed(well)}, and only roughly {listed(wide)}."
 
 
 def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:

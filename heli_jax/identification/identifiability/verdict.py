@@ -8,6 +8,9 @@ import numpy as np
 # Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
+ROUGHLY = 0.5
+"""sd in relative coordinates, as intervals are reported, above which a parameter is determined only
+roughly: its 95 % interval reaches further than a factor of 2.7 to either side"""
 # The 97.5 % point of the standard normal distribution.
 Z95 = 1.959963984540054
 
@@ -82,6 +85,8 @@ class Verdict:
     sentences: tuple[str, ...]
     resting: tuple[str, ...] = ()
     """parameters that are determined by priors, and not by the data alone"""
+    roughly: tuple[str, ...] = ()
+    """parameters that are determined, but with a wide interval"""
     exchangeable: tuple[str, ...] = ()
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
 
