@@ -42,7 +42,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
-from heli_jax.identification.validation.aliases import fast_modes
+from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -160,7 +160,7 @@ def assemble(
     solution = Solution(layout, data, noise, best.z)
     # Whether the sample time is short enough is a question to the estimated machine.
     values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
-    fast = fast_modes(problem, values, noise.sd)
+    fast = fast_modes(problem, values, measurement_noise(problem, noise.sd))
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
     errors = standard_errors(problem, solution, e, run.before, white=all_white, aliased=aliased)
     numbers = _numbers(problem, solution, e, errors, absent)

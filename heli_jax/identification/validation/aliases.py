@@ -13,6 +13,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.operating_point import OperatingPoint, operating_point
 
@@ -49,6 +50,22 @@ class FastMode(NamedTuple):
         """What it is, in a few words."""
         where = "past" if self.frequency >= self.nyquist else "near"
         return f"{self.flight} has a mode {where} its Nyquist frequency"
+
+
+def measurement_noise(
+    problem: Problem, sd: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, float], ...]:
+    """By flight and output the sd that residuals leave to noise, without what a model misses, SI.
+
+    Args:
+        problem: the flights that are fitted.
+        sd: of the residuals, by flight and output.
+    """
+    # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
+    return tuple(
+        {n: max(min(float(s), noise_guess(flight.outputs[n])), 1e-300) for n, s in one.items()}
+        for flight, one in zip(problem.training, sd, strict=True)
+    )
 
 
 class Modes(NamedTuple):

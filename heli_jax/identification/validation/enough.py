@@ -7,6 +7,7 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes
 from heli_jax.identification.validation.finding import Finding
@@ -14,6 +15,7 @@ from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, saturation
+from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
 
 if TYPE_CHECKING:
     from heli_jax.identification.result import Fit
@@ -45,6 +47,8 @@ def is_it_enough(
         *_of_feedback(problem, feedback),
         *saturation(flights),
         *quantisation(flights, at.noise.sd),
+        *rate_against_angle(problem),
+        *against_start(flights, e.simulated),
     ]
     if compare:
         found += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
@@ -65,7 +69,8 @@ def judged_again(problem: Problem, found: Sequence[Finding], fitted: "Fit") -> t
     if fitted.status == "not-converged":
         return tuple(found)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
-    again = logging_rate(problem, flights, fitted.reached.noise.sd, fitted.params)
+    noise = measurement_noise(problem, fitted.reached.noise.sd)
+    again = logging_rate(problem, flights, noise, fitted.params)
     kept = [f for f in found if f.topic != "logging rate"]
     return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
