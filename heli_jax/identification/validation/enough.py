@@ -11,6 +11,7 @@ from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
@@ -49,6 +50,7 @@ def is_it_enough(
         *quantisation(flights, at.noise.sd),
         *rate_against_angle(problem),
         *against_start(flights, e.simulated),
+        *late_inputs(flights, feedback),
     ]
     if compare:
         found += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
