@@ -65,7 +65,7 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     if ratio is None:
         return []
     smallest, largest = ratio
-    size = float(np.sqrt(smallest * largest))
+    size = float(np.sign(smallest) * np.sqrt(smallest * largest))
     backward, off = size < 0, abs(smallest) > _FACTOR or abs(largest) < 1.0 / _FACTOR
     if not (backward or off):
         return []
