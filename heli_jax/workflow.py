@@ -22,6 +22,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
 from heli_jax.identification.validation.enough import judged_again
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.yaml_file import as_yaml
@@ -144,7 +145,7 @@ def run_fit(
         fitted,
         _baseline(config, problem, fitted, progress),
         _supplementary(config, problem, fitted, progress)._replace(
-            findings=judged_again(problem, enough, fitted) if enough else ()
+            findings=_at_estimates(problem, fitted, enough)
         ),
         began=began,
     )
@@ -152,6 +153,15 @@ def run_fit(
         return run
     progress("writing the report")
     return write_report(run, out)
+
+
+def _at_estimates(
+    problem: Problem, fitted: Fit, findings: tuple[Finding, ...]
+) -> tuple[Finding, ...]:
+    """What was found at the start values, judged at the estimates where these are any."""
+    if not findings or fitted.status == "not-converged":
+        return findings
+    return judged_again(problem, findings, fitted.params, fitted.reached.noise.sd)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:

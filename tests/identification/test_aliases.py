@@ -48,6 +48,6 @@ def test_an_aliased_optimum_is_neither_determined_nor_adequate():
     assert "The data determine b." in found.verdict.text
     assert not found.adequate
     assert "past its Nyquist frequency" in found.adequacy.summary
-    [rate, *_] = judged_again(asked, (), found)
+    [rate, *_] = judged_again(asked, (), found.params, found.reached.noise.sd)
     assert rate.severity == "refuse"
     assert "cannot show it" in rate.sentence

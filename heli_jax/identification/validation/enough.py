@@ -1,7 +1,7 @@
 """Is this log enough? What can be said of a record before any fit, each answer one sentence."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.problem import Problem
@@ -18,8 +18,7 @@ from heli_jax.identification.validation.next_flight import next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, saturation
 from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
 
-if TYPE_CHECKING:
-    from heli_jax.identification.result import Fit
+# params is Any: a record of a model's Params, whose class may be a user's own.
 
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2}
 
@@ -60,19 +59,19 @@ def is_it_enough(
     return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))
 
 
-def judged_again(problem: Problem, found: Sequence[Finding], fitted: "Fit") -> tuple[Finding, ...]:
-    """The findings with the logging rate at the estimates, where the optimiser arrived there.
+def judged_again(
+    problem: Problem, found: Sequence[Finding], params: Any, sd: Sequence[Mapping[str, Any]]
+) -> tuple[Finding, ...]:
+    """The findings with the logging rate at the estimates.
 
     Args:
         problem: what was fitted.
         found: at the start values.
-        fitted: the estimates.
+        params: the model's Params with the estimates in place, SI.
+        sd: of the residuals by flight and output, SI.
     """
-    if fitted.status == "not-converged":
-        return tuple(found)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
-    noise = measurement_noise(problem, fitted.reached.noise.sd)
-    again = logging_rate(problem, flights, noise, fitted.params)
+    again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
     kept = [f for f in found if f.topic != "logging rate"]
     return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
