@@ -100,7 +100,7 @@ def test_the_reported_interval_is_asked_of_the_others_too():
 
 
 def test_who_takes_a_small_part_is_not_called_determined():
-    sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 1.0]])
+    sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 4.0]])
     verdict = analyse(sensitivity, unknowns("a", "c", "B"))
     assert set(verdict.undetermined) == {"a", "c"}
     assert "The data determine B." in verdict.text
