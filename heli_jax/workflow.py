@@ -21,6 +21,8 @@ from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals, intervals
+from heli_jax.identification.validation.enough import judged_again
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.yaml_file import as_yaml
@@ -144,7 +146,9 @@ def run_fit(
         problem,
         fitted,
         _baseline(config, problem, fitted, progress),
-        _supplementary(config, problem, fitted, progress)._replace(findings=enough),
+        _supplementary(config, problem, fitted, progress)._replace(
+            findings=_at_estimates(problem, fitted, enough)
+        ),
         began=began,
     )
     if out is None:
@@ -162,6 +166,15 @@ def _require_rates(problem: Problem) -> None:
     for finding in rates(problem):
         if finding.severity == "refuse":
             raise ValueError(finding.sentence)
+
+
+def _at_estimates(
+    problem: Problem, fitted: Fit, findings: tuple[Finding, ...]
+) -> tuple[Finding, ...]:
+    """What was found at the start values, judged at the estimates where these are any."""
+    if not findings or fitted.status == "not-converged":
+        return findings
+    return judged_again(problem, findings, fitted.params, fitted.reached.noise.sd)
 
 
 def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Check:

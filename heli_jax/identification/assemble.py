@@ -43,6 +43,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
+from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -158,7 +159,11 @@ def assemble(
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
     solution = Solution(layout, data, noise, best.z)
-    errors = standard_errors(problem, solution, e, run.before, white=all_white)
+    # Whether the sample time is short enough is a question to the estimated machine.
+    values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
+    fast = fast_modes(problem, values, measurement_noise(problem, noise.sd))
+    aliased = frozenset(n for mode in fast for n in mode.undetermined)
+    errors = standard_errors(problem, solution, e, run.before, white=all_white, aliased=aliased)
     numbers = _numbers(problem, solution, e, errors, absent)
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
@@ -167,6 +172,7 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
+    notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(
         model=problem.model.name,
@@ -188,7 +194,7 @@ def assemble(
         one_step=pooled_metrics(signals, one_step=True),
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=white,
-        adequacy=adequacy,
+        adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined]),
         coloured=errors.coloured,
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
@@ -284,13 +290,10 @@ def _notes(
         correlated: by pair of outputs the correlations that the intervals allow for.
     """
     layout, data, best = search.layout, search.data, optimum.best
-    # Whether the sample time is short enough is a question to the estimated machine.
-    values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
     none, absent = _no_disturbance(optimum), _absent_names(layout, optimum)
     # An optimiser that has not arrived comes first: it makes all else doubtful.
     return [
         *_stopped_notes(layout, best, optimum),
-        *excitation.sampling(problem, values),
         *_disturbance_notes(optimum.ratio if none else None),
         *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
         *_absent_notes(layout, optimum.absent),

@@ -42,6 +42,7 @@ from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
+from heli_jax.identification.validation.signal_signs import rate_against_angle
 
 __all__ = [
     "Check",
@@ -221,7 +222,8 @@ def fit(
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
         optimum = which(search, optimum)
-    optimum = optimum._replace(notes=(*cautions(problem), *optimum.notes))
+    said = (*cautions(problem), *(f.sentence for f in rate_against_angle(problem)))
+    optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))
 

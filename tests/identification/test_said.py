@@ -100,7 +100,7 @@ def test_the_reported_interval_is_asked_of_the_others_too():
 
 
 def test_who_takes_a_small_part_is_not_called_determined():
-    sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 1.0]])
+    sensitivity = np.array([[1.0, -0.02, 0.0], [0.0, 0.0, 4.0]])
     verdict = analyse(sensitivity, unknowns("a", "c", "B"))
     assert set(verdict.undetermined) == {"a", "c"}
     assert "The data determine B." in verdict.text
@@ -147,3 +147,15 @@ def test_parameters_that_are_correlated_as_a_group_have_one_sentence():
 def test_pairs_that_a_later_one_joins_are_one_group():
     pairs = [Pair("a", "b", 0.999), Pair("c", "d", 0.998), Pair("e", "f", 0.997)]
     assert _tied_together([*pairs, Pair("b", "c", -0.995)]) == [set("abcd"), set("ef")]
+
+
+def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
+    # The interval of B reaches a factor of exp(1.96 * 0.8) = 4.8 to either side.
+    sensitivity = np.diag([100.0, 1.0 / 0.8])
+    verdict = analyse(sensitivity, unknowns("L", "B"))
+    assert verdict.identifiable
+    assert verdict.roughly == ("B",)
+    said = "The data determine L, and only roughly B (95 % within a factor of 4.8)."
+    assert said in verdict.text
+    verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), reported=np.diag([0.64, 1e-4]))
+    assert "only roughly L (95 % within a factor of 4.8)" in verdict.text

@@ -29,7 +29,7 @@ from heli_jax.identification.identifiability.sentences import (
     Weakest,
     sentences,
 )
-from heli_jax.identification.identifiability.verdict import Pair, Unknown, Verdict
+from heli_jax.identification.identifiability.verdict import ROUGHLY, Z95, Pair, Unknown, Verdict
 from heli_jax.identification.identifiability.wide_intervals import (
     TAKES_NO_PART,
     further,
@@ -60,6 +60,8 @@ class _Determined(NamedTuple):
     total: Directions
     """of the data and the priors of the unknowns"""
     rank: int
+    sd: np.ndarray
+    """(q,) as reported, in relative coordinates"""
 
 
 def _determined(
@@ -92,10 +94,14 @@ def _determined(
     # What one direction leaves open says nothing of the parameters that take no part in it.
     null += further(weakly_held(without_weak, covariance, unknowns), null)
     null += further(single_too_wide(without_weak, unknowns), null)
+    # An alias is another optimum, of which no slope at this one tells.
+    aliased = [np.eye(len(unknowns))[i] for i, u in enumerate(unknowns) if u.aliased]
+    null += further(aliased, null)
     if reported is not None:
         wide = single_too_wide if null else reported_too_wide
         null += further(wide(reported, unknowns), null)
-    return _Determined(null, covariance, without_weak, total, int(kept.sum()))
+    sd = np.sqrt(np.diag(covariance if reported is None else reported))
+    return _Determined(null, covariance, without_weak, total, int(kept.sum()), sd)
 
 
 class _ByData(NamedTuple):
@@ -193,6 +199,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
     pairs = _pairs(correlation, names, a.undetermined)
     share = _shares(known.covariance, known.without_weak, a.unknowns)
     nuisances_hold = [n for group in a.groups if group.nuisances for n in group.names]
+    roughly = _roughly(a)
     facts = Facts(
         a.unknowns,
         a.without_effect,
@@ -204,6 +211,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         share.weak,
         share.prior,
         dict(remedies),
+        roughly,
     )
     directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
@@ -225,12 +233,23 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         prior_share=share.both | dict.fromkeys(nuisances_hold, 1.0),
         sentences=sentences(facts),
         resting=tuple(n for group in a.resting for n in group.names),
+        roughly=tuple(roughly),
         exchangeable=tuple(
             dict.fromkeys(
                 label for v in directions_not_determined for label in a.exchange.labels(v)
             )
         ),
     )
+
+
+def _roughly(a: _Analysis) -> dict[str, float]:
+    """By parameter that is determined in a wide interval, the factor to its ends."""
+    # A coordinate that is no logarithm has no factor; what has no effect has no variance.
+    return {
+        u.name: math.exp(Z95 * float(sd))
+        for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
+        if u.logarithmic and sd > ROUGHLY and u.name not in (*a.undetermined, *a.without_effect)
+    }
 
 
 def _without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -202,8 +203,15 @@ def _remedies(problem: Problem) -> dict[str, str]:
     return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
 
 
+_WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
+
+
 def verdict_of(
-    problem: Problem, layout: Layout, e: Evaluation, reported: np.ndarray | None = None
+    problem: Problem,
+    layout: Layout,
+    e: Evaluation,
+    reported: np.ndarray | None = None,
+    aliased: Collection[str] = (),
 ) -> Verdict:
     """What the data determine at one point.
 
@@ -213,6 +221,7 @@ def verdict_of(
         e: the whitened residuals' Jacobian and the values there.
         reported: covariance (k, k) of the parameters of interest, in the optimiser's coordinates,
             that the reported intervals have where it is not that of white residuals.
+        aliased: the parameters that move a mode which the samples do not tell from its aliases.
 
     Raises:
         ValueError: the simulation is not finite there.
@@ -223,6 +232,7 @@ def verdict_of(
             "the length of this record; start elsewhere or use a shorter window"
         )
     unknowns, rows = relative_rows(problem, layout, e)
+    unknowns = tuple(u._replace(aliased=u.name in aliased) for u in unknowns)
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     q = len(unknowns)
@@ -235,4 +245,5 @@ def verdict_of(
         references = references_of(problem, unknowns)
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
-    return analyse(sensitivity, unknowns, _remedies(problem), null_below, without, reported)
+    remedies = _remedies(problem) | dict.fromkeys(aliased, _WITHOUT_ALIASES)
+    return analyse(sensitivity, unknowns, remedies, null_below, without, reported)

@@ -1,6 +1,7 @@
 """The identifiability analysis in sentences; each names a way out that exists."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from heli_jax.identification.identifiability.verdict import Combination, Pair, Unknown
@@ -56,6 +57,8 @@ class Facts(NamedTuple):
     """by name, the share of what is known that its own prior contributes"""
     remedies: Mapping[str, str]
     """by name, a further way out, as 'add a run with a known inertia'"""
+    roughly: Mapping[str, float] = MappingProxyType({})
+    """by name, the factor to the ends of a 95 % interval that is wide"""
 
 
 def sentences(facts: Facts) -> tuple[str, ...]:
@@ -94,8 +97,18 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
     by_data = [
         u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
     ]
-    lines = [f"The data determine {listed(by_data)}."] if by_data else []
+    lines = [_by_data(by_data, facts.roughly)] if by_data else []
     return lines + _by_prior(by_prior)
+
+
+def _by_data(names: list[str], roughly: Mapping[str, float]) -> str:
+    well = [n for n in names if n not in roughly]
+    wide = [f"{n} (95 % within a factor of {roughly[n]:.2g})" for n in names if n in roughly]
+    if not wide:
+        return f"The data determine {listed(well)}."
+    if not well:
+        return f"The data determine only roughly {listed(wide)}."
+    return f"The data determine {listed(well)}, and only roughly {listed(wide)}."
 
 
 def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:
@@ -191,6 +204,12 @@ def _not_determined(group: Inseparable, facts: Facts) -> str:
         what = f"the data determine no part of {listed(names)}"
     if group.nuisances:
         what = f"{listed([*names, *group.nuisances])} are exchangeable, so {what}"
+    aliased = [u.name for u in facts.unknowns if u.aliased and u.name in names]
+    if aliased:
+        it = "it moves" if names == tuple(aliased[:1]) else f"{listed(aliased)} move"
+        if len(aliased) == 1 and len(names) > 1:
+            it = f"{aliased[0]} moves"
+        what += f", since {it} a mode past the Nyquist frequency, whose aliases fit as well"
     # Not capitalize(): that would lower the names' capitals.
     what = what[0].upper() + what[1:] if what.startswith("the ") else what
     return f"{what}: {way_out(names, facts, group.count, group.switches)}."

@@ -8,6 +8,9 @@ import numpy as np
 # Rank alone is not enough: noise of any size leaves full rank, and an interval of three decades.
 FACTOR = 10.0
 """A 95 % interval that reaches further than this factor to either side determines nothing."""
+ROUGHLY = 0.5
+"""sd in relative coordinates, as intervals are reported, above which a parameter is determined only
+roughly: its 95 % interval reaches further than a factor of 2.7 to either side"""
 # The 97.5 % point of the standard normal distribution.
 Z95 = 1.959963984540054
 
@@ -30,6 +33,8 @@ class Unknown(NamedTuple):
     symmetric: bool = False
     """whether it may have either sign: its interval is then symmetric about the value, and
     determines nothing where it reaches further than log 10 times its size to either side"""
+    aliased: bool = False
+    """whether it moves a mode that the samples do not tell from its aliases"""
 
 
 class Combination(NamedTuple):
@@ -80,6 +85,8 @@ class Verdict:
     sentences: tuple[str, ...]
     resting: tuple[str, ...] = ()
     """parameters that are determined by priors, and not by the data alone"""
+    roughly: tuple[str, ...] = ()
+    """parameters that are determined, but with a wide interval"""
     exchangeable: tuple[str, ...] = ()
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
 

@@ -1,5 +1,6 @@
 """How sure the numbers at an optimum are: Cramér-Rao's bound, or wider."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -33,7 +34,13 @@ class StandardErrors(NamedTuple):
 
 
 def standard_errors(
-    problem: Problem, at: Solution, e: Evaluation, before: Verdict, *, white: bool
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    before: Verdict,
+    *,
+    white: bool,
+    aliased: Collection[str] = (),
 ) -> StandardErrors:
     """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
     estimated, the sandwich.
@@ -44,10 +51,11 @@ def standard_errors(
         e: what it tells.
         before: the verdict at the first guess, which stands where the optimum has no Jacobian.
         white: whether the residuals are white and independent between outputs.
+        aliased: the parameters that move a mode which the samples do not tell from its aliases.
     """
     layout, estimator = at.layout, at.layout.estimator
     usable = bool(np.all(np.isfinite(e.J)))
-    verdict = verdict_of(problem, layout, e) if usable else before
+    verdict = verdict_of(problem, layout, e, aliased=aliased) if usable else before
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
     freedom = max(measured_count(at.data) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
@@ -60,7 +68,7 @@ def standard_errors(
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)
     # The rule of the factor of ten has to see the intervals that are reported.
-    verdict = verdict_of(problem, layout, e, _reported(errors, layout, quantiles))
+    verdict = verdict_of(problem, layout, e, _reported(errors, layout, quantiles), aliased)
     verdict = _widened(verdict, errors, _along(verdict, layout, e))
     return StandardErrors(verdict, errors.inflation(), quantiles, True)
 

@@ -14,7 +14,7 @@ With filter error the simulation does not know the disturbance, so it is judged 
 estimated disturbance lets expect.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +65,12 @@ class Adequacy(NamedTuple):
     advice: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     """what looks bad and is as expected"""
+    doubts: tuple[str, ...] = ()
+    """what forbids to call it adequate, however well it fits"""
+
+    def doubted(self, doubts: Sequence[str]) -> "Adequacy":
+        """The same, not adequate where there is such a doubt, each in a few words."""
+        return self._replace(adequate=False, doubts=tuple(doubts)) if doubts else self
 
     @property
     def doubtful(self) -> bool:
@@ -83,7 +89,7 @@ class Adequacy(NamedTuple):
         if self.adequate:
             return f"in size only ({'; '.join(self._left_over)})" if self.coloured else "yes"
         bad = [output for output in self.judged if not output.adequate]
-        words = [
+        words = list(self.doubts) + [
             f"VAF of {output.output} is {output.vaf:.3g}"
             + (", less than its mean" if output.vaf < 0 else "")
             for output in bad

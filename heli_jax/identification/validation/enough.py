@@ -1,18 +1,24 @@
 """Is this log enough? What can be said of a record before any fit, each answer one sentence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes, untested
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
 from heli_jax.identification.validation.signal_quality import quantisation, saturation
+from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
+
+# params is Any: a record of a model's Params, whose class may be a user's own.
 
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2}
 
@@ -41,6 +47,9 @@ def is_it_enough(
         *_of_feedback(problem, feedback),
         *saturation(flights),
         *quantisation(flights, at.noise.sd),
+        *rate_against_angle(problem),
+        *against_start(flights, e.simulated),
+        *late_inputs(flights, feedback),
     ]
     if compare:
         found += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
@@ -48,6 +57,23 @@ def is_it_enough(
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
         found.append(Finding("next flight", "ok", words))
     return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))
+
+
+def judged_again(
+    problem: Problem, found: Sequence[Finding], params: Any, sd: Sequence[Mapping[str, Any]]
+) -> tuple[Finding, ...]:
+    """The findings with the logging rate at the estimates.
+
+    Args:
+        problem: what was fitted.
+        found: at the start values.
+        params: the model's Params with the estimates in place, SI.
+        sd: of the residuals by flight and output, SI.
+    """
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    again = logging_rate(problem, flights, measurement_noise(problem, sd), params)
+    kept = [f for f in found if f.topic != "logging rate"]
+    return tuple(sorted([*again, *kept], key=lambda f: _ORDER[f.severity]))
 
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:

@@ -1,18 +1,14 @@
 """Doubts about a record that no residual shows: sampling too slow, inputs too small or too few."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.validation.operating_point import modes_of_flight
+from heli_jax.identification.validation.aliases import FastMode, fast_modes
 
-_AT_NYQUIST = 0.9
-"""part of the Nyquist frequency from which on a mode is hardly shown by the samples"""
 ALIASED = "the Nyquist frequency of the sampling"
 """what every sentence of `sampling` names"""
 _FEEBLE = 3.0
@@ -70,25 +66,19 @@ def _few_changes(flight: Flight, free: int) -> list[str]:
 
 def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
     """A sentence for each flight whose sampling a mode of the linearised model reaches."""
-    # Gains and shifts of the inputs stand among the values too, and move no mode.
-    free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
-    params = naming.replace(problem.vehicle, **free)
+    return aliasing(fast_modes(problem, values))
+
+
+def aliasing(modes: Sequence[FastMode]) -> list[str]:
+    """A sentence for each mode that the samples cannot show, as `fast_modes` finds them."""
     sentences = []
-    for flight in problem.training:
-        linearised = modes_of_flight(problem.model, params, flight, problem.substeps)
-        if linearised is None:
-            continue
-        eigenvalues, about = linearised
-        # The imaginary part alone: a fast decay without oscillation has no alias.
-        fastest = float(np.max(np.abs(np.imag(eigenvalues))))
-        nyquist = np.pi / flight.dt
-        if fastest >= _AT_NYQUIST * nyquist:
-            past = fastest >= nyquist
-            sentences.append(
-                f"{flight.name or 'the flight'}: a mode at {fastest:.4g} rad/s"
-                f"{f' (linearised about {about})' if about else ''} lies "
-                f"{'at or past' if past else 'near'} {ALIASED} "
-                f"({nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, and "
-                "its aliases may be taken for slower dynamics."
-            )
+    for mode in modes:
+        past = mode.frequency >= mode.nyquist
+        sentences.append(
+            f"{mode.flight}: a mode at {mode.frequency:.4g} rad/s"
+            f"{f' (linearised about {mode.about})' if mode.about else ''} lies "
+            f"{'at or past' if past else 'near'} {ALIASED} "
+            f"({mode.nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, "
+            "and its aliases may be taken for slower dynamics."
+        )
     return sentences

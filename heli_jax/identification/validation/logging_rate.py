@@ -1,4 +1,4 @@
-"""Whether the log is fast enough for the dynamics, at the start values.
+"""Whether the log is fast enough for the dynamics, at the start values or the estimates.
 
 Two rates count. Outputs that are sampled at less than twice the frequency of a mode show its
 aliases. An input that was sampled while it moved is known at its samples alone: between them a
@@ -14,17 +14,15 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.analysis.linear import linearize
 from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.finding import Finding, Severity
 from heli_jax.identification.validation.operating_point import operating_point
 
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
-_SHOWS = 3.0
-"""times the noise by which a mode moves an output, from which on it matters"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
 _LEVELS, _STEPS = 10, 20
@@ -45,7 +43,10 @@ class _Mode(NamedTuple):
 
 
 def logging_rate(
-    problem: Problem, flights: Sequence[tuple[str, Flight]], sd: Sequence[Mapping[str, Any]]
+    problem: Problem,
+    flights: Sequence[tuple[str, Flight]],
+    sd: Sequence[Mapping[str, Any]],
+    params: Any = None,
 ) -> list[Finding]:
     """Rates of inputs and outputs against the fastest mode that matters.
 
@@ -53,12 +54,15 @@ def logging_rate(
         problem: model and start values.
         flights: by what each is called.
         sd: by flight and output the noise that is assumed, SI.
+        params: the model's Params with the estimates in place, SI; the start values unless given.
     """
+    where = "start values" if params is None else "estimates"
+    params = problem.start_params() if params is None else params
     findings: list[Finding] = []
     every: list[Finding] = []
     for (label, flight), noise in zip(flights, sd, strict=True):
-        modes = _modes_that_show(problem, flight, noise)
-        found = [*_of_inputs(label, flight, modes), *_of_outputs(label, flight, modes)]
+        modes = _modes_that_show(problem, params, flight, noise)
+        found = [*_of_inputs(label, flight, modes, where), *_of_outputs(label, flight, modes)]
         findings += [f for f in found if f.severity != "ok"]
         every += found
     return findings if findings or not every else [min(every, key=_value)]
@@ -69,45 +73,35 @@ def _value(finding: Finding) -> float:
     return finding.value
 
 
-def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any]) -> list[_Mode]:
+def _modes_that_show(
+    problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
+) -> list[_Mode]:
     """Those whose part in the answer to a step of an input's size stands out of the noise."""
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
-    params = naming.replace(problem.start_params(), **known)
+    params = naming.replace(params, **known)
     at = operating_point(
         problem.model, params, flight.inputs, flight.outputs, flight.dt, substeps=problem.substeps
     )
-    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
-    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
-    if not all(np.isfinite(M).all() for M in (A, B, C)):
-        return []
-    eigenvalues, right = np.linalg.eig(A)
-    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
-    left = np.linalg.pinv(right)
-    outputs, inputs = naming.names(problem.model.Outputs), naming.names(problem.model.Inputs)
+    modes = modes_about(problem, params, at)
     behind = states_behind(problem.model)
     machine = [n not in behind for n in naming.names(problem.model.State)]
     shown = []
-    for k, eigenvalue in enumerate(eigenvalues):
+    for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
-        if abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
+        if modes is None or abs(eigenvalue) < 2.0 * np.pi / (flight.n_samples * flight.dt):
             continue
         # A filter's own mode has no part in the machine. Its constants are known, and it is no
         # motion that a log would have to show.
-        if np.linalg.norm(right[machine, k]) < 1e-6 * np.linalg.norm(right[:, k]):
+        right = modes.right[:, k]
+        if np.linalg.norm(right[machine]) < 1e-6 * np.linalg.norm(right):
             continue
-        best = (0.0, "", "")
-        for j, u in enumerate(inputs):
-            size = float(np.std(flight.inputs[u]))
-            for i, y in ((outputs.index(y), y) for y in flight.outputs):
-                residue = abs(C[i] @ right[:, k]) * abs(left[k] @ B[:, j])
-                part = residue / abs(eigenvalue) * size / float(noise[y])
-                best = max(best, (part, u, y))
-        if best[0] >= _SHOWS:
-            shown.append(_Mode(complex(eigenvalue), *best[1:]))
+        part, u, y = modes.strongest(k, problem, flight, noise)
+        if part >= SHOWS:
+            shown.append(_Mode(complex(eigenvalue), u, y))
     return shown
 
 
-def _of_inputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
+def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> list[Finding]:
     findings = []
     for name, u in flight.inputs.items():
         rate = input_rate(flight, name, u)
@@ -118,7 +112,7 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
         ratio = rate / fastest.hz
         begun = (
             f"{label}: {name} was sampled at {rate:.3g} Hz while it moved, and {fastest.output} "
-            f"answers up to {fastest.hz:.3g} Hz (a mode at the start values)"
+            f"answers up to {fastest.hz:.3g} Hz (a mode at the {where})"
         )
         findings.append(_judged(begun, ratio, fastest.hz))
     return findings

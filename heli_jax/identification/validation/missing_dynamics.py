@@ -12,6 +12,8 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
+from heli_jax.identification.validation.metrics import cross_correlation
+
 _SECONDS = 0.4
 """lags of an input that are looked at"""
 _MOST_LAGS = 30
@@ -21,6 +23,11 @@ _BY_CHANCE = 1e-5
 """probability, for all pairs of a fit together, at which nothing is said"""
 _WORTH_IT = 0.02
 """share of the whitened residual below which it makes no difference to the estimates"""
+_EARLIER = 0.6
+"""part of the largest correlation with an earlier input that one with a later input reaches where
+the clocks differ: a fit leaves what came early and what it expected late, both alike"""
+_BY_CHANCE_AT_MOST = 5.0
+"""correlation of independent signals, times the root of the samples"""
 _FEWEST = 10
 """samples for each regressor"""
 _OF_A_MACHINE = (
@@ -52,7 +59,7 @@ class Explained(NamedTuple):
     p_value: float
     """of an F test"""
     lag: float
-    """where the response to the input is largest [s]"""
+    """where the response to the input is largest [s]; negative where it comes before the input"""
 
 
 def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> list[str]:
@@ -80,11 +87,7 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
         }
         found = {pair: e for pair, e in found.items() if e.share == most[pair[0]]}
     remedy = _OF_SENSORS if sensors else _OF_A_MACHINE
-    sentences = [
-        f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
-        f"{one.lag:.2g} s after it moved: {remedy}"
-        for (output, name), one in found.items()
-    ]
+    sentences = [_sentence(output, name, one, remedy) for (output, name), one in found.items()]
     gappy = {n: None for f in flights for n, r in f.residuals.items() if not np.isfinite(r).all()}
     if gappy:
         sentences.append(
@@ -92,6 +95,19 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
             "samples are missing."
         )
     return sentences
+
+
+def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
+    begun = (
+        f"{name} still explains {one.share:.0%} of the whitened residual of {output}, most of it "
+    )
+    if one.lag < 0:
+        return begun + (
+            f"{-one.lag:.2g} s before it moved: the response precedes {name} as it is logged. "
+            f"So {name} is logged late (free a delay: nuisance.time_shift, or delays of the model) "
+            "or follows the response (feedback); no servo or filter that is missing does that."
+        )
+    return begun + f"{one.lag:.2g} s after it moved: {remedy}"
 
 
 def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:
@@ -105,7 +121,7 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
         u: the input (N,), any unit.
         dt: [s].
     """
-    lags = max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
+    lags = _lags(dt)
     seen = np.isfinite(residual)
     # A gap would have to be filled, and what fills it looks like a response.
     if not seen.all() or residual.size < _FEWEST * (lags + _ORDER):
@@ -136,7 +152,52 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
     # By each lag alone, since the coefficients of a regression on neighbouring lags swing against
     # one another where the input moves slowly.
     correlation = np.abs(X.T @ y) / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-    return Explained(share, p_value, float(np.argmax(correlation)) * dt)
+    lead = _lead(e, drive, lags)
+    lag = float(np.argmax(correlation)) if lead is None else -lead
+    return Explained(share, p_value, lag * dt)
+
+
+def _lead(e: np.ndarray, drive: np.ndarray, lags: int) -> int | None:
+    """By how many samples a residual goes with what an input does later; None where it does not."""
+    # Nothing that a machine does comes before its input: then clocks differ or the input follows.
+    c = _answer(e, drive, lags)
+    early = lags - int(np.argmax(c[:lags]))
+    enough = max(_EARLIER * float(c[lags:].max()), _BY_CHANCE_AT_MOST / np.sqrt(e.size))
+    return early if c[lags - early] > enough else None
+
+
+def _answer(e: np.ndarray, drive: np.ndarray, lags: int) -> np.ndarray:
+    """Size (2 lags + 1,) of the correlation of e with a drive that many samples before, from -lags
+    to lags, both through the filter that whitens the drive."""
+    # Else what an input does later is foretold by what it has done, and every answer seems to begin
+    # before it.
+    whitening = _whitening(drive)
+    y, x = (np.convolve(v, whitening)[: v.size][2 * _ORDER :] for v in (e, drive))
+    return np.abs(cross_correlation(x, y, lags))
+
+
+def answers(y: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray | None:
+    """Size (2 k + 1,) of the correlation of an output with an input so much before, from -k samples
+    to k, both whitened; None where nothing can be told.
+
+    Args:
+        y: the output (N,), NaN where nothing is measured.
+        u: the input (N,).
+        dt: [s].
+    """
+    lags = _lags(dt)
+    if not np.isfinite(y).all() or y.size < _FEWEST * (lags + _ORDER):
+        return None
+    e, drive = y - y.mean(), u - u.mean()
+    if not (np.std(e) > 0 and np.std(drive) > 0):
+        return None
+    c = _answer(e, drive, lags)
+    by_chance = _BY_CHANCE_AT_MOST / np.sqrt(y.size)
+    return np.where(c > by_chance, c, 0.0)
+
+
+def _lags(dt: float) -> int:
+    return max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
 
 
 def _whitening(e: np.ndarray) -> np.ndarray:

@@ -79,6 +79,7 @@ def _doubts(fit: Fit) -> list[str]:
     """What a reader has to know of estimates that are determined."""
     v = fit.verdict
     doubts = [
+        (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
         ("the intervals are too narrow", fit.overconfident),
         ("the residuals are not white", fit.coloured and not fit.white),
         # Widened though each residual is white by itself: then several outputs err together.

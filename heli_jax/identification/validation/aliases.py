@@ -1,0 +1,221 @@
+"""Modes that the samples cannot show, and the free parameters that move them.
+
+Samples at a rate f show a mode at w + 2 pi f as they show one at w. So an optimum whose mode lies
+past the Nyquist frequency is one of many that fit as well, each with a narrow interval of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.linear import linearize
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.validation.operating_point import OperatingPoint, operating_point
+
+_AT_NYQUIST = 0.9
+"""part of the Nyquist frequency from which on a mode is hardly shown by the samples"""
+_MOVED = 1e-6
+"""relative change of a mode, for a relative change of a parameter, that is none"""
+_TURNED = 0.2
+"""the same of its frequency from which on a parameter can take the mode to an alias; a frequency
+that goes with the parameter's root has 0.5"""
+_STEP = 1e-4
+"""relative step of the parameters for these changes"""
+SHOWS = 3.0
+"""times the noise by which a mode moves an output, from which on it matters"""
+
+# params is Any: a record of a model's Params, whose class may be a user's own.
+
+
+class FastMode(NamedTuple):
+    """A mode of a flight at or past the Nyquist frequency that free parameters move."""
+
+    flight: str
+    frequency: float
+    """[rad/s]"""
+    nyquist: float
+    """[rad/s]"""
+    about: str
+    """where the model was linearised; empty for a linear one"""
+    undetermined: tuple[str, ...]
+    """the free parameters that can take it to an alias, where it shows in an output"""
+
+    @property
+    def words(self) -> str:
+        """What it is, in a few words."""
+        where = "past" if self.frequency >= self.nyquist else "near"
+        return f"{self.flight} has a mode {where} its Nyquist frequency"
+
+
+def measurement_noise(
+    problem: Problem, sd: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, float], ...]:
+    """By flight and output the sd that residuals leave to noise, without what a model misses, SI.
+
+    Args:
+        problem: the flights that are fitted.
+        sd: of the residuals, by flight and output.
+    """
+    # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
+    return tuple(
+        {n: max(min(float(s), noise_guess(flight.outputs[n])), 1e-300) for n, s in one.items()}
+        for flight, one in zip(problem.training, sd, strict=True)
+    )
+
+
+class Modes(NamedTuple):
+    """A linearised model along its eigenvectors."""
+
+    eigenvalues: np.ndarray
+    """(n,) [1/s]"""
+    right: np.ndarray
+    """(n, n) a mode a column"""
+    left: np.ndarray
+    """(n, n) a mode a row"""
+    B: np.ndarray
+    C: np.ndarray
+
+    def strongest(
+        self, k: int, problem: Problem, flight: Flight, noise: Mapping[str, Any]
+    ) -> tuple[float, str, str]:
+        """The part of mode k in the answer of an output to a step of an input's size, over the
+        output's noise, where that is largest: with the input's and the output's name.
+
+        Args:
+            k: of the eigenvalues.
+            problem: names the model's inputs and outputs.
+            flight: says how far the inputs move.
+            noise: sd by output, SI.
+        """
+        outputs = naming.names(problem.model.Outputs)
+        best = (0.0, "", "")
+        for j, u in enumerate(naming.names(problem.model.Inputs)):
+            size = float(np.std(flight.inputs[u]))
+            for y in flight.outputs:
+                residue = abs(self.C[outputs.index(y)] @ self.right[:, k])
+                residue *= abs(self.left[k] @ self.B[:, j])
+                part = residue / abs(self.eigenvalues[k]) * size / float(noise[y])
+                best = max(best, (part, u, y))
+        return best
+
+
+def modes_about(problem: Problem, params: Any, at: OperatingPoint) -> Modes | None:
+    """The model's modes about a point; None where its matrices are not finite.
+
+    Args:
+        problem: whose model it is.
+        params: of the flight, SI.
+        at: where the model is linearised.
+    """
+    matrices = linearize(problem.model, params, at.state, at.inputs).matrices
+    A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
+    if not all(np.isfinite(M).all() for M in (A, B, C)):
+        return None
+    eigenvalues, right = np.linalg.eig(A)
+    # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
+    return Modes(eigenvalues, right, np.linalg.pinv(right), B, C)
+
+
+def fast_modes(
+    problem: Problem,
+    values: Mapping[str, float],
+    noise: Sequence[Mapping[str, Any]] | None = None,
+) -> list[FastMode]:
+    """For each fitted flight the fastest mode that its samples cannot show and that is not known.
+
+    Args:
+        problem: the flights and what is free.
+        values: of the free parameters, SI; gains and shifts among them move no mode.
+        noise: sd by flight and output, SI; without it nothing is said to be undetermined.
+    """
+    free = {n: jnp.asarray(v) for n, v in values.items() if n in problem.free}
+    found = []
+    for i, flight in enumerate(problem.training):
+        known = {n: jnp.asarray(v) for n, v in flight.known.items()}
+        params = naming.replace(problem.vehicle, **(free | known))
+        at = operating_point(
+            problem.model,
+            params,
+            flight.inputs,
+            flight.outputs,
+            flight.dt,
+            substeps=problem.substeps,
+        )
+        moving = [n for n in free if n not in known]
+        fast = _of_flight(problem, flight, params, at, moving, noise[i] if noise else None)
+        found += [] if fast is None else [fast]
+    return found
+
+
+def _of_flight(
+    problem: Problem,
+    flight: Flight,
+    params: Any,
+    at: OperatingPoint,
+    moving: list[str],
+    noise: Mapping[str, Any] | None,
+) -> FastMode | None:
+    modes = modes_about(problem, params, at)
+    if modes is None:
+        return None
+    nyquist = np.pi / flight.dt
+    # The imaginary part alone: a fast decay without oscillation has no alias.
+    past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _AT_NYQUIST * nyquist]
+    if not past:
+        return None
+    slopes = {n: _relative_slopes(problem, params, at, n, modes) for n in moving}
+    # A filter or a servo whose constants are given is simulated as it is, and has no alias.
+    past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
+    if not past:
+        return None
+    undetermined = [
+        n
+        for n, slope in slopes.items()
+        if noise is not None
+        and not _known_otherwise(problem, n)
+        and any(
+            abs(slope[k].imag) > _TURNED
+            # What is gone within a sample swings in none, under any alias.
+            and -modes.eigenvalues[k].real * flight.dt < 1.0
+            and modes.strongest(k, problem, flight, noise)[0] >= SHOWS
+            for k in past
+        )
+    ]
+    fastest = max(float(modes.eigenvalues[k].imag) for k in past)
+    label = flight.name or "the flight"
+    return FastMode(label, fastest, nyquist, at.words, tuple(undetermined))
+
+
+def _known_otherwise(problem: Problem, name: str) -> bool:
+    """Whether a parameter's alias is excluded by its prior, or it is a delay, whose modes are an
+    approximation's."""
+    return problem.free[name].prior is not None or name in problem.model.delay_parameters
+
+
+def _relative_slopes(
+    problem: Problem, params: Any, at: OperatingPoint, name: str, modes: Modes
+) -> np.ndarray:
+    """Of every eigenvalue (n,) complex its change over its size, for a relative change of one
+    parameter: first-order perturbation of a simple eigenvalue."""
+    value = float(getattr(params, name))
+    step = _STEP * (abs(value) or 1.0)
+    ends = [
+        np.asarray(
+            linearize(
+                problem.model,
+                naming.replace(params, **{name: jnp.asarray(v)}),
+                at.state,
+                at.inputs,
+            ).matrices.A,
+            np.float64,
+        )
+        for v in (value - step, value + step)
+    ]
+    slope = (ends[1] - ends[0]) / (2.0 * _STEP)
+    changes = np.einsum("ki,ij,jk->k", modes.left, slope, modes.right)
+    return changes / np.maximum(np.abs(modes.eigenvalues), 1e-300)

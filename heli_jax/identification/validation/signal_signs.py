@@ -1,0 +1,169 @@
+"""Whether signals have the signs and units that they are said to have.
+
+Two tests that need no fit. An angle is the integral of its rate, so the two have to move alike by
+as much. And with start values of the right signs the simulated outputs move with the measured ones.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import scipy.integrate
+from jaxtyping import Float
+
+from heli_jax.dynamics.model import axes_of
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.metrics import autocorrelation, cross_correlation
+
+_PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
+"""rate and angle by the names that outputs have here, beside those of the model's axes"""
+_WITHIN = 0.5
+"""[s] over which an angle and the integral of its rate are compared"""
+_INDEPENDENT = 10
+"""so many of these parts of a record at least"""
+_ALIKE = 0.8
+"""correlation of the two from which on their sizes are compared"""
+_FACTOR = 1.3
+"""by which these may differ: coupled rotation and sensors that are off by a fifth"""
+_GAP = 0.3
+"""[s] without a sample, over which nothing is put between"""
+_DEGREE = 180.0 / np.pi
+_NEARLY = 1.3
+"""factor about 57.3 that is still degrees taken for radians"""
+
+AGAINST = -0.3
+"""correlation below which a simulated output moves against the measured one"""
+_SURE = 3.0
+"""times what chance makes of it"""
+_LAG = 0.25
+"""[s] to either side: later, a swing of the right sign looks like one of the wrong sign"""
+_LARGER = 1.3
+"""by how much the correlation of the wrong sign exceeds any of the right one"""
+
+
+def rate_against_angle(problem: Problem) -> list[Finding]:
+    """A doubt for each angle that does not move as the integral of its rate does.
+
+    Args:
+        problem: the flights that are fitted, and the model, whose axes name rates and angles.
+    """
+    axes = [(a.rate, a.angle) for a in axes_of(problem.model) if a.angle is not None]
+    pairs = list(dict.fromkeys([*axes, *_PAIRS]))
+    flights = problem.training
+    found = []
+    for label, flight in zip(labels(flights), flights, strict=True):
+        for rate, angle in pairs:
+            if rate in flight.outputs and angle in flight.outputs:
+                found += _of_pair(label, flight, rate, angle)
+    return found
+
+
+def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
+    ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
+    if ratio is None:
+        return []
+    smallest, largest = ratio
+    size = float(np.sign(smallest) * np.sqrt(smallest * largest))
+    backward, off = size < 0, abs(smallest) > _FACTOR or abs(largest) < 1.0 / _FACTOR
+    if not (backward or off):
+        return []
+    how = f"{abs(size):.3g} times as far as" if off else "as far as"
+    reasons = ["one of the two has the wrong sign (invert)"] if backward else []
+    if off and 1.0 / _NEARLY < max(abs(size), 1.0 / abs(size)) / _DEGREE < _NEARLY:
+        reasons.append("one of the two is in degrees and read as radians, or the reverse (unit)")
+    elif off:
+        reasons.append("the unit or the scale of one of the two is wrong")
+    words = (
+        f"{label}: {angle} moves {how} the integral of {rate}"
+        f"{', and against it' if backward else ''}: {' and '.join(reasons)}."
+    )
+    criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
+    return [Finding("signs and units", "doubt", words, size, criterion)]
+
+
+def angle_over_rate(
+    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
+) -> tuple[float, float] | None:
+    """Between which factors an angle's changes are those of its integrated rate, whatever the noise
+    of either; both negative where they go against one another, None where nothing can be told.
+
+    Regressions of the one on the other and of the other on the one enclose the factor where both
+    are noisy (Frisch, 1934).
+
+    Args:
+        angle: [rad], NaN where missing.
+        rate: [rad/s], likewise.
+        dt: [s].
+    """
+    filled = [_filled(v, dt) for v in (angle, rate)]
+    steps = max(1, round(_WITHIN / dt))
+    if filled[0] is None or filled[1] is None or angle.size < (_INDEPENDENT + 1) * steps:
+        return None
+    # Headings jump by a turn where they pass south.
+    turned = np.unwrap(filled[0])
+    integral = scipy.integrate.cumulative_trapezoid(filled[1], dx=dt, initial=0.0)
+    # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
+    # is not divided by a sample time.
+    changes = [v[steps:] - v[:-steps] for v in (turned, integral)]
+    sds = [float(np.std(v)) for v in changes]
+    if not min(sds) > 0:
+        return None
+    alike = float(np.corrcoef(changes[0], changes[1])[0, 1])
+    if abs(alike) < _ALIKE:
+        return None
+    size = float(np.sign(alike)) * sds[0] / sds[1]
+    return size * abs(alike), size / abs(alike)
+
+
+def _filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
+    """A signal (N,) with straight lines over its short gaps; None where one is long."""
+    seen = np.flatnonzero(np.isfinite(signal))
+    if seen.size < 2 or np.max(np.diff(np.r_[0, seen, signal.size - 1])) * dt > _GAP:
+        return None
+    return np.interp(np.arange(signal.size), seen, signal[seen])
+
+
+def against_start(
+    flights: Sequence[tuple[str, Flight]], simulated: Sequence[Mapping[str, np.ndarray]]
+) -> list[Finding]:
+    """A doubt for each output that moves against the one simulated at the start values.
+
+    Args:
+        flights: by what each is called.
+        simulated: by flight and output (N,), SI.
+    """
+    found = []
+    for (label, flight), run in zip(flights, simulated, strict=True):
+        inputs = " and ".join(flight.inputs)
+        for name, measured in flight.outputs.items():
+            c = _against(measured, run[name], flight.dt)
+            if c is None:
+                continue
+            words = (
+                f"{label}: at the start values the simulated {name} moves against the measured one "
+                f"(correlation {c:+.2f}): check the signs and columns of {name} and {inputs}, and "
+                "the signs of the start values."
+            )
+            criterion = f"largest correlation of both, {AGAINST:g}"
+            found.append(Finding("signs and units", "doubt", words, c, criterion))
+    return found
+
+
+def _against(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
+    """The correlation of the wrong sign, where it is sure; else None."""
+    seen = np.isfinite(measured)
+    if not np.isfinite(simulated).all() or np.std(simulated) == 0 or seen.mean() < 0.5:
+        return None
+    lags = max(1, min(round(_LAG / dt), measured.size // 4))
+    # Missing samples add nothing to the products and all of the simulation to their scale.
+    c = cross_correlation(simulated, measured, lags) / np.sqrt(seen.mean())
+    worst = float(np.min(c))
+    # Of two independent signals, by their autocorrelations (Bartlett, 1935).
+    most = max(1, measured.size // 5)
+    window = 1.0 - np.arange(most + 1) / (most + 1)
+    both = window * autocorrelation(measured, most) * autocorrelation(simulated, most)
+    chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / seen.sum()))
+    sure = worst < min(AGAINST, -_SURE * chance) and -worst > _LARGER * float(np.max(c))
+    return worst if sure else None

@@ -1,0 +1,53 @@
+"""A mode past the Nyquist frequency: what moves it is not determined, and what does not is not
+blamed."""
+
+import numpy as np
+import pytest
+
+from heli_jax import Free, Nuisance, Prior, Problem, fit
+from heli_jax.identification.validation.aliases import fast_modes
+from heli_jax.identification.validation.enough import judged_again
+from tests.identification.test_enough import DT, SWING, TRUTH, flight
+
+# The mode of the truth, seen one turn of the sampling further on.
+FAST = 2.0 * np.pi / DT - np.sqrt(35.0)
+K = FAST**2 + 1.0
+ALIAS = {"k": K, "d": 2.0, "b": 20.0 * K / 36.0}
+SD = [{"phi": 0.005}]
+
+
+def problem(record, **free):
+    vehicle = TRUTH._replace(k=K, b=ALIAS["b"])
+    return Problem(SWING, vehicle, [record], free, Nuisance(bias=False))
+
+
+def test_only_what_moves_a_fast_mode_is_blamed_for_it():
+    record = flight()
+    every = {n: Free(v) for n, v in ALIAS.items()}
+    [mode] = fast_modes(problem(record, **every), ALIAS, SD)
+    assert mode.frequency == pytest.approx(FAST)
+    assert mode.undetermined == ("k",)
+    # A constant that is given, as a filter's, has no alias, whatever else is free.
+    assert fast_modes(problem(record, b=every["b"]), ALIAS, SD) == []
+    damping = fast_modes(problem(record, d=every["d"]), ALIAS, SD)
+    assert [m.undetermined for m in damping] == [()]
+    # A prior tells the aliases apart, and a mode within the noise tells nothing.
+    known = problem(record, k=Free(K, prior=Prior(K, 0.1 * K)), b=every["b"])
+    assert fast_modes(known, ALIAS, SD)[0].undetermined == ()
+    assert fast_modes(problem(record, **every), ALIAS, [{"phi": 1e3}])[0].undetermined == ()
+    assert fast_modes(problem(record, **every), {**ALIAS, "k": 36.0}, SD) == []
+
+
+def test_an_aliased_optimum_is_neither_determined_nor_adequate():
+    record = flight()
+    asked = problem(record, k=Free(K, lower=0.9 * K, upper=1.1 * K), b=Free(ALIAS["b"]))
+    found = fit(asked)
+    assert found.status == "not-identifiable"
+    assert found.not_identifiable == ("k",)
+    assert "a mode past the Nyquist frequency, whose aliases fit as well" in found.verdict.text
+    assert "The data determine b." in found.verdict.text
+    assert not found.adequate
+    assert "past its Nyquist frequency" in found.adequacy.summary
+    [rate, *_] = judged_again(asked, (), found.params, found.reached.noise.sd)
+    assert rate.severity == "refuse"
+    assert "cannot show it" in rate.sentence

@@ -1,0 +1,111 @@
+"""Signs, units and clocks of signals that do not go together, and those that do."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight
+from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.late_inputs import late_inputs
+from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
+from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
+from tests.identification.test_enough import DT, problem, response, steps
+
+N = 1000
+DEGREE = np.pi / 180.0
+
+
+def moved(seed=0):
+    """An angle of swings by SciPy, and its rate, with the noise of sensors."""
+    rng = np.random.default_rng(seed)
+    u = steps(rng, N)
+    phi, p = response(u, np.zeros(N))
+    return u, phi + 0.003 * rng.standard_normal(N), p + 0.02 * rng.standard_normal(N)
+
+
+def said(phi, p):
+    u = np.zeros(N)
+    flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
+    return [f.sentence for f in rate_against_angle(problem(flight))]
+
+
+def test_an_angle_that_moves_as_its_rate_says_nothing():
+    for seed in range(20):
+        _, phi, p = moved(seed)
+        assert said(phi, p) == []
+        # A bias, a sensor that is off by a tenth, and one in twenty samples of the angle.
+        assert said(phi + 1.0, 1.1 * p - 0.3) == []
+        assert said(np.where(np.arange(N) % 5 == 0, phi, np.nan), p) == []
+        # Nothing can be told of signals that have nothing in common.
+        assert said(phi, moved(seed + 100)[2]) == []
+
+
+@pytest.mark.parametrize(
+    ("angle", "rate", "words"),
+    [
+        (DEGREE, 1.0, "in degrees"),
+        (1.0, DEGREE, "in degrees"),
+        (-1.0, 1.0, "phi moves as far as the integral of p, and against it: one of the two has"),
+        (2.0, 1.0, "the unit or the scale"),
+        (1.0, -DEGREE, "wrong sign (invert) and one of the two is in degrees"),
+    ],
+)
+def test_a_wrong_sign_or_unit_of_an_angle_or_its_rate_is_said(angle, rate, words):
+    _, phi, p = moved()
+    [sentence] = said(angle * phi, rate * p)
+    assert words in sentence
+
+
+def test_an_output_that_moves_against_the_simulated_one_is_said():
+    u, phi, p = moved()
+    found = 0
+    for sign in (1.0, -1.0):
+        inputs = {"u": sign * u, "v": np.zeros(N)}
+        flight = Flight(dt=DT, inputs=inputs, outputs={"phi": phi, "p": p})
+        # Start values that are off: a swing of 4 rad/s in place of 6, and half the effect.
+        b, a, _ = scipy.signal.cont2discrete(([10.0], [1.0, 2.0, 16.0]), DT)
+        guess = scipy.signal.lfilter(np.ravel(b), a, sign * u)
+        run = {"phi": guess, "p": np.gradient(guess, DT)}
+        sentences = [f.sentence for f in against_start([("flight 1", flight)], [run])]
+        found += bool(sentences)
+        assert all("moves against the measured one" in s for s in sentences)
+        assert bool(sentences) == (sign < 0)
+    assert found == 1
+    other = [{"phi": moved(7)[1], "p": moved(7)[2]}]
+    assert against_start([("flight 1", flight)], other) == []
+
+
+def a_stick_and_its_answer(late):
+    rng = np.random.default_rng(3)
+    u = scipy.signal.lfilter([0.1], [1.0, -0.9], rng.standard_normal(N))
+    answer = scipy.signal.lfilter([0.1], [1.0, -0.9], u)
+    return u, answer, np.roll(u, late), np.roll(answer, late), 1e-3 * rng.standard_normal(N)
+
+
+def test_a_stick_that_is_logged_late_is_no_missing_servo():
+    u, answer, u_late, answer_late, noise = a_stick_and_its_answer(8)
+    # What a fit leaves that takes the stick as it is logged, and one without the servo's lag.
+    cut = slice(50, None)
+    late = Left(DT, {"p": (answer - answer_late + noise)[cut]}, {"u": u_late[cut]})
+    servo = Left(DT, {"p": (answer_late - answer + noise)[cut]}, {"u": u[cut]})
+    [sentence] = missing_dynamics((late,))
+    assert "0.16 s before it moved: the response precedes u as it is logged" in sentence
+    assert "nuisance.time_shift" in sentence
+    [sentence] = missing_dynamics((servo,))
+    assert "s after it moved" in sentence
+    assert "Is a servo, a rate loop or a filter missing" in sentence
+
+
+def test_an_output_before_its_stick_is_said_before_any_fit():
+    u, answer, u_late, _, noise = a_stick_and_its_answer(8)
+    cut = slice(50, None)
+    outputs = {"p": (answer + noise)[cut]}
+    # A second stick that the pilot moves a little later is no late one.
+    second = 0.8 * np.roll(u, 5) + 0.2 * np.random.default_rng(4).standard_normal(N)
+    good = Flight(dt=DT, inputs={"u": u[cut], "v": second[cut]}, outputs=outputs)
+    bad = Flight(dt=DT, inputs={"u": u_late[cut], "v": np.zeros(N - 50)}, outputs=outputs)
+    assert late_inputs([("flight 1", good)], ()) == []
+    [finding] = late_inputs([("flight 1", bad)], ())
+    assert "p moves 0.16 s before u does" in finding.sentence
+    follows = Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)
+    assert late_inputs([("flight 1", bad)], (follows,)) == []
