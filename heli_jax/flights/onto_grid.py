@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, in_gaps, longest_gap, resampled
+from heli_jax.flights.resample import held_mean, in_gaps, longest_gap, resampled
 from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
@@ -91,8 +91,9 @@ def at_times(
 ) -> tuple[dict[Key, np.ndarray], list[str]]:
     """The signals' samples (M,) on a grid, and notes.
 
-    Inputs follow their hold. Outputs are interpolated, or low-pass filtered where the rate goes
-    down; those that are slower than the grid stand at the instants nearest to their own.
+    A held input has the mean of what it was until the grid's next instant. Other inputs and the
+    outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
+    than the grid stand at the instants nearest to their own.
 
     Args:
         request: names them.
@@ -103,9 +104,13 @@ def at_times(
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     for (key, kind), signal in signals.items():
         if kind == "input":
-            # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
-            method = hold if holds[key].hold == "zero-order" else resampled
-            samples[key, kind] = method(*signal, times)
+            if holds[key].hold != "zero-order":
+                samples[key, kind] = resampled(*signal, times)
+                continue
+            # A low-pass filter would turn a stick that jumps into one that rings.
+            samples[key, kind] = held_mean(*signal, times)
+            if not np.isin(samples[key, kind], signal.values).all():
+                notes.append(f"{key} is held: each step of the grid has its mean over that step")
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples
