@@ -13,6 +13,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.describe import describe_table
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
@@ -189,6 +190,12 @@ def _clocks(
             notes.append(f"left out: {str(e).removeprefix(f'{log.path}, ')}")
     if not clocks:
         raise problems[0]
+    longest = max(
+        (topic.times for topic in (log.topic_of(n) for n in names) if topic.name in clocks),
+        key=lambda times: times[-1],
+    )
+    end, step = float(longest[-1]) - log.first_time, float(np.median(np.diff(longest)))
+    notes += window_note(selection.window, end, step)
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():

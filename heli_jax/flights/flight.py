@@ -79,6 +79,7 @@ class Source:
         cautions: sentences on what biases a fit to the log as it is used, which every fit repeats.
         inputs: by the model's name, what each is in the log.
         outputs: likewise.
+        begin: time of the log's beginning [s], in the log's own count; windows count from it.
     """
 
     path: str
@@ -90,6 +91,7 @@ class Source:
     cautions: tuple[str, ...] = ()
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
+    begin: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +186,12 @@ class Flight:
     def times(self) -> np.ndarray:
         """Time of each sample from the first one on, shape (N,) [s]."""
         return self.dt * np.arange(self.n_samples)
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """First and last time [s] from the log's beginning; from its own where it has no log."""
+        start = self.t0 - (self.source.begin if self.source else self.t0)
+        return start, start + self.duration
 
     @property
     def duration(self) -> float:

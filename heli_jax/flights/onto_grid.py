@@ -41,6 +41,22 @@ def long_gap(seconds: np.ndarray) -> LongGap | None:
     return LongGap(row, float(steps[row]), most) if steps[row] > most * (1 + 1e-9) else None
 
 
+def window_note(
+    window: tuple[float, float] | None, end: float, step: float = 0.0
+) -> tuple[str, ...]:
+    """A note where a window reaches beyond the log, else none.
+
+    Args:
+        window: first and last time [s] from the log's beginning.
+        end: of the log [s].
+        step: the usual one [s], by which a window may be longer.
+    """
+    if window is None or (window[0] >= 0 and window[1] <= end + step):
+        return ()
+    words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
+    return (f"{words}, which ends at {end:.6g} s",)
+
+
 def even_expected(seconds: np.ndarray, usual: float) -> str:
     """What to do about stamps (N,) [s] that are no uniform grid, in words; `usual` is the step
     [s] of most."""

@@ -32,6 +32,7 @@ from heli_jax.flights.onto_grid import (
     long_gap,
     measured_once,
     missing_notes,
+    window_note,
 )
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
@@ -67,6 +68,13 @@ def load_table(table: Table, request: Request) -> LoadedTable:
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
 
+def table_window_note(loaded: LoadedTable, request: Request) -> tuple[str, ...]:
+    """A note where the window reaches beyond the table."""
+    elapsed = loaded.clock.elapsed
+    step = float(np.median(np.diff(elapsed))) if elapsed.size > 1 else 0.0
+    return window_note(request.options.window, float(elapsed[-1]), step)
+
+
 def read_table(loaded: LoadedTable, request: Request) -> Flight:
     """The flight inside the window of `request`.
 
@@ -91,7 +99,7 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
     notes = (*notes, *repeated, *missing_notes(request, signals), *more)
-    source = Source(table.path, table.sha256, notes)
+    source = Source(table.path, table.sha256, notes, begin=loaded.first_time)
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
 
@@ -176,8 +184,7 @@ def _rows(
                 path,
                 f"{where} lies outside the log, expected a part of 0 s to {elapsed[-1]:.6g} s",
             )
-        if start < 0 or end > elapsed[-1] + step:
-            notes = (f"{where} was cut to the log, which ends at {elapsed[-1]:.6g} s",)
+        notes = window_note(window, float(elapsed[-1]), step)
         # The bounds are inclusive whatever the rounding of the stamps.
         first = int(np.searchsorted(elapsed, start - 1e-3 * step, side="left"))
         last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
