@@ -12,9 +12,10 @@ from heli_jax.config.onboard import FROM_LOG
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, with_filters
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Source
 from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.table import shown
 
 type _Channel = tuple[tuple[Filter, ...], float]
 
@@ -71,7 +72,15 @@ def _channel(part: Any, i: int, name: str, output: OutputConfig, path: Path) -> 
             filters.append(config.filter)
             continue
         log = str((path.parent / part.log).absolute())
-        logged = logged_filters(*_settings(log, part.flight, _version(log)), output.signal)
+        firmware, settings, channels = _settings(log, part.flight, _version(log))
+        # First, or a misspelt channel would be taken for one of which the log says nothing.
+        if not _is_derived(output.signal) and output.signal not in channels:
+            near = nearest(output.signal[:60], {n[:60] for n in channels})
+            raise InputError(
+                f"{path}: flights[{i}].signals.outputs.{name}.signal: {part.log} has no channel "
+                f"{shown(output.signal)}{near}"
+            )
+        logged = logged_filters(firmware, settings, output.signal)
         if logged is None:
             raise InputError(
                 f"{path}: flights[{i}].signals.outputs.{name}.filter: {part.log} does not say "
@@ -80,6 +89,11 @@ def _channel(part: Any, i: int, name: str, output: OutputConfig, path: Path) -> 
             )
         filters += logged.filters
     return tuple(filters), output.delay or 0.0
+
+
+def _is_derived(signal: str) -> bool:
+    """Whether it is computed from channels, and so stands in no log."""
+    return "(" in signal or signal.startswith("ccpm.")
 
 
 def _version(log: str) -> tuple[int, int]:
@@ -94,12 +108,14 @@ def _version(log: str) -> tuple[int, int]:
 # Of the last log only: its outputs are asked for one after the other, and it may take seconds to
 # read.
 @functools.lru_cache(maxsize=1)
-def _settings(log: str, number: int | None, version: tuple[int, int]) -> tuple[str, Any]:
-    """Firmware and settings of a log."""
+def _settings(
+    log: str, number: int | None, version: tuple[int, int]
+) -> tuple[str, Any, frozenset[str]]:
+    """Firmware, settings and channels of a log."""
     opened = chosen_flights(log, open_flights(log), number)
     if not isinstance(opened, tuple):
-        return "", {}
-    return opened[0].firmware, opened[0].parameters
+        return "", {}, frozenset(opened.names)
+    return opened[0].firmware, opened[0].parameters, frozenset(opened[0].names)
 
 
 def _words(channel: _Channel) -> str:
