@@ -93,6 +93,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     # A table has one clock and no firmware, so most of the lines below would be empty.
     if not flight.topics:
         yield from _clock_lines(flight.time)
+        yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
         yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
         return
     number, of = flight.flight

@@ -20,7 +20,7 @@ from heli_jax.flights.grid import (
 )
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
-from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
+from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 # A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
@@ -234,6 +234,22 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         columns=tuple(_describe_column(each) for each in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
+        notes=_other_lengths(surveys),
+    )
+
+
+def _other_lengths(surveys: list[Survey]) -> tuple[str, ...]:
+    """A sentence for each number of samples that is not the log's: arrays may have their own."""
+    by_size: dict[int, list[str]] = {}
+    for each in surveys:
+        if each.values is not None:
+            by_size.setdefault(each.values.size, []).append(shown(each.name))
+    rows = _n_rows(surveys)
+    return tuple(
+        f"{size} samples, not {rows}: {', '.join(names[:6])}"
+        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        for size, names in by_size.items()
+        if size != rows
     )
 
 
