@@ -109,9 +109,12 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     fitting = fitting_presets(flight.format, [column.name for column in flight.columns])
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"
-    yield from _topic_lines(flight.topics)
+    # Who asks for channels of a name has not asked for the topics.
+    if pattern is None:
+        yield from _topic_lines(flight.topics)
     yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
-    yield from _setting_lines(flight)
+    if pattern is None:
+        yield from _setting_lines(flight)
 
 
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from heli_jax import units
+from heli_jax.errors import nearest
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -280,6 +281,10 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
     if _values(surveys, signal.name) is None:
         raise wrong(table.path, "holds text, expected times", column(signal.name))
     if signal.unit not in _SECONDS:
+        if not units.is_unit(signal.unit):
+            # Of the units of time alone: the nearest of all units may be one of capacity.
+            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, _SECONDS)}"
+            raise wrong(table.path, problem, column(signal.name))
         try:
             units.factor(signal.unit, "s")
         except ValueError as e:

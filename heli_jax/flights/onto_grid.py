@@ -78,15 +78,28 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
     return holds
 
 
-def missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
-    """A note for every output (N,) with missing samples."""
+def missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
+    """A note for every output with missing samples: how many, and where in the log."""
     notes = []
-    for key, samples in values.items():
-        count = int(np.isnan(samples).sum())
+    for key, signal in signals.items():
+        missing = np.isnan(signal.values)
+        count = int(missing.sum())
         if count:
             name = shown(request.signals[key].name)
-            notes.append(f"{count} of {samples.size} samples of {name} are missing")
+            words = f"{count} of {missing.size} samples of {name} are missing"
+            notes.append(f"{words}, {_where(signal.seconds[missing], missing)}")
     return notes
+
+
+def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
+    """Where samples are missing: their times [s] and, of all samples (N,), which they are."""
+    first, last = f"{seconds[0]:.6g} s", f"{seconds[-1]:.6g} s"
+    if seconds.size == 1:
+        return f"at {first}"
+    runs = int(missing[0]) + int(np.count_nonzero(missing[1:] & ~missing[:-1]))
+    if runs == 1:
+        return f"all from {first} to {last}"
+    return f"in {runs} places from {first} to {last}"
 
 
 def measured_once(

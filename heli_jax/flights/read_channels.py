@@ -113,8 +113,9 @@ def flight_of_signals(
     holds = decided_holds(request, values)
     values, repeated = measured_once(request, values)
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
+    missing = missing_notes(request, {key: signal.timed for key, signal in signals.items()})
     start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
-    notes = (*source.notes, *repeated, *missing_notes(request, values), *notes)
+    notes = (*source.notes, *repeated, *missing, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates, begin=first_time)
     return flight_of(request, samples, dt, first_time + start, holds, source)

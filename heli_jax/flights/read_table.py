@@ -98,7 +98,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
-    notes = (*notes, *repeated, *missing_notes(request, signals), *more)
+    timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
+    notes = (*notes, *repeated, *missing_notes(request, timed), *more)
     source = Source(table.path, table.sha256, notes, begin=loaded.first_time)
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
