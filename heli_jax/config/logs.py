@@ -295,10 +295,11 @@ def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
         # A receiver's pulse width is a time, and no stick of any model is one.
         if role == "inputs" and si is not None and units.is_time(unit):
-            more = '"1"' if units.is_plain(si) else si
+            example = f'{OFFSET_AND_SCALE}, unit: "1"'
+            if not units.is_plain(si):
+                example = f"such as offset: 1500, scale in {si} per {unit.strip()}, unit: {si}"
             hint = (
-                f"; of pulse widths state offset, scale and the unit that they then have, "
-                f"{OFFSET_AND_SCALE}, unit: {more}"
+                f"; of pulse widths state offset, scale and the unit that they then have, {example}"
             )
         raise InputError(f"{place}: {e}{hint}") from e
     return si
