@@ -225,7 +225,7 @@ def test_a_rotor_in_the_wrong_unit_is_doubted(load, tmp_path, rotor, sentence):
 def test_raw_pulse_widths_are_doubted(load, tmp_path):
     write_log(tmp_path / "flight.log", np.sin(TIMES))
     text = (tmp_path / "flight.log").read_text()
-    for level in ("-0.1", "0.1"):
+    for level in ("-0.1", "0", "0.1"):
         pulse = f"{1500 + 1000 * float(level):.0f}"
         text = re.sub(rf", {level}$", f", {pulse}", text, flags=re.MULTILINE)
     (tmp_path / "flight.log").write_text(text)

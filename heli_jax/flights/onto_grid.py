@@ -51,7 +51,7 @@ def window_note(
         end: of the log [s].
         step: the usual one [s], by which a window may be longer.
     """
-    if window is None or (window[0] >= 0 and window[1] <= end + step):
+    if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
         return ()
     words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
     return (f"{words}, which ends at {end:.6g} s",)
