@@ -211,7 +211,7 @@ def test_a_fit_repeats_the_cautions_once(load):
     ("rotor", "sentence"),
     [
         ({"rotor": 150}, "vibration: rotor: no unit stated, 150 taken as rad/s"),
-        ({"rotor": 1450}, "turns at 1.385e+04 rpm, .*was unit: rpm meant"),
+        ({"rotor": 1450}, "turns at 13846 rpm, .*was unit: rpm meant"),
         ({"rotor": 1450, "unit": "rpm"}, None),
     ],
 )

@@ -48,7 +48,7 @@ def rotor_doubt(vibration: VibrationConfig, speed: float) -> tuple[str, ...]:
     """
     if speed > _FASTEST_ROTOR:
         return (
-            f"vibration: a rotor of {speed:.4g} rad/s turns at {speed * 30 / np.pi:.4g} rpm, "
+            f"vibration: a rotor of {speed:.4g} rad/s turns at {speed * 30 / np.pi:.0f} rpm, "
             f"expected less than {_FASTEST_ROTOR:g} rad/s; was unit: rpm meant?",
         )
     if "unit" not in vibration.model_fields_set:
