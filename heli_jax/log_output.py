@@ -98,6 +98,7 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     # A table has one clock and no firmware, so most of the lines below would be empty.
     if not flight.topics:
         yield from _clock_lines(flight.time)
+        yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
         yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
         return
     number, of = flight.flight
@@ -114,9 +115,12 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     if fitting:
         yield f"preset: {', '.join(fitting)} (docs/logs.md)"
     yield from _vibration_lines(flight.vibration)
-    yield from _topic_lines(flight.topics)
+    # Who asks for channels of a name has not asked for the topics.
+    if pattern is None:
+        yield from _topic_lines(flight.topics)
     yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
-    yield from _setting_lines(flight)
+    if pattern is None:
+        yield from _setting_lines(flight)
 
 
 def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:

@@ -236,6 +236,11 @@ def is_plain(unit: str) -> bool:
     return not dict(_parse(unit).dimensionality)
 
 
+def is_time(unit: str) -> bool:
+    """Whether a text is a unit of time: `s`, `us`."""
+    return is_unit(unit) and _parse(unit).dimensionality == _parse("s").dimensionality
+
+
 def _without_angle(quantity: Any) -> dict[str, float]:
     return {k: v for k, v in dict(quantity.dimensionality).items() if k != "[angle]"}
 

@@ -1,5 +1,6 @@
 """What a configuration says of filters, delays and vibration between motion and log."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -88,6 +89,10 @@ def test_a_filter_is_stated_or_read_from_the_log(load, tmp_path):
         ({"delay": 4}, "p.delay: delay: expected seconds, at most 1, got 4"),
         ({"delay": "4 ms"}, "p.delay: expected a number of seconds, got '4 ms'"),
         ({"signal": "IMU.C1", "filter": "from log"}, "does not say how IMU.C1 was filtered"),
+        (
+            {"signal": "IMU.GyrZ", "filter": "from log"},
+            "p.signal: flight.log has no channel 'IMU.GyrZ'; did you mean 'IMU.GyrX'",
+        ),
     ],
 )
 def test_errors_are_sentences(load, p, sentence):
@@ -245,3 +250,37 @@ def test_a_fit_repeats_the_cautions_once(load):
     problem = configuration.problem(load(flight(), flight()))
     (said,) = cautions(problem)
     assert said.startswith("flight 1: p was low-passed at 20 Hz")
+
+
+@pytest.mark.parametrize(
+    ("rotor", "sentence"),
+    [
+        ({"rotor": 150}, "vibration: rotor: no unit stated, 150 taken as rad/s"),
+        ({"rotor": 1450}, "turns at 13846 rpm, .*was unit: rpm meant"),
+        ({"rotor": 1450, "unit": "rpm"}, None),
+    ],
+)
+def test_a_rotor_in_the_wrong_unit_is_doubted(load, tmp_path, rotor, sentence):
+    write_log(tmp_path / "flight.log", np.sin(TIMES))
+    (read,) = read_flights(load(flight() | {"vibration": rotor}))
+    said = " ".join(c for c in read.source.cautions if c.startswith("vibration"))
+    assert re.search(sentence, said) if sentence else not said
+
+
+def test_raw_pulse_widths_are_doubted(load, tmp_path):
+    write_log(tmp_path / "flight.log", np.sin(TIMES))
+    text = (tmp_path / "flight.log").read_text()
+    for level in ("-0.1", "0", "0.1"):
+        pulse = f"{1500 + 1000 * float(level):.0f}"
+        text = re.sub(rf", {level}$", f", {pulse}", text, flags=re.MULTILINE)
+    (tmp_path / "flight.log").write_text(text)
+    raw = flight()
+    (read,) = read_flights(load(raw))
+    (doubt,) = [c for c in read.source.cautions if c.startswith("lat: 1400 to 1600 in the log")]
+    assert "taken as plain numbers, with no offset: state offset and scale" in doubt
+    raw["signals"]["inputs"]["lat"] |= {"offset": 1500, "scale": 0.002}
+    (read,) = read_flights(load(raw))
+    assert not any("pulse" in c for c in read.source.cautions)
+    raw["signals"]["inputs"]["lat"] = {"signal": "IMU.C1", "unit": "us"}
+    with pytest.raises(InputError, match=r'offset: 1500, scale: 0\.002, unit: "1"'):
+        read_flights(load(raw))

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from heli_jax import naming, units
 from heli_jax.config.corrections import read_corrections, with_corrections
+from heli_jax.config.doubts import OFFSET_AND_SCALE, pulse_width_doubts
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
@@ -101,7 +102,11 @@ def _read_flight(
     flights = tuple(with_instruments(flight, instruments) for flight in flights)
     first, *others = _treated(experiment, flights, f, where)
     cautions = filter_cautions(first.source, everything.outputs)
-    cautions = (*cautions, *vibration_notes(experiment, first, f, where))
+    cautions = (
+        *cautions,
+        *pulse_width_doubts(first),
+        *vibration_notes(experiment, first, f, where),
+    )
     return (_with_notes(first, notes, cautions), *others)
 
 
@@ -341,7 +346,7 @@ def signals(
         out[name] = Signal(
             config.signal or "",
             unit,
-            _si(unit, si, place, gain),
+            _si(unit, si, place, gain, role),
             sd,
             hold,
             getattr(config, "repeats", "auto"),
@@ -351,7 +356,7 @@ def signals(
     return out
 
 
-def _si(unit: str, si: str | None, place: str, gain: bool) -> str:
+def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:
     try:
         # A model of one's own may state no units: the log's unit is converted to SI all the same.
         if si is None:
@@ -365,5 +370,13 @@ def _si(unit: str, si: str | None, place: str, gain: bool) -> str:
         # The remedy only where it is one: for sticks logged in percent or counts.
         if si is not None and unit.strip() in ("", "1", "-", "%", "stick", "dimensionless"):
             hint = "; or set fit.nuisance.input_gain: true, and the estimated gain carries the unit"
+        # A receiver's pulse width is a time, and no stick of any model is one.
+        if role == "inputs" and si is not None and units.is_time(unit):
+            example = f'{OFFSET_AND_SCALE}, unit: "1"'
+            if not units.is_plain(si):
+                example = f"such as offset: 1500, scale in {si} per {unit.strip()}, unit: {si}"
+            hint = (
+                f"; of pulse widths state offset, scale and the unit that they then have, {example}"
+            )
         raise InputError(f"{place}: {e}{hint}") from e
     return si

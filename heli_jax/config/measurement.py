@@ -12,9 +12,10 @@ from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import Filter, with_filters
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.table import shown
 
 type _Channel = tuple[tuple[Filter, ...], float]
 
@@ -74,6 +75,13 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             filters.append(config.filter)
             continue
         log = logs.open(path.parent / part.log, part.flight)
+        # First, or a misspelt channel would be taken for one of which the log says nothing.
+        if not _is_derived(output.signal) and output.signal not in log.names:
+            near = nearest(output.signal[:60], {n[:60] for n in log.names})
+            raise InputError(
+                f"{path}: flights[{i}].signals.outputs.{name}.signal: {part.log} has no channel "
+                f"{shown(output.signal)}{near}"
+            )
         # A table has no settings.
         settings = (log.firmware, log.parameters) if isinstance(log, ChannelLog) else ("", {})
         logged = logged_filters(*settings, output.signal)
@@ -84,6 +92,11 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
             )
         filters += logged.filters
     return tuple(filters), output.delay or 0.0
+
+
+def _is_derived(signal: str) -> bool:
+    """Whether it is computed from channels, and so stands in no log."""
+    return "(" in signal or signal.startswith("ccpm.")
 
 
 def _words(channel: _Channel) -> str:

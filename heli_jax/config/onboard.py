@@ -183,7 +183,7 @@ class VibrationConfig(_Strict):
     """What shakes the sensors, to give lines of the spectrum a name."""
 
     rotor: _Positive
-    """speed of the rotor"""
+    """speed of the rotor, in rad/s unless `unit` says otherwise"""
     unit: str = "rad/s"
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from heli_jax import naming, units
+from heli_jax.config.doubts import rotor_doubt
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
@@ -96,7 +97,8 @@ def vibration_notes(
     """
     rotor = _rotor_hz(experiment, flight, config, where)
     rates = flight.source.rates if flight.source else {}
-    notes = []
+    stated = config.vibration
+    notes = [] if stated is None or rotor is None else [*rotor_doubt(stated, 2 * math.pi * rotor)]
     for name, y in flight.outputs.items():
         found = lines(y, flight.dt, rotor, rates.get(name))
         if found:

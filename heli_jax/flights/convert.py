@@ -2,8 +2,8 @@
 
 import fnmatch
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from heli_jax.flights.describe import describe_table
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.named import NamedBy
+from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
@@ -86,7 +87,9 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     named = None if selection.named is None else selection.named(log)
     notes = [] if named is None else list(named.notes)
     if isinstance(log, DerivedTable):
-        log = with_derived(_as_channels(log.table, selection, notes), selection.swashplate)
+        channels, clockless = _as_channels(log.table, selection, notes)
+        _require_clocks(channels, clockless, selection.signals, notes)
+        log = with_derived(channels, selection.swashplate)
         assert isinstance(log, DerivedLog)
     elif selection.time or selection.time_unit:
         raise wrong(log.path, "its topics have clocks of their own, expected no time to be stated")
@@ -125,8 +128,64 @@ def _check(path: str, selection: Selection) -> None:
         raise wrong(path, f"window is {list(window)}, expected two increasing numbers of seconds")
 
 
-def _as_channels(table: Table, selection: Selection, notes: list[str]) -> ChannelLog:
-    """A table as a log of one topic, its clock named or guessed."""
+type _Clockless = Mapping[str, int]
+"""arrays without a clock of their own length, with their numbers of samples"""
+
+
+def _as_channels(
+    table: Table, selection: Selection, notes: list[str]
+) -> tuple[ChannelLog, _Clockless]:
+    """A table as a log of one topic, its clock named or guessed; arrays of other lengths that have
+    a clock too are topics of their own."""
+    topic, start = _table_topic(table, selection, notes)
+    topics, clockless = [topic], {}
+    lengths = table.lengths() if isinstance(table, ArrayTable) else {}
+    for size, names in lengths.items():
+        if size == topic.times.size:
+            continue
+        part = table.only(names)
+        try:
+            another, first = _table_topic(part, Selection(), said := [])
+        except InputError:
+            another, first, said = None, 0.0, []
+        if another is None or not another.columns:
+            clockless |= dict.fromkeys(names, size)
+            continue
+        # One machine's clocks have one zero.
+        times = another.times + (first - start)
+        topics.append(replace(another, name=f"arrays of {size} samples", times=times))
+        notes += said
+    return ChannelLog(table.path, table.format, table.size, table.sha256, tuple(topics)), clockless
+
+
+def _require_clocks(
+    log: ChannelLog, clockless: _Clockless, patterns: Sequence[str], notes: list[str]
+) -> None:
+    """Refuse, or where they were not asked for by name note, arrays without a clock."""
+    rows = log.topics[0].times.size
+    for pattern in patterns:
+        matches = _matching(clockless, pattern)
+        if matches and not _matching(log.names, pattern):
+            name = matches[0]
+            problem = f"has {clockless[name]} samples and the clock {shown(log.topics[0].clock)}"
+            problem += f" {rows}, expected an array of {clockless[name]} times beside it"
+            raise wrong(log.path, problem, f"array {shown(name)}")
+    asked = [n for p in patterns or ["*"] for n in _matching(clockless, p)]
+    for size in dict.fromkeys(clockless[name] for name in asked):
+        names = [shown(n) for n in dict.fromkeys(asked) if clockless[n] == size]
+        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+        words = f"left out: {', '.join(names[:6])}{more}"
+        notes.append(f"{words}, of {size} samples, for which there is no clock")
+
+
+def _matching(names: Iterable[str], pattern: str) -> list[str]:
+    # The brackets of gyroADC[0] are meant as they stand.
+    literal = pattern.replace("[", "[[]")
+    return [name for name in names if fnmatch.fnmatchcase(name, literal)]
+
+
+def _table_topic(table: Table, selection: Selection, notes: list[str]) -> tuple[Topic, float]:
+    """The columns of a table's clock, which is named or guessed, and its first time [s]."""
     info = describe_table(table, selection.time, selection.time_unit)
     clock = info.time
     if clock is None or clock.problem:
@@ -148,7 +207,7 @@ def _as_channels(table: Table, selection: Selection, notes: list[str]) -> Channe
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
-    return ChannelLog(table.path, table.format, table.size, table.sha256, (topic,))
+    return topic, float(stamps[0]) * scale
 
 
 def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
@@ -168,9 +227,7 @@ def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
     else:
         names = []
         for pattern in patterns:
-            # The brackets of gyroADC[0] are meant as they stand.
-            literal = pattern.replace("[", "[[]")
-            matches = [n for n in log.names if fnmatch.fnmatchcase(n, literal)]
+            matches = _matching(log.names, pattern)
             if not matches and log.is_derived(pattern):
                 matches = [pattern]
             if not matches:
@@ -214,6 +271,12 @@ def _clocks(
             notes.append(f"left out: {str(e).removeprefix(f'{log.path}, ')}")
     if not clocks:
         raise problems[0]
+    longest = max(
+        (topic.times for topic in (log.topic_of(n) for n in names) if topic.name in clocks),
+        key=lambda times: times[-1],
+    )
+    end, step = float(longest[-1]) - log.first_time, float(np.median(np.diff(longest)))
+    notes += window_note(selection.window, end, step)
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
@@ -283,7 +346,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def require_output(out: Path, log: str | Path) -> None:
-    """Refuse a name that no format that is written ends with, and the log itself.
+    """Refuse a name that no format that is written ends with, and a file that is there already.
 
     Raises:
         InputError: naming the endings.
@@ -294,6 +357,8 @@ def require_output(out: Path, log: str | Path) -> None:
     # overwrite it just as well.
     if out.exists() and Path(log).exists() and os.path.samefile(out, log):
         raise InputError(f"{out}: is the log itself, expected another name")
+    if os.path.lexists(out):  # a link to nothing is in the way too
+        raise InputError(f"{out}: exists already, expected a new name")
 
 
 def write_converted(out: Path, converted: Converted) -> None:

@@ -102,6 +102,10 @@ _LONGEST_LINE = 10_000_000
 _LONGEST_PREAMBLE = 1_000_000
 """bytes of blank lines and comments before the header"""
 _BLOCK = 1 << 20
+_PLAIN = re.compile(r"[+-]?[0-9]*\.?[0-9]+(?:\.|[eE][+-]?[0-9]+)?|nan", re.IGNORECASE)
+_COMMENT = re.compile(r"\s*(#|%(\s|%|[^,;\t]*$))")
+"""A name may begin with a percent sign, so that of MATLAB's comments those are known which go on
+with a blank or have no cells."""
 _SOMETHING = re.compile(rb"[^ \t\n\r\v\f]")
 
 
@@ -114,19 +118,35 @@ class Line(NamedTuple):
 
 
 def find_header(data: bytes) -> Line | None:
-    """The first line that is neither blank nor a comment; None where there is none within the
-    first 1 MB."""
+    """The first line that is neither blank nor a comment, or the comment above it where that names
+    columns of numbers; None where there is none within the first 1 MB."""
     # Excel's byte order mark would belong to the first name.
     start, number = 3 if data.startswith(codecs.BOM_UTF8) else 0, 1
+    comment = ""
     while start < min(len(data), _LONGEST_PREAMBLE):
         end, after = _line_end(data, start)
         # Cut: what is refused for its length need not be decoded as a whole.
         content = data[start : min(end, start + 4 * LONGEST_HEADER + 4)].decode("utf-8", "ignore")
         # Comments may say anything, a list of names with commas too.
-        if content.strip() and not content.strip().startswith("#"):
+        mark = _COMMENT.match(content)
+        if content.strip() and mark is None:
+            # MATLAB's and NumPy's writers of text put the names into a comment.
+            if _names_columns(comment, content):
+                return Line(comment, number - 1, start)
             return Line(content, number, after)
+        comment = content.lstrip()[1:].strip() if mark else ""
         start, number = after, number + 1
     return None
+
+
+def _names_columns(comment: str, row: str) -> bool:
+    """Whether a comment names as many columns as the row of numbers below it has."""
+    cells = re.split(r"[,;\s]+", row.strip(" \t\r\n,;"))
+    if not all(_PLAIN.fullmatch(cell) for cell in cells) or _PLAIN.match(comment):
+        return False
+    if any(comment.count(d) == row.count(d) > 0 for d in "\t;,"):
+        return True
+    return is_of_blanks(comment, row)
 
 
 def first_row(data: bytes, at: int) -> str | None:

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from heli_jax import units
+from heli_jax.errors import nearest
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -21,7 +22,7 @@ from heli_jax.flights.grid import (
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.table import Survey, Table, column, require_columns, wrong
+from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 # A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
@@ -238,6 +239,22 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         columns=tuple(_describe_column(each) for each in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
+        notes=_other_lengths(surveys),
+    )
+
+
+def _other_lengths(surveys: list[Survey]) -> tuple[str, ...]:
+    """A sentence for each number of samples that is not the log's: arrays may have their own."""
+    by_size: dict[int, list[str]] = {}
+    for each in surveys:
+        if each.values is not None:
+            by_size.setdefault(each.values.size, []).append(shown(each.name))
+    rows = _n_rows(surveys)
+    return tuple(
+        f"{size} samples, not {rows}: {', '.join(names[:6])}"
+        + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        for size, names in by_size.items()
+        if size != rows
     )
 
 
@@ -268,6 +285,10 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
     if _values(surveys, signal.name) is None:
         raise wrong(table.path, "holds text, expected times", column(signal.name))
     if signal.unit not in _SECONDS:
+        if not units.is_unit(signal.unit):
+            # Of the units of time alone: the nearest of all units may be one of capacity.
+            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, _SECONDS)}"
+            raise wrong(table.path, problem, column(signal.name))
         try:
             units.factor(signal.unit, "s")
         except ValueError as e:

@@ -195,6 +195,12 @@ class Flight:
         return self.dt * np.arange(self.n_samples)
 
     @property
+    def window(self) -> tuple[float, float]:
+        """First and last time [s] from the log's beginning; from its own where it has no log."""
+        start = self.t0 - (self.source.first_time if self.source else self.t0)
+        return start, start + self.duration
+
+    @property
     def duration(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.dt * (self.n_samples - 1)

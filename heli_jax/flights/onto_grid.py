@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.holds import Decision, decide
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import hold, in_gaps, longest_gap, resampled
+from heli_jax.flights.resample import held_mean, in_gaps, longest_gap, resampled
 from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
@@ -41,6 +41,22 @@ def long_gap(seconds: np.ndarray) -> LongGap | None:
     return LongGap(row, float(steps[row]), most) if steps[row] > most * (1 + 1e-9) else None
 
 
+def window_note(
+    window: tuple[float, float] | None, end: float, step: float = 0.0
+) -> tuple[str, ...]:
+    """A note where a window reaches beyond the log, else none.
+
+    Args:
+        window: first and last time [s] from the log's beginning.
+        end: of the log [s].
+        step: the usual one [s], by which a window may be longer.
+    """
+    if window is None or (window[0] >= 0 and window[1] <= end + 1.001 * step):
+        return ()
+    words = f"the window from {window[0]:g} s to {window[1]:g} s was cut to the log"
+    return (f"{words}, which ends at {end:.6g} s",)
+
+
 def even_expected(seconds: np.ndarray, usual: float) -> str:
     """What to do about stamps (N,) [s] that are no uniform grid, in words; `usual` is the step
     [s] of most."""
@@ -62,19 +78,22 @@ def decided_holds(request: Request, values: Mapping[Key, np.ndarray]) -> dict[st
     return holds
 
 
-def sample_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
-    """What is to be said of the signals (N,) as they were logged, in sentences."""
-    return [*_missing_notes(request, values), *_turn_notes(request, values)]
+def sample_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
+    """What is to be said of the signals as they were logged, in sentences."""
+    values = {key: signal.values for key, signal in signals.items()}
+    return [*_missing_notes(request, signals), *_turn_notes(request, values)]
 
 
-def _missing_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]:
-    """A note for every output (N,) with missing samples."""
+def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
+    """A note for every output with missing samples: how many, and where in the log."""
     notes = []
-    for key, samples in values.items():
-        count = int(np.isnan(samples).sum())
+    for key, signal in signals.items():
+        missing = np.isnan(signal.values)
+        count = int(missing.sum())
         if count:
             name = shown(request.signals[key].name)
-            notes.append(f"{count} of {samples.size} samples of {name} are missing")
+            words = f"{count} of {missing.size} samples of {name} are missing"
+            notes.append(f"{words}, {_where(signal.seconds[missing], missing)}")
     return notes
 
 
@@ -99,6 +118,17 @@ def _turn_notes(request: Request, values: Mapping[Key, np.ndarray]) -> list[str]
     return notes
 
 
+def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
+    """Where samples are missing: their times [s] and, of all samples (N,), which they are."""
+    first, last = f"{seconds[0]:.6g} s", f"{seconds[-1]:.6g} s"
+    if seconds.size == 1:
+        return f"at {first}"
+    runs = int(missing[0]) + int(np.count_nonzero(missing[1:] & ~missing[:-1]))
+    if runs == 1:
+        return f"all from {first} to {last}"
+    return f"in {runs} places from {first} to {last}"
+
+
 def measured_once(
     request: Request, values: Mapping[Key, np.ndarray]
 ) -> tuple[dict[Key, np.ndarray], list[str]]:
@@ -117,8 +147,9 @@ def at_times(
 ) -> tuple[dict[Key, np.ndarray], list[str]]:
     """The signals' samples (M,) on a grid, and notes.
 
-    Inputs follow their hold. Outputs are interpolated, or low-pass filtered where the rate goes
-    down; those that are slower than the grid stand at the instants nearest to their own.
+    A held input has the mean of what it was until the grid's next instant. Other inputs and the
+    outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
+    than the grid stand at the instants nearest to their own.
 
     Args:
         request: names them.
@@ -129,9 +160,13 @@ def at_times(
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     for (key, kind), signal in signals.items():
         if kind == "input":
-            # Steps stay steps: a low-pass filter would turn a stick that jumps into one that rings.
-            method = hold if holds[key].hold == "zero-order" else resampled
-            samples[key, kind] = method(*signal, times)
+            if holds[key].hold != "zero-order":
+                samples[key, kind] = resampled(*signal, times)
+                continue
+            # A low-pass filter would turn a stick that jumps into one that rings.
+            samples[key, kind] = held_mean(*signal, times)
+            if not np.isin(samples[key, kind], signal.values).all():
+                notes.append(f"{key} is held: each step of the grid has its mean over that step")
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples

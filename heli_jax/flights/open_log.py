@@ -22,6 +22,8 @@ from heli_jax.regular_file import open_regular, require_regular
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
 _TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log")
+_AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
+"""what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
     "expected a table (.csv, .txt, .tsv, .asc, .dat, .parquet), arrays (.mat, .nc, .h5, .hdf5) or"
@@ -124,11 +126,11 @@ def _reader(path: Path) -> _Reader:
         return open_parquet
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
-    # What such a file begins with is the user's own text, which may look like the mark of any
-    # other.
-    if ending in (".csv", ".tsv"):
-        return open_csv
     marked = _by_content(head)
+    # What such a file begins with is the user's own text, which may look like the mark of any
+    # other; but an autopilot's log may have been given the name of a table.
+    if ending in (".csv", ".tsv"):
+        return marked if marked is not None and head.startswith(_AUTOPILOTS) else open_csv
     # Arrays go by their ending, since MATLAB 7.3, NetCDF 4 and HDF5 files hold the same mark.
     if marked is not None and ending not in _ARRAYS:
         return marked

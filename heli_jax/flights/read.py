@@ -20,7 +20,7 @@ from heli_jax.flights.origins import with_origins, without_constants
 from heli_jax.flights.parts import is_too_short, stretches
 from heli_jax.flights.read_channels import clocks_of, on_all_the_time
 from heli_jax.flights.request import ReadOptions, Request
-from heli_jax.flights.sources import Opened, clocked, flight_from, opened
+from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opened
 from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
@@ -122,7 +122,8 @@ def read_parts(
     if not parts:
         problem = f"{len(found)} parts between gaps, expected one that is long enough; the last: "
         raise wrong(request.path, problem + left_out[-1]) from why
-    return (_with_notes(parts[0], _notes(found, left_out)), *parts[1:])
+    notes = (*beyond(logs, request), *_notes(found, left_out))
+    return (_with_notes(parts[0], notes), *parts[1:])
 
 
 def _opened(

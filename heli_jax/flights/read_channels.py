@@ -21,6 +21,7 @@ from heli_jax.flights.onto_grid import (
     long_gap,
     measured_once,
     sample_notes,
+    window_note,
 )
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
@@ -77,8 +78,20 @@ def read_channels(log: ChannelLog, request: Request) -> Flight:
         InputError: a channel is missing or holds no numbers, a clock is none, the window lies
             outside the log, a rate is needed or makes no sense.
     """
-    source = Source(log.path, log.sha256, log.notes, log.firmware, log.parameters)
+    notes = (*log.notes, *channel_window_note(log, request))
+    source = Source(log.path, log.sha256, notes, log.firmware, log.parameters)
     return flight_of_signals(signals_of(log, request), request, source, log.first_time)
+
+
+def channel_window_note(log: ChannelLog, request: Request) -> tuple[str, ...]:
+    """A note where the window reaches beyond the topics that are asked for."""
+    times = [log.topic_of(signal.name).times for signal in request.signals.values()]
+    # The one that ends first is where the flight does.
+    last = min((t for t in times if t.size > 1), key=lambda t: t[-1], default=None)
+    if last is None:
+        return ()
+    step = float(np.median(np.diff(last)))
+    return window_note(request.options.window, float(last[-1]) - log.first_time, step)
 
 
 def flight_of_signals(
@@ -100,8 +113,9 @@ def flight_of_signals(
     holds = decided_holds(request, values)
     values, repeated = measured_once(request, values)
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
+    said = sample_notes(request, {key: signal.timed for key, signal in signals.items()})
     start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
-    notes = (*source.notes, *repeated, *sample_notes(request, values), *notes)
+    notes = (*source.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates, first_time=first_time)
     return flight_of(request, samples, dt, first_time + start, holds, source)

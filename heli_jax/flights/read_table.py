@@ -32,6 +32,7 @@ from heli_jax.flights.onto_grid import (
     long_gap,
     measured_once,
     sample_notes,
+    window_note,
 )
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
@@ -67,6 +68,13 @@ def load_table(table: Table, request: Request) -> LoadedTable:
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
 
+def table_window_note(loaded: LoadedTable, request: Request) -> tuple[str, ...]:
+    """A note where the window reaches beyond the table."""
+    elapsed = loaded.clock.elapsed
+    step = float(np.median(np.diff(elapsed))) if elapsed.size > 1 else 0.0
+    return window_note(request.options.window, float(elapsed[-1]), step)
+
+
 def read_table(loaded: LoadedTable, request: Request) -> Flight:
     """The flight inside the window of `request`.
 
@@ -90,7 +98,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
-    notes = (*notes, *repeated, *sample_notes(request, signals), *more)
+    timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
+    notes = (*notes, *repeated, *sample_notes(request, timed), *more)
     source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
@@ -176,8 +185,7 @@ def _rows(
                 path,
                 f"{where} lies outside the log, expected a part of 0 s to {elapsed[-1]:.6g} s",
             )
-        if start < 0 or end > elapsed[-1] + step:
-            notes = (f"{where} was cut to the log, which ends at {elapsed[-1]:.6g} s",)
+        notes = window_note(window, float(elapsed[-1]), step)
         # The bounds are inclusive whatever the rounding of the stamps.
         first = int(np.searchsorted(elapsed, start - 1e-3 * step, side="left"))
         last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))

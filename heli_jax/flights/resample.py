@@ -39,7 +39,7 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
-        notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, steps stay steps")
+        notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs")
     return Clock(seconds[0] + np.arange(count) / rate, 1.0 / rate, tuple(notes))
 
 
@@ -56,6 +56,7 @@ def in_gaps(seconds: np.ndarray, times: np.ndarray) -> np.ndarray:
 def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """The value of the sample before each time: a stick stays until the next sample.
 
+    For modes and counters, of which no mean makes sense; what acts on a machine takes `held_mean`.
     A time that misses a stamp by rounding alone counts as at the stamp.
 
     Args:
@@ -68,6 +69,41 @@ def hold(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarr
     """
     tolerance = 1e-6 * float(np.median(np.diff(seconds)))
     return values[np.searchsorted(seconds, times + tolerance, side="right") - 1]
+
+
+def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The mean of a stepwise signal over each step of a grid, from its time to the next.
+
+    What a machine makes of a step is its integral. The mean keeps it wherever the step falls; the
+    value at the grid's time would be late by half a grid step on average, which a fit takes for
+    the machine's lag.
+
+    Args:
+        seconds: stamps (N,) [s], increasing; each sample stays until the next.
+        values: samples (N,), finite.
+        times: (M,) [s], evenly spaced, M >= 2, none before the first stamp.
+
+    Returns:
+        (M,), in the samples' unit; the samples themselves, to the last bit, where no step falls
+        between two times.
+    """
+    edges = np.append(times, 2 * times[-1] - times[-2])
+    # A stamp that misses a time by rounding alone counts as at it.
+    near = np.clip(np.searchsorted(edges, seconds), 1, edges.size - 1)
+    nearest = np.where(seconds - edges[near - 1] < edges[near] - seconds, near - 1, near)
+    at_edge = np.abs(seconds - edges[nearest]) <= 1e-6 * float(np.median(np.diff(seconds)))
+    stamps = np.where(at_edge, edges[nearest], seconds)
+    inside = stamps[(stamps >= edges[0]) & (stamps < edges[-1])]
+    bounds = np.union1d(edges, inside)
+    begins = bounds[:-1]
+    pieces = values[np.maximum(np.searchsorted(stamps, begins, side="right") - 1, 0)]
+    first = np.searchsorted(begins, times)
+    lowest = np.minimum.reduceat(pieces, first)
+    highest = np.maximum.reduceat(pieces, first)
+    steps = np.diff(edges)[np.searchsorted(times, begins, side="right") - 1]
+    # Weighted first: the sum of huge values times seconds could overflow.
+    mean = np.add.reduceat(pieces * (np.diff(bounds) / steps), first)
+    return np.clip(mean, lowest, highest)
 
 
 def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -17,11 +17,18 @@ from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import (
     ClockedSignal,
     TopicClock,
+    channel_window_note,
     flight_of_signals,
     read_channels,
     signals_of,
 )
-from heli_jax.flights.read_table import LoadedTable, clocked_table, load_table, read_table
+from heli_jax.flights.read_table import (
+    LoadedTable,
+    clocked_table,
+    load_table,
+    read_table,
+    table_window_note,
+)
 from heli_jax.flights.request import Also, ReadOptions, Request
 from heli_jax.flights.table import Table, shown, wrong
 
@@ -88,13 +95,21 @@ def flight_from(logs: Opened, request: Request) -> Flight:
             return read_channels(log, request)
         # A table by itself has rows that a message can name, and stamps whose rounding is known.
         return read_table(log, request)
-    notes = tuple(one.note for one in logs.beside)
+    notes = (*beyond(logs, request), *(one.note for one in logs.beside))
     if isinstance(log, ChannelLog):
         source = Source(log.path, log.sha256, (*log.notes, *notes), log.firmware, log.parameters)
         first = log.first_time
     else:
         source, first = Source(log.table.path, log.table.sha256, notes), log.first_time
     return flight_of_signals(clocked(logs, request), request, source, first)
+
+
+def beyond(logs: Opened, request: Request) -> tuple[str, ...]:
+    """A note where the window reaches beyond the first log."""
+    log, asked = logs.log, _only(request, logs.keys)
+    if isinstance(log, ChannelLog):
+        return channel_window_note(log, asked)
+    return table_window_note(log, asked)
 
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:

@@ -304,6 +304,7 @@ def _source(flight: Flight) -> dict[str, Any]:
         "hold_out": flight.hold_out,
         "n_samples": flight.n_samples,
         "dt": flight.dt,
+        "window": list(flight.window),
         "notes": list(flight.source.notes),
         "signals": {
             "inputs": {n: as_content(s) for n, s in flight.source.inputs.items()},

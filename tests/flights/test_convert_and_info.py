@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.io
 
 from heli_jax.cli import main
 from heli_jax.flights import describe_log, read_flight
@@ -217,3 +218,78 @@ def test_topics_are_told_apart_in_a_conversion_of_all(tmp_path):
     assert any("left out" in note for note in converted.notes)
     assert converted.columns["time"].size == 50
     assert TOPICS[0][0] == ATTITUDE
+
+
+def test_a_window_beyond_the_log_is_told_and_nothing_is_overwritten(tmp_path, capsys):
+    path, out = some_ulog(tmp_path), tmp_path / "out.csv"
+    arguments = ["convert", path, out, "--signals", f"{ATTITUDE}[0].xyz*", "--window", "0", "40"]
+    assert main([str(a) for a in arguments]) == 0
+    assert (
+        "the window from 0 s to 40 s was cut to the log, which ends at" in capsys.readouterr().err
+    )
+    before = out.read_bytes()
+    refused(capsys, arguments, "out.csv: exists already, expected a new name")
+    assert out.read_bytes() == before
+
+
+def test_channels_of_a_name_come_without_the_topics(tmp_path, capsys):
+    path = some_ulog(tmp_path)
+    assert main(["info", str(path), "--channels", "manual*"]) == 0
+    shown = capsys.readouterr().out
+    assert "manual_control_setpoint.x" in shown
+    assert ATTITUDE not in shown
+
+
+def arrays(path, **gps):
+    log = {"t": np.arange(100) * 0.01, "p": np.sin(np.arange(100)), "gps": gps}
+    scipy.io.savemat(path, {"log": log})
+    return path
+
+
+def test_arrays_of_another_length(tmp_path, capsys):
+    alone = arrays(tmp_path / "alone.mat", v=np.cos(np.arange(20)))
+    assert main(["info", str(alone)]) == 0
+    assert "20 samples, not 100: 'log.gps.v'" in capsys.readouterr().out
+    asked = ["convert", alone, tmp_path / "no.csv", "--signals", "log.gps.v"]
+    refused(
+        capsys, asked, "'log.gps.v': has 20 samples and the clock 'log.t' 100, expected an array"
+    )
+    assert main(["convert", str(alone), str(tmp_path / "all.csv")]) == 0
+    assert "left out: 'log.gps.v', of 20 samples" in capsys.readouterr().err
+    times = 0.3 + np.arange(20) * 0.02
+    both = arrays(tmp_path / "both.mat", v=np.cos(np.arange(20)), time=times)
+    asked = ["convert", both, tmp_path / "gps.csv", "--signals", "log.gps.v"]
+    assert main([str(a) for a in asked]) == 0
+    columns = table_of(tmp_path / "gps.csv")
+    np.testing.assert_allclose(columns["time"], times, atol=1e-12)
+    np.testing.assert_array_equal(columns["log.gps.v"], np.cos(np.arange(20)))
+
+
+def test_an_autopilots_log_under_the_name_of_a_table(tmp_path):
+    path = some_ulog(tmp_path)
+    assert open_log(path.rename(tmp_path / "flight.csv")).format == "ulog"
+    assert open_log(written(tmp_path, some_flight(), "other.csv")).format == "blackbox"
+    text = written(tmp_path, b"ULog,t\n0,1\n1,2\n", "table.csv")
+    assert open_log(text).names == ("ULog", "t")
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("% my log, of today\n%\nt,u\n0,1\n1,2\n", ("t", "u")),
+        ("%my log\nt,u\n0,1\n1,2\n", ("t", "u")),
+        ("# t,u\n0,1\n1,2\n", ("t", "u")),
+        ("% t[s] lat\n0 1e-3\n1 2\n", ("t[s]", "lat")),
+        ("%u,t\n0,1\n1,2\n", ("%u", "t")),
+        ("# of today\n0,1\n1,2\n", ("0", "1")),
+    ],
+)
+def test_comments_above_the_header(tmp_path, text, names):
+    assert open_log(written(tmp_path, text.encode(), "log.txt")).names == names
+
+
+def test_an_unknown_unit_of_time_names_those_of_time(tmp_path, capsys):
+    path = written(tmp_path, b"t,u\n0,1\n1,2\n", "log.csv")
+    asked = ["info", path, "--time-unit"]
+    refused(capsys, [*asked, "foo"], "unknown unit of time 'foo'; known are min, ms, ns, s")
+    refused(capsys, [*asked, "deg"], "unit 'deg' is an angle, expected a time")

@@ -265,7 +265,9 @@ def test_missing_outputs_are_read_and_told(tmp_path):
     flight = read_flight(path, **ASKED)
     assert np.array_equal(np.flatnonzero(np.isnan(flight.outputs["roll"])), [3, 7])
     assert flight.source is not None
-    assert flight.source.notes == ("2 of 12 samples of 'phi' are missing",)
+    assert flight.source.notes == (
+        "2 of 12 samples of 'phi' are missing, in 2 places from 0.06 s to 0.14 s",
+    )
     # On another clock what lies beside a missing sample is missing too, the rest stays.
     near = read_flight(path, **ASKED, rate=60).outputs["roll"]
     assert np.array_equal(np.flatnonzero(np.isnan(near)), [3, 4, 8, 9])

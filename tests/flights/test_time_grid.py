@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Flight, Signal, read_flight
-from heli_jax.flights.resample import hold, interpolate
+from heli_jax.flights.resample import held_mean, hold, interpolate
 
 
 def read(path, stamps: list[str], x: np.ndarray | None = None, **request) -> Flight:
@@ -124,7 +124,9 @@ def test_a_slower_clock_takes_whole_samples(tmp_path, part):
     x = np.sin(2 * np.pi * 0.3 * np.arange(300) / 30)
     stamps = [f"{i / 30:.3f}" for i in range(300)]
     flight = read(tmp_path / "log.csv", stamps, x, rate=30.0 / part)
-    assert np.array_equal(flight.inputs["u"], x[::part])
+    # A held input has the mean over each step; behind the last sample that stays.
+    means = np.r_[x, np.repeat(x[-1], part)][: part * flight.n_samples].reshape(-1, part).mean(1)
+    np.testing.assert_allclose(flight.inputs["u"], means, rtol=0, atol=1e-9)
     assert np.allclose(flight.outputs["y"][3:-3], x[::part][3:-3], atol=2e-3)
 
 
@@ -165,3 +167,41 @@ def test_hold_and_interpolation_against_a_plain_loop(steps, every):
         line.append(values[k] + part * (values[after] - values[k]))
     assert np.array_equal(hold(seconds, values, times), held)
     assert np.allclose(interpolate(seconds, values, times), line, rtol=0, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(steps=STEPS, every=st.integers(1, 30))
+def test_mean_of_a_held_input_against_a_count_of_ticks(steps, every):
+    ticks = [0, *np.cumsum(steps).tolist()]
+    values = np.random.default_rng(len(ticks)).normal(size=len(ticks))
+    count = max(2, ticks[-1] // every + 1)
+    by_tick = [values[bisect_right(ticks, t) - 1] for t in range(count * every)]
+    mean = np.reshape(by_tick, (count, every)).mean(axis=1)
+    times = np.arange(count) * every * 1e-3
+    assert held_mean(np.array(ticks) * 1e-3, values, times) == pytest.approx(mean, abs=1e-9)
+
+
+def test_a_held_input_on_its_own_grid_stays_to_the_last_bit():
+    values = np.random.default_rng(3).normal(size=5000) * 1e300
+    seconds = 1.7e9 + np.arange(5000) / 100
+    assert np.array_equal(held_mean(seconds, values, seconds[0] + np.arange(5000) * 0.01), values)
+    # Ten samples a step of the grid, all of one value.
+    held = np.repeat(values[:500], 10)
+    assert np.array_equal(held_mean(seconds, held, seconds[::10]), values[:500])
+
+
+def test_a_flight_at_a_lower_rate_keeps_the_impulse_of_its_stick(tmp_path):
+    rows = [(0.01 * i, 1.0 if i >= 53 else 0.0) for i in range(100)]
+    text = "t,stick,phi\n" + "".join(f"{t:.2f},{u},{t}\n" for t, u in rows)
+    (tmp_path / "log.csv").write_text(text)
+    flight = read_flight(
+        tmp_path / "log.csv",
+        time="t",
+        rate=20.0,
+        inputs={"x_roll": Signal("stick", "m", "m", hold="zero-order")},
+        outputs={"roll": Signal("phi", "rad", "rad")},
+    )
+    # The step at 0.53 s leaves 0.02 s of the step of the grid from 0.5 s.
+    expected = [0.0] * 10 + [0.4] + [1.0] * 9
+    assert flight.inputs["x_roll"] == pytest.approx(expected, abs=1e-9)
+    assert "x_roll is held: each step of the grid has its mean over that step" in notes(flight)

@@ -217,10 +217,12 @@ def _what_follows(problem: Problem, present: Sequence[Feedback]) -> str:
     names = list(dict.fromkeys(one.input for one in present))
     of = " and ".join(names)
     moved = f", taken {sure.earlier:.2g} s earlier as its delay says" if sure.earlier else ""
+    first, last = (f"{lag:.2g}" for lag in sure.lag)
+    lags = first if first == last else f"{first} to {last}"
     follows = (
         f"{of} {'follow' if len(names) > 1 else 'follows'} the response ({sure.flight}: "
         f"correlation {sure.correlation:+.2f} of what is unforeseen of {sure.input}{moved} with "
-        f"what was unforeseen of {sure.output} {sure.lag[0]:.2g} to {sure.lag[1]:.2g} s before)"
+        f"what was unforeseen of {sure.output} {lags} s before)"
     )
     if all(one.delay_known for one in present):
         return f"The loop is closed: {follows}. Estimates are then"

@@ -35,6 +35,9 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
                 f"{flight.n_samples} at {1 / flight.dt:g} Hz, {flight.duration:.6g} s",
             ),
         ]
+        if flight.source:
+            start, end = flight.window
+            rows.append(("window", f"{start:.6g} s to {end:.6g} s from the log's beginning"))
         if flight.known:
             values = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
             rows.append(("differs in", values))
