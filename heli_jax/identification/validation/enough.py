@@ -7,7 +7,13 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes
+from heli_jax.identification.validation.feedback import (
+    LEVEL,
+    STEPS,
+    Feedback,
+    feedback_notes,
+    why_untested,
+)
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
@@ -52,7 +58,11 @@ def is_it_enough(
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:
     if not feedback:
-        return []
+        why = why_untested(problem)
+        # Steps that somebody commanded follow nothing; of the rest nothing is known.
+        severity = "ok" if why == STEPS else "doubt"
+        words = f"whether an input follows the response was not tested: {why}."
+        return [Finding("feedback", severity, words)] if why else []
     least = min(feedback, key=lambda f: f.p_value)
     criterion = f"p value of the surest input, {LEVEL:g}"
     present = feedback_notes(problem, feedback)
