@@ -3,13 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scipy.signal
 
 from heli_jax.identification.validation.enough import _of_feedback
 from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_of
+from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.seen_parts import seen_parts
-from tests.identification.test_enough import DT, flight, problem, response
+from heli_jax.identification.validation.signal_quality import quantisation
+from tests.identification.test_enough import DT, TRUTH, flight, problem, response
 
 
 def swept(n=4000, noise=0.02):
@@ -117,3 +120,40 @@ def test_feedback_that_was_not_tested_is_said():
     [found] = _of_feedback(jumps, feedback_of(jumps))
     assert found.severity == "ok"
     assert "between jumps" in found.sentence
+
+
+def test_modes_that_do_not_swing_ask_for_a_rate_too():
+    # 400 = 10 * 40: two decays, the faster of 40 rad/s = 6.4 Hz.
+    model = problem(flight(0))
+    vehicle = TRUTH._replace(k=400.0, d=50.0, b=220.0)
+    free = {n: f._replace(start=getattr(vehicle, n)) for n, f in model.free.items()}
+    for every, severity in ((1, "ok"), (3, "doubt"), (8, "refuse")):
+        f = flight(0, 3000)
+        slow = replace(
+            f,
+            dt=DT * every,
+            inputs={n: u[::every] for n, u in f.inputs.items()},
+            outputs={"phi": f.outputs["phi"][::every]},
+            sd={"phi": 1e-6},
+        )
+        asked = replace(model, vehicle=vehicle, flights=(slow,), free=free)
+        [found] = logging_rate(asked, [("one", slow)], [{"phi": 1e-6}])
+        assert found.severity == severity
+        assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
+        # Guessed noise as large as the motion hides no mode; a stated one does, and it is said.
+        [guessed] = logging_rate(asked, [("one", replace(slow, sd={}))], [{"phi": 1.0}])
+        assert guessed.severity == severity
+        [hidden] = logging_rate(asked, [("one", slow)], [{"phi": 1.0}])
+        assert hidden.severity == "doubt"
+        assert "was not judged" in hidden.sentence
+
+
+def test_few_samples_are_not_taken_for_coarse_steps():
+    f = swept(100)
+    short = replace(
+        f,
+        inputs={n: u[:10] for n, u in f.inputs.items()},
+        outputs={"phi": f.outputs["phi"][:10]},
+    )
+    [found] = quantisation([("one", short)], [{"phi": 1.0}])
+    assert "the record has only 10 samples of phi" in found.sentence

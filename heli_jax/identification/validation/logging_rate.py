@@ -24,6 +24,9 @@ HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
 _SHOWS = 3.0
 """times the noise by which a mode moves an output, from which on it matters"""
+_PART = 0.1
+"""of an output's own motion, from which on a mode matters whatever the noise is guessed to be: a
+guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
 _LEVELS, _STEPS = 10, 20
@@ -56,7 +59,9 @@ def logging_rate(
     findings: list[Finding] = []
     every: list[Finding] = []
     for (label, flight), noise in zip(flights, sd, strict=True):
-        modes = _modes_that_show(problem, flight, noise)
+        modes, hidden = _modes_that_show(problem, flight, _shown_from(flight, noise))
+        if hidden:
+            findings.append(_not_judged(label, hidden))
         found = [*_of_inputs(label, flight, modes), *_of_outputs(label, flight, modes)]
         findings += [f for f in found if f.severity != "ok"]
         every += found
@@ -68,8 +73,31 @@ def _value(finding: Finding) -> float:
     return finding.value
 
 
-def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any]) -> list[_Mode]:
-    """Those whose part in the answer to a step of an input's size stands out of the noise."""
+def _shown_from(flight: Flight, noise: Mapping[str, Any]) -> dict[str, float]:
+    """By output, by how much a mode has to move it to matter."""
+    sizes = {}
+    for name, y in flight.outputs.items():
+        own = _PART * float(np.nanstd(y))
+        sizes[name] = _SHOWS * float(noise[name])
+        # One that stays where it is shows no mode, however small its noise seems.
+        if name not in flight.sd and own > 0:
+            sizes[name] = min(sizes[name], own)
+    return sizes
+
+
+def _not_judged(label: str, hz: float) -> Finding:
+    words = (
+        f"{label}: whether the rate is enough was not judged: at the start values no mode of the "
+        f"model (the fastest has {hz:.3g} Hz) moves an output by {_SHOWS:g} times its noise."
+    )
+    return Finding("logging rate", "doubt", words)
+
+
+def _modes_that_show(
+    problem: Problem, flight: Flight, sizes: Mapping[str, float]
+) -> tuple[list[_Mode], float]:
+    """Those whose part in the answer to a step of an input's size stands out, and where there are
+    only others the frequency [Hz] of their fastest, else 0."""
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     params = naming.replace(problem.start_params(), **known)
     at = operating_point(
@@ -78,7 +106,8 @@ def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any])
     matrices = linearize(problem.model, params, at.state, at.inputs).matrices
     A, B, C, _ = (np.asarray(M, np.float64) for M in matrices)
     if not all(np.isfinite(M).all() for M in (A, B, C)):
-        return []
+        return [], 0.0
+    fastest = 0.0
     eigenvalues, right = np.linalg.eig(A)
     # A defective matrix has no inverse of its vectors: the least squares one spreads the residues.
     left = np.linalg.pinv(right)
@@ -93,11 +122,12 @@ def _modes_that_show(problem: Problem, flight: Flight, noise: Mapping[str, Any])
             size = float(np.std(flight.inputs[u]))
             for i, y in ((outputs.index(y), y) for y in flight.outputs):
                 residue = abs(C[i] @ right[:, k]) * abs(left[k] @ B[:, j])
-                part = residue / abs(eigenvalue) * size / float(noise[y])
+                part = residue / abs(eigenvalue) * size / sizes[y]
                 best = max(best, (part, u, y))
-        if best[0] >= _SHOWS:
+        fastest = max(fastest, abs(eigenvalue) / (2.0 * np.pi))
+        if best[0] >= 1.0:
             shown.append(_Mode(complex(eigenvalue), *best[1:]))
-    return shown
+    return shown, 0.0 if shown else fastest
 
 
 def _of_inputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
@@ -118,17 +148,18 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
 
 
 def _of_outputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
-    findings = []
-    # A fast decay without oscillation has no alias: outputs are held to what oscillates.
-    for mode in (m for m in modes if m.eigenvalue.imag > 0):
-        hz = mode.eigenvalue.imag / (2.0 * np.pi)
-        rate = max(output_rate(flight, y) for y in flight.outputs)
-        begun = (
-            f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} swings at {hz:.3g} Hz"
-        )
-        findings.append(_judged(begun, rate / hz, hz))
+    if not modes:
+        return []
     # The fastest alone: what is too slow for it is said once.
-    return [min(findings, key=_value)] if findings else []
+    mode = max(modes, key=lambda m: m.hz)
+    rate = max(output_rate(flight, y) for y in flight.outputs)
+    # A decay has no alias, but between two samples all of it may be over.
+    moves = "swings" if abs(mode.eigenvalue.imag) > 0 else "settles"
+    begun = (
+        f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} {moves} at {mode.hz:.3g} "
+        f"Hz (a mode at the start values)"
+    )
+    return [_judged(begun, rate / mode.hz, mode.hz)]
 
 
 def _judged(begun: str, ratio: float, hz: float) -> Finding:
