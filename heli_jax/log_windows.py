@@ -51,7 +51,9 @@ def rank_log(
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
         # Two flights of one log are, without their windows, the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
-    stated = [] if log is not None else [_stated_window(config.flights, f) for f in flights]
+    first = config.flights[0]
+    asked = flights if log is None else [first] if _same_file(path, first, log) else []
+    stated = [_stated_window(config.flights, f) for f in asked]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
     for flight in problem.flights:
@@ -69,6 +71,11 @@ def rank_log(
 
 
 _Window = tuple[float, float] | None
+
+
+def _same_file(path: Path, flight: FlightConfig, log: str) -> bool:
+    """Whether a log is the one that the configuration at `path` names for a flight."""
+    return (path.parent / flight.log).resolve() == Path(log).resolve()
 
 
 def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Window:
