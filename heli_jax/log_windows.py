@@ -86,7 +86,7 @@ def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Win
         for f in flights
         if (f.log, f.flight) == (whole.log, whole.flight) and not f.hold_out
     ]
-    return None if isinstance(windows[0], str) or windows[0] is None else tuple(windows[0])
+    return None if isinstance(windows[0], str) else windows[0]
 
 
 def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -> Ranking:
