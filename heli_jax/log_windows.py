@@ -1,15 +1,23 @@
 """`heli-jax windows`: which parts of a log say most of what a configuration has free."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from heli_jax import config as configuration
 from heli_jax.config import Experiment
+from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
+from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.fit import windows
-from heli_jax.identification.validation.record_windows import ENOUGH, Ranking, Window
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.chosen_windows import DETERMINES, ENOUGH, Window
+from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
+from heli_jax.identification.validation.record_windows import Ranking, window_samples
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""
@@ -43,6 +51,9 @@ def rank_log(
         kept = [f.model_copy(update={"window": None}) for f in config.flights if not f.hold_out]
         # Two flights of one log are, without their windows, the same.
         flights = list({(f.log, f.flight): f for f in reversed(kept)}.values())[::-1]
+    first = config.flights[0]
+    asked = flights if log is None else [first] if _same_file(path, first, log) else []
+    stated = [_stated_window(config.flights, f) for f in asked]
     experiment = experiment._replace(config=config.model_copy(update={"flights": flights}))
     problem = configuration.problem(experiment)
     for flight in problem.flights:
@@ -50,7 +61,11 @@ def rank_log(
             if progress is not None:
                 progress(note)
     try:
-        ranking = windows(problem, length)
+        # Before the work, and not after it: with many windows that takes a while.
+        seconds = window_samples(problem, length) * problem.training[0].dt
+        if progress is not None:
+            progress(f"comparing windows of {seconds:.3g} s, half overlapping")
+        ranking = _ranked(problem, stated, length)
     except ValueError as e:
         raise InputError(f"{path}: {e}") from e
     ranked = {window.flight for window in ranking.windows}
@@ -59,6 +74,50 @@ def rank_log(
             words = f"is shorter than a window of {ranking.length:.3g} s, and left out"
             progress(f"{flight.name}: {flight.duration:.4g} s {words}")
     return ranking
+
+
+_Window = tuple[float, float] | None
+
+
+def _same_file(path: Path, flight: FlightConfig, log: str) -> bool:
+    """Whether a log is the one that the configuration at `path` names for a flight."""
+    return (path.parent / flight.log).resolve() == Path(log).resolve()
+
+
+def _stated_window(flights: Sequence[FlightConfig], whole: FlightConfig) -> _Window:
+    """The window [s] that a configuration states for a log, of several the first; None where it
+    takes all of it."""
+    windows = [
+        f.window
+        for f in flights
+        if (f.log, f.flight) == (whole.log, whole.flight) and not f.hold_out
+    ]
+    return None if isinstance(windows[0], str) else windows[0]
+
+
+def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -> Ranking:
+    """The ranking with the noise that `check` guesses: of the windows that are stated."""
+    flights = list(problem.training)
+    # Filter error estimates the noise itself; parts of a split log are no flights of the file.
+    same = len(stated) == len(flights) and any(stated)
+    if not same or estimator_of(problem.method).process_noise:
+        return windows(problem, length)
+    guessed: list[str] = []
+    every = labels(problem.training)
+    for i, (flight, window) in enumerate(zip(flights, stated, strict=True)):
+        first, last = (0, flight.n_samples)
+        if window is not None:
+            first, last = (round(t / flight.dt) for t in window)
+        sd = {n: noise_guess(y[first : last + 1]) for n, y in flight.outputs.items()}
+        guessed += [f"{every[i]}/{n}" for n in sd if n not in flight.sd]
+        flights[i] = dataclasses.replace(flight, sd={**sd, **flight.sd})
+    held = tuple(f for f in problem.flights if f.hold_out)
+    ranking = windows(dataclasses.replace(problem, flights=(*flights, *held)), length)
+    begun = (
+        "The noise is that of the windows which the configuration states, as check guesses it; "
+        "check begins each at rest, and these windows begin where the whole log has come to."
+    )
+    return dataclasses.replace(ranking, guessed=tuple(guessed), notes=(*ranking.notes, begun))
 
 
 def print_ranking(ranking: Ranking) -> None:
@@ -95,6 +154,27 @@ def print_ranking(ranking: Ranking) -> None:
         f"{100 * last.efficiency:.0f} % of what all say together (at least {100 * ENOUGH:.0f} % "
         f"asked); expected sd of these (of all): {together}. At the start values, from white noise."
     )
+    _print_doubts(ranking)
+
+
+def not_determined(ranking: Ranking) -> tuple[str, ...]:
+    """The parameters that all windows together do not determine."""
+    pairs = zip(ranking.parameters, ranking.all_sd, strict=True)
+    return tuple(n for n, sd in pairs if not sd < DETERMINES)
+
+
+def _print_doubts(ranking: Ranking) -> None:
+    """What the numbers of a ranking rest on."""
+    for name in ranking.guessed:
+        print(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
+    finite = ranking.all_sd[np.isfinite(ranking.all_sd)]
+    if sentence := too_good(finite, bool(ranking.guessed)):
+        print(f"! {sentence}")
+    for note in ranking.notes:
+        print(f"! {note}")
+    if names := not_determined(ranking):
+        whole = "The whole record does" if set(names) <= set(ranking.undetermined) else "All do"
+        print(f"! {whole} not determine {', '.join(names)}; heli-jax check says why.")
 
 
 def _of(w: Window) -> tuple[str, ...]:
@@ -102,4 +182,4 @@ def _of(w: Window) -> tuple[str, ...]:
 
 
 def _percent(sd: float) -> str:
-    return f"{100 * sd:.2g} %" if np.isfinite(sd) and sd < 100 else "-"
+    return f"{100 * sd:.2g} %" if np.isfinite(sd) and sd < DETERMINES else "-"

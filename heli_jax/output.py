@@ -18,6 +18,7 @@ from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
+from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.numbers import rounded
@@ -210,8 +211,10 @@ def print_check(check: Check) -> None:
         rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
-        guess = " (guessed: too small where the log was smoothed; state the output's sd)"
-        print(f"noise of {name}: {sd:.3g}{guess if name in check.guessed else ''}")
+        guess = f" ({GUESSED})" if name in check.guessed else ""
+        print(f"noise of {name}: {sd:.3g}{guess}")
+    if sentence := too_good(np.sqrt(np.diag(verdict.covariance)), bool(check.guessed)):
+        print(f"! {sentence}")
     for note in check.further_notes:
         print(f"! {note}")
     _print_findings(check.findings)

@@ -69,6 +69,22 @@ def test_windows_of_a_part_count_from_the_beginning_of_its_log():
     assert (window.start, window.end) == pytest.approx((14.0, 15.98))
 
 
+def test_no_part_says_more_than_the_whole(ranked):
+    whole = problem(excited(800, 1200))
+    sd = np.sqrt(np.diag(check(whole).verdict.covariance))
+    assert np.all(ranked.all_sd >= 0.999 * sd)
+    assert all(np.all(w.sd >= 0.999 * sd) for w in ranked.windows)
+    # One window that is all of the record says what `check` says of it.
+    [window] = windows(whole, 40.0).windows
+    np.testing.assert_allclose(window.sd, sd, rtol=1e-3)
+    assert ranked.guessed == ()
+
+
+def test_more_windows_than_can_be_compared_are_refused():
+    with pytest.raises(ValueError, match="expected at most 200 windows, got 400, half overlapping"):
+        windows(problem(excited(800, 1200)), 0.2)
+
+
 def test_damaged_windows_are_left_out_with_the_reason(ranked):
     f = excited(800, 1200)
     y = f.outputs["phi"].copy()

@@ -9,7 +9,14 @@ from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.aliases import measurement_noise
 from heli_jax.identification.validation.excited_band import bands
-from heli_jax.identification.validation.feedback import LEVEL, Feedback, feedback_notes, untested
+from heli_jax.identification.validation.feedback import (
+    LEVEL,
+    STEPS,
+    Feedback,
+    feedback_notes,
+    untested,
+    why_untested,
+)
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -80,7 +87,11 @@ def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding
     # What is not tested is said: "no input follows" would be taken for all outputs.
     aside = [Finding("feedback", "ok", words) for words in untested(problem)]
     if not feedback:
-        return aside
+        why = why_untested(problem)
+        # Steps that somebody commanded follow nothing; of the rest nothing is known.
+        severity = "ok" if why == STEPS else "doubt"
+        words = f"whether an input follows the response was not tested: {why}."
+        return [Finding("feedback", severity, words)] if why else aside
     least = min(feedback, key=lambda f: f.p_value)
     criterion = f"p value of the surest input, {LEVEL:g}"
     present = feedback_notes(problem, feedback)

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Complex, Float
 from heli_jax.analysis.spectra import partial_coherence, segment_transforms
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.hardly_moving import hardly_moving
+from heli_jax.identification.validation.seen_parts import Part, SeenParts, seen_parts
 
 COHERENT = 0.6
 """coherence from which on a response is taken for the input's: Tischler and Remple, Aircraft and
@@ -24,7 +26,10 @@ _SHORTEST, _LONGEST = 64, 4096
 _MANY, _LONG = 24, 400
 """segments that are better, where each still has so many samples"""
 _CHANCE = 0.01
-"""probability that any frequency of signals without coherence shows more"""
+"""probability that any frequency of any input and output without coherence shows more"""
+_WIDTH, _BINS = 0.25, 3
+"""octaves and frequencies of the spectrum of a band, at least: a single frequency is a line of
+vibration, or chance"""
 _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
 _LEAST_POWER = 1e-3
@@ -53,35 +58,48 @@ def bands(flights: Sequence[Flight]) -> list[Finding]:
     if not moving:
         words = "no input moves: nothing is excited."
         return [Finding("excited band", "refuse", words, 0.0, "inputs that move, 1")]
-    outputs = [
-        n
-        for n in alike[0].outputs
-        if all(n in f.outputs and np.isfinite(f.outputs[n]).all() for f in alike)
-    ]
-    pooled = _pooled(alike, moving, outputs)
-    if pooled is None:
-        return [*_short_bands(alike, moving), *_short_together(alike, moving)]
-    return [*_coherent_bands(pooled, moving, outputs), *_moving_together(pooled, moving)]
+    seen = seen_parts(alike)
+    barely = hardly_moving(alike, moving)
+    pooled = _pooled(seen, moving, alike[0].dt)
+    if pooled is not None:
+        together, found = _moving_together(pooled, moving), _coherent_bands(pooled, moving, seen)
+        return [*barely, *found, *together]
+    together = _short_together(alike, moving)
+    return [*barely, *_short_bands(alike, moving, _why_not(seen)), *together]
 
 
-def _pooled(flights: list[Flight], moving: list[str], outputs: list[str]) -> _Pooled | None:
-    """None where the records are too short for an average."""
-    more, sizes = 2 * (len(moving) - 1), [f.n_samples for f in flights]
+def _why_not(seen: SeenParts) -> str:
+    """Why there is no coherence, in words."""
+    if seen.left_out and not seen.outputs:
+        return "; ".join(f"{n} {why}" for n, why in seen.left_out.items())
+    if len(seen.parts) > 1:
+        return "the parts without missing samples are too short"
+    return "the record is too short"
+
+
+def _pooled(seen: SeenParts, moving: list[str], dt: float) -> _Pooled | None:
+    """None where no output is seen, or the parts are too short for an average."""
+    more, sizes = 2 * (len(moving) - 1), [p.n_samples for p in seen.parts]
+    if not seen.outputs or not sizes:
+        return None
     # Many segments where they can be long still, since few show little of a disturbed machine; else
     # as few as make an average.
     length = _length(sizes, _MANY + more, _LONG) or _length(sizes, _SEGMENTS + more, _SHORTEST)
     if length == 0:
         return None
-    parts = []
-    for f in (f for f in flights if f.n_samples >= length):
-        channels = [f.inputs[n] for n in moving] + [f.outputs[n] for n in outputs]
-        omega, transforms = segment_transforms(np.stack(channels), f.dt, length)
-        parts.append(transforms)
-    both = np.concatenate(parts, axis=1)
+    long = [p for p in seen.parts if p.n_samples >= length]
+    transforms = [segment_transforms(_channels(p, moving, seen.outputs), dt, length) for p in long]
+    omega, both = transforms[0][0], np.concatenate([t for _, t in transforms], axis=1)
     # Without zero frequency, which the straight lines took, and Nyquist's.
     inner = slice(1, -1)
     hz, m = omega[inner] / (2.0 * np.pi), len(moving)
     return _Pooled(hz, both[inner, :, :m], both[inner, :, m:])
+
+
+def _channels(
+    part: Part, inputs: Sequence[str], outputs: Sequence[str]
+) -> Float[np.ndarray, "channels n"]:
+    return np.stack([part.inputs[n] for n in inputs] + [part.outputs[n] for n in outputs])
 
 
 def _length(sizes: list[int], segments: int, least: int) -> int:
@@ -96,46 +114,72 @@ def _count(samples: int, length: int) -> int:
     return 0 if samples < length else 1 + (samples - length) // (length - length // 2)
 
 
-def _chance(pooled: _Pooled, level: float) -> float:
-    """The coherence that counts: `level`, or more where few segments show that much by chance."""
+def _chance(pooled: _Pooled, level: float, pairs: int) -> float:
+    """The coherence that counts: `level`, or more where few segments show that much by chance in
+    any of so many pairs of signals."""
     k, segments, m = pooled.inputs.shape
     # Of n independent segments a coherence of nothing exceeds c with probability (1 - c)^(n - 1);
     # half-overlapping Hann windows are worth about 0.9 n, and each other input takes one.
     free = max(0.9 * segments - m, 1.0)
-    return max(level, 1.0 - (_CHANCE / k) ** (1.0 / free))
+    return max(level, 1.0 - (_CHANCE / (k * max(pairs, 1))) ** (1.0 / free))
 
 
-def _coherent_bands(pooled: _Pooled, moving: list[str], outputs: list[str]) -> list[Finding]:
-    limit, findings, seen = _chance(pooled, COHERENT), [], False
+def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list[Finding]:
+    limit = _chance(pooled, COHERENT, len(moving) * len(seen.outputs))
+    findings, followed = [], False
     criterion = f"partial coherence with an output, {limit:.2f}"
+    left = "".join(f" {n} was not looked at: it {why}." for n, why in seen.left_out.items())
     for j, name in enumerate(moving):
-        others = np.delete(pooled.inputs, j, axis=2)
-        u = pooled.inputs[:, :, j]
-        power = np.sum(np.abs(u) ** 2, axis=1)
+        power = np.sum(np.abs(pooled.inputs[:, :, j]) ** 2, axis=1)
         low, high = _power_band(pooled.hz, power)
-        begun = f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; "
-        best: tuple[float, str, float, float] | None = None
-        for i, output in enumerate(outputs):
-            c = np.nan_to_num(partial_coherence(others, u, pooled.outputs[:, :, i]))
-            good = (c >= limit) & (power >= _LEAST_POWER * power.max())
-            run = _longest(pooled.hz, good)
-            if run is not None and (best is None or run[1] / run[0] > best[3] / best[2]):
-                best = (float(np.max(c[good])), output, *run)
+        words = f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; "
+        best = _best_band(pooled, j, seen.outputs, limit)
         if best is None:
-            words = f"{begun}no output follows it alone with a coherence of {limit:.2f}."
+            words += (
+                f"no output follows it alone over a quarter of an octave with a coherence of "
+                f"{limit:.2f}.{left}"
+            )
             findings.append(Finding("excited band", "ok", words, None, criterion))
             continue
-        seen = True
-        peak, output, first, last = best
-        words = f"{begun}{output} follows it from {first:.2g} to {last:.2g} Hz."
-        findings.append(Finding("excited band", "ok", words, peak, criterion))
-    if not seen and outputs:
+        followed = True
+        words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
+        findings.append(Finding("excited band", "ok", words, best.peak, criterion))
+    if not followed:
         words = (
-            "no output follows any input coherently at any frequency: noise, disturbances or "
-            "something else moves the machine more than the sticks do."
+            "no output follows any input coherently over a band of frequencies: noise, "
+            "disturbances or something else moves the machine more than the sticks do."
         )
         findings.append(Finding("excited band", "doubt", words, None, criterion))
     return findings
+
+
+class _Band(NamedTuple):
+    """Where an output follows an input."""
+
+    output: str
+    low: float
+    high: float
+    """[Hz]"""
+    peak: float
+    """coherence"""
+
+
+def _best_band(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) -> _Band | None:
+    """The widest band in which an output follows the j-th input; None where it is too narrow."""
+    others, u = np.delete(pooled.inputs, j, axis=2), pooled.inputs[:, :, j]
+    power = np.sum(np.abs(u) ** 2, axis=1)
+    step, best = pooled.hz[1] - pooled.hz[0], None
+    for i, output in enumerate(outputs):
+        c = np.nan_to_num(partial_coherence(others, u, pooled.outputs[:, :, i]))
+        good = (c >= limit) & (power >= _LEAST_POWER * power.max())
+        run = _longest(pooled.hz, good)
+        # Each frequency stands for the step about it.
+        wide = run is not None and np.log2((run[1] + step / 2) / (run[0] - step / 2)) >= _WIDTH
+        if run is None or not wide or run[1] - run[0] < (_BINS - 1.5) * step:
+            continue
+        if best is None or run[1] / run[0] > best.high / best.low:
+            best = _Band(output, *run, float(np.max(c[good])))
+    return best
 
 
 def _power_band(hz: np.ndarray, power: np.ndarray) -> tuple[float, float]:
@@ -155,7 +199,7 @@ def _longest(hz: np.ndarray, good: Bool[np.ndarray, " k"]) -> tuple[float, float
 
 
 def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
-    limit, pairs = _chance(pooled, TOGETHER), []
+    limit, pairs = _chance(pooled, TOGETHER, len(moving) * (len(moving) - 1) // 2), []
     for a, b in itertools.combinations(range(len(moving)), 2):
         others = np.delete(pooled.inputs, [a, b], axis=2)
         u, v = pooled.inputs[:, :, a], pooled.inputs[:, :, b]
@@ -202,8 +246,8 @@ def _pair_findings(
     return [Finding("inputs together", "ok", words, mean, criterion)]
 
 
-def _short_bands(flights: list[Flight], moving: list[str]) -> list[Finding]:
-    """From the power of the inputs alone, of records too short for an average."""
+def _short_bands(flights: list[Flight], moving: list[str], why: str) -> list[Finding]:
+    """From the power of the inputs alone, where there is no coherence, and why that is."""
     longest = max(flights, key=lambda f: f.n_samples)
     length = min(longest.n_samples, _LONGEST) // 2 * 2
     findings = []
@@ -212,10 +256,10 @@ def _short_bands(flights: list[Flight], moving: list[str]) -> list[Finding]:
         power = np.sum(np.abs(U[1:-1, :, 0]) ** 2, axis=1)
         low, high = _power_band(omega[1:-1] / (2.0 * np.pi), power)
         words = (
-            f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; the record is too "
-            "short to say where the response follows it."
+            f"{name} has 90 % of its power from {low:.2g} to {high:.2g} Hz; whether an output "
+            f"follows it was not computed: {why}."
         )
-        findings.append(Finding("excited band", "ok", words))
+        findings.append(Finding("excited band", "doubt", words))
     return findings
 
 

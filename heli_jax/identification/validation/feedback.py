@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.special
 from jaxtyping import Float
 
 from heli_jax.dynamics.disturbance import disturbable
@@ -28,7 +27,10 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.lag_blocks import correlation_with_sums, lag_blocks
 
+STEPS = "inputs stay where they are between jumps"
+"""the reason why nothing is tested where no input moves freely"""
 LEVEL = 0.01
 """of the test of a whole record: all inputs, outputs and lags together"""
 _RATE = 50.0
@@ -89,31 +91,17 @@ def feedback(
         together: how many flights are tested side by side, for the p values.
         earlier: by input, how much earlier than logged it is to be taken [s]; none unless given.
     """
-    # Half of a record at most: a delay beyond is none that it could show.
-    most = flight.n_samples // 2
-    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in (earlier or {}).items()}
-    inputs, outputs, dt = _decimated(flight, steps)
-    n = next(iter(outputs.values())).size if outputs else 0
-    if not inputs or n < _LEAST:
+    tested = _tested(flight, earlier or {})
+    if isinstance(tested, str):
         return ()
-    unforeseen = {name: _unforeseen(values) for name, values in inputs.items()}
-    free = {name: values for name, values in unforeseen.items() if values is not None}
-    if not free:
-        return ()
-    y = np.stack(list(outputs.values()), axis=1)
-    u = np.stack(list(inputs.values()), axis=1)
-    # From the past of all signals together. What one output alone cannot foretell may well be the
-    # answer to an input, and would pass for feedback.
-    innovations = _innovations(y, np.concatenate([y, u], axis=1))
-    if innovations is None:
-        return ()
-    blocks = _blocks(max(1, min(round(_LONGEST / dt), n // 10)))
+    free, innovations, inputs, outputs, steps, dt = tested
+    blocks = lag_blocks(max(1, min(round(_LONGEST / dt), len(innovations) // 10)))
     # Bonferroni: one test in a hundred records fails by chance, not one in a hundred lags.
     tests = together * len(inputs) * len(outputs) * len(blocks)
     found = []
     for name, values in free.items():
         p, correlation, output, (first, last) = min(
-            (*_correlation(values, innovations[:, k], block), output, block)
+            (*correlation_with_sums(values, innovations[:, k], block), output, block)
             for k, output in enumerate(outputs)
             for block in blocks
         )
@@ -121,6 +109,57 @@ def feedback(
         late = steps.get(name, 0) * flight.dt
         found.append(Feedback(label, name, output, correlation, lag, min(1.0, tests * p), late))
     return tuple(found)
+
+
+class _Tested(NamedTuple):
+    """What is correlated."""
+
+    free: dict[str, np.ndarray]
+    """by input what its own past does not foretell"""
+    innovations: Float[np.ndarray, "N p"]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    steps: dict[str, int]
+    """by input by how many samples of the flight it was taken earlier"""
+    dt: float
+
+
+def _tested(flight: Flight, earlier: Mapping[str, float]) -> _Tested | str:
+    """What of a flight is correlated, or in words why nothing is."""
+    # Half of a record at most: a delay beyond is none that it could show.
+    most = flight.n_samples // 2
+    steps = {n: min(math.ceil(s / flight.dt - 1e-9), most) for n, s in earlier.items()}
+    inputs, outputs, dt = _decimated(flight, steps)
+    if not outputs:
+        return f"every output stays where it is or lacks more than {1 - _SEEN:.0%} of its samples"
+    n = next(iter(outputs.values())).size
+    if n < _LEAST:
+        return f"the record is too short ({n * dt:.3g} s, expected {_LEAST * dt:.3g} s at least)"
+    unforeseen = {name: _unforeseen(values) for name, values in inputs.items()}
+    free = {name: values for name, values in unforeseen.items() if values is not None}
+    if not free:
+        return STEPS
+    y = np.stack(list(outputs.values()), axis=1)
+    u = np.stack(list(inputs.values()), axis=1)
+    # From the past of all signals together. What one output alone cannot foretell may well be the
+    # answer to an input, and would pass for feedback.
+    innovations = _innovations(y, np.concatenate([y, u], axis=1))
+    if innovations is None:
+        return "too few samples stand in a row without a missing one"
+    return _Tested(free, innovations, tuple(inputs), tuple(outputs), steps, dt)
+
+
+def why_untested(problem: Problem) -> str:
+    """Why nothing was tested of any flight, in words; `STEPS` where inputs move in no other way."""
+    reasons = {
+        label: tested
+        for label, f in zip(labels(problem.training), problem.training, strict=True)
+        if isinstance(tested := _tested(f, {}), str)
+    }
+    kinds = list(dict.fromkeys(reasons.values()))
+    if len(kinds) < 2:
+        return "".join(kinds)
+    return "; ".join(f"{label}: {reason}" for label, reason in reasons.items())
 
 
 def feedback_of(
@@ -346,42 +385,3 @@ def _regressors(
         if rows.sum() >= _PER_UNKNOWN * x.shape[1]:
             return x[rows], rows
     return None, np.zeros(0, bool)
-
-
-def _blocks(longest: int) -> list[tuple[int, int]]:
-    """Lags in samples, in groups that grow with the lag: what follows the response does so over a
-    while, and few sums over many lags see it where each lag by itself would not."""
-    blocks, first = [], 1
-    while first <= longest:
-        last = max(first, int(first * 1.5))
-        blocks.append((first, min(last, longest)))
-        first = last + 1
-    return blocks
-
-
-def _correlation(
-    u: Float[np.ndarray, " N"], e: Float[np.ndarray, " N"], block: tuple[int, int]
-) -> tuple[float, float]:
-    """p value and correlation of u with the sum of e over the lags of a block."""
-    first, last = block
-    seen = np.isfinite(u) & np.isfinite(e)
-    u, e = np.where(seen, u, 0.0), np.where(seen, e, 0.0)
-    sums = np.concatenate([np.zeros(last), np.convolve(e, np.ones(last - first + 1), "valid")])
-    past = sums[: u.size]  # at t the sum over t - last ... t - first
-    n = int(seen.sum())
-    size = float(np.sqrt(np.sum(u**2) * np.sum(past**2)))
-    if size == 0:
-        return 1.0, 0.0
-    correlation = float(u @ past) / size
-    # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's own.
-    lags = min(4 * (last - first + 1) + 20, u.size - 1)
-    a, b = _autocorrelation(u, lags), _autocorrelation(past, lags)
-    variance = max(float(1.0 + 2.0 * (a[1:] @ b[1:])), 0.1) / n
-    p = 2.0 * scipy.special.ndtr(-abs(correlation) / np.sqrt(variance))
-    return float(p), correlation
-
-
-def _autocorrelation(x: np.ndarray, lags: int) -> np.ndarray:
-    size = 1 << (2 * x.size - 1).bit_length()
-    c = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: lags + 1]
-    return c / c[0]

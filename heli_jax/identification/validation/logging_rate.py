@@ -23,6 +23,9 @@ from heli_jax.identification.validation.operating_point import operating_point
 
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
+_PART = 0.1
+"""of an output's own motion, from which on a mode matters whatever the noise is guessed to be: a
+guess from slow samples takes the motion between them for noise"""
 _REGULAR = 0.8
 """part of the steps of a staircase that have the usual length, from which on it is a slow clock"""
 _LEVELS, _STEPS = 10, 20
@@ -61,7 +64,9 @@ def logging_rate(
     findings: list[Finding] = []
     every: list[Finding] = []
     for (label, flight), noise in zip(flights, sd, strict=True):
-        modes = _modes_that_show(problem, params, flight, noise)
+        modes, hidden = _modes_that_show(problem, params, flight, _shown_from(flight, noise))
+        if hidden:
+            findings.append(_not_judged(label, hidden))
         found = [*_of_inputs(label, flight, modes, where), *_of_outputs(label, flight, modes)]
         findings += [f for f in found if f.severity != "ok"]
         every += found
@@ -73,10 +78,31 @@ def _value(finding: Finding) -> float:
     return finding.value
 
 
+def _shown_from(flight: Flight, noise: Mapping[str, Any]) -> dict[str, float]:
+    """By output, by how much a mode has to move it to matter."""
+    sizes = {}
+    for name, y in flight.outputs.items():
+        own = _PART * float(np.nanstd(y))
+        sizes[name] = SHOWS * float(noise[name])
+        # One that stays where it is shows no mode, however small its noise seems.
+        if name not in flight.sd and own > 0:
+            sizes[name] = min(sizes[name], own)
+    return sizes
+
+
+def _not_judged(label: str, hz: float) -> Finding:
+    words = (
+        f"{label}: whether the rate is enough was not judged: at the start values no mode of the "
+        f"model (the fastest has {hz:.3g} Hz) moves an output by {SHOWS:g} times its noise."
+    )
+    return Finding("logging rate", "doubt", words)
+
+
 def _modes_that_show(
-    problem: Problem, params: Any, flight: Flight, noise: Mapping[str, Any]
-) -> list[_Mode]:
-    """Those whose part in the answer to a step of an input's size stands out of the noise."""
+    problem: Problem, params: Any, flight: Flight, sizes: Mapping[str, float]
+) -> tuple[list[_Mode], float]:
+    """Those whose part in the answer to a step of an input's size stands out, and where there are
+    only others the frequency [Hz] of their fastest, else 0."""
     known = {n: jnp.asarray(v) for n, v in flight.known.items()}
     params = naming.replace(params, **known)
     at = operating_point(
@@ -85,6 +111,7 @@ def _modes_that_show(
     modes = modes_about(problem, params, at)
     behind = states_behind(problem.model)
     machine = [n not in behind for n in naming.names(problem.model.State)]
+    fastest = 0.0
     shown = []
     for k, eigenvalue in enumerate(modes.eigenvalues if modes is not None else ()):
         # Slower than the record is a drift, and a pair of integrators is no oscillation.
@@ -95,10 +122,11 @@ def _modes_that_show(
         right = modes.right[:, k]
         if np.linalg.norm(right[machine]) < 1e-6 * np.linalg.norm(right):
             continue
-        part, u, y = modes.strongest(k, problem, flight, noise)
-        if part >= SHOWS:
+        part, u, y = modes.strongest(k, problem, flight, sizes)
+        fastest = max(fastest, abs(eigenvalue) / (2.0 * np.pi))
+        if part >= 1.0:
             shown.append(_Mode(complex(eigenvalue), u, y))
-    return shown
+    return shown, 0.0 if shown else fastest
 
 
 def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> list[Finding]:
@@ -119,17 +147,18 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
 
 
 def _of_outputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
-    findings = []
-    # A fast decay without oscillation has no alias: outputs are held to what oscillates.
-    for mode in (m for m in modes if m.eigenvalue.imag > 0):
-        hz = mode.eigenvalue.imag / (2.0 * np.pi)
-        rate = max(output_rate(flight, y) for y in flight.outputs)
-        begun = (
-            f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} swings at {hz:.3g} Hz"
-        )
-        findings.append(_judged(begun, rate / hz, hz))
+    if not modes:
+        return []
     # The fastest alone: what is too slow for it is said once.
-    return [min(findings, key=_value)] if findings else []
+    mode = max(modes, key=lambda m: m.hz)
+    rate = max(output_rate(flight, y) for y in flight.outputs)
+    # A decay has no alias, but between two samples all of it may be over.
+    moves = "swings" if abs(mode.eigenvalue.imag) > 0 else "settles"
+    begun = (
+        f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} {moves} at {mode.hz:.3g} "
+        f"Hz (a mode at the start values)"
+    )
+    return [_judged(begun, rate / mode.hz, mode.hz)]
 
 
 def _judged(begun: str, ratio: float, hz: float) -> Finding:

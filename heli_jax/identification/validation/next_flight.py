@@ -26,6 +26,7 @@ from heli_jax.identification.identifiability.expected import (
     together,
     triangle,
 )
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -34,6 +35,7 @@ from heli_jax.identification.unknowns.layout import (
     Solution,
     layout_of,
 )
+from heli_jax.identification.validation.chosen_windows import DETERMINES
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.simulation.inputs import chirp, multistep_3211
 
@@ -43,6 +45,8 @@ _LONGEST = 20.0
 """duration of a candidate at most [s]: of a longer record several in a row"""
 _BAND = (0.1, 5.0)
 """of the chirp [Hz]"""
+_FREE = 1e-3
+"""weight of weak priors where they are all that holds a parameter up"""
 _WORTH = 0.98
 """of the sd that the same record again would leave: less is no reason to fly something else"""
 
@@ -64,7 +68,7 @@ class Plan(NamedTuple):
     before: float
     """its expected sd relative to its value (of its logarithm); inf where it is not determined"""
     again: float
-    """with the same record once more"""
+    """with the same record once more; inf where it does not determine the parameter"""
     best: Candidate
     after: float
     """with the best candidate, flown for as long as the record"""
@@ -94,7 +98,7 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
         + f", for {plan.duration:.3g} s"
     )
     criterion = f"sd with it over that with the same record again; {_WORTH:g}"
-    ratio = plan.after / plan.again if np.isfinite(plan.again) else 0.0
+    ratio = plan.after / plan.again if np.isfinite(plan.after) and plan.again > 0 else 1.0
     begun = f"what to fly next for {plan.parameter} ({_sd(plan.before)}, the widest): "
     if not np.isfinite(plan.after):
         words = f"{begun}none of the manoeuvres that were compared determines it."
@@ -128,6 +132,9 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     # A filter of a nonlinear model would be compiled for every candidate by itself.
     if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
         return None
+    # Of a simulation that diverges there is nothing to compare with.
+    if not np.isfinite(e.J).all():
+        return None
     flight = max(problem.training, key=lambda f: f.n_samples)
     i = problem.training.index(flight)
     # With windows one of them is simulated: no model that needs windows can be longer.
@@ -137,20 +144,24 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     if not candidates:
         return None
     s, layout, data = _sensitivity(problem, at, i, candidates, m)
-    triangles = _by_flight(s, layout, data)
     now = sensitivity_at(problem, at.layout, e)
+    verdict = verdict_of(problem, at.layout, e)
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    if lacking:
+        # What only weak priors of biases and offsets hold up is not known: neither now nor then.
+        s, now = (v._replace(own=v.own / _FREE) for v in (s, now))
+    triangles = _by_flight(s, layout, data)
     R = triangle(now)
     before = expected_sd(now.unknowns, R)
-    widest = int(np.argmax(before))
+    absent = np.array([u.name in lacking for u in now.unknowns])
+    widest = int(np.argmax(np.where(absent, before, 0.0) if lacking else before))
     times = flight.n_samples / m
-    sds = [
-        float(expected_sd(now.unknowns, together(R, repeated(T, times)))[widest]) for T in triangles
-    ]
+    sds = [_widest_sd(now, widest, together(R, repeated(T, times)), absent) for T in triangles]
     best = int(np.argmin(sds))
     return Plan(
         now.unknowns[widest].name,
-        float(before[widest]),
-        _again(now, at.layout, at.data, i, R, widest),
+        np.inf if lacking else float(before[widest]),
+        np.inf if lacking else _again(now, at, i, widest),
         candidates[best],
         sds[best],
         flight.n_samples * flight.dt,
@@ -159,12 +170,17 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     )
 
 
-def _again(
-    now: Sensitivity, layout: Layout, data: Data, i: int, R: np.ndarray, widest: int
-) -> float:
+def _again(now: Sensitivity, at: Solution, i: int, widest: int) -> float:
     """The widest sd with the i-th flight flown once more."""
-    T = _by_flight(now, layout, data)[i]
-    return float(expected_sd(now.unknowns, together(R, T))[widest])
+    T = _by_flight(now, at.layout, at.data)[i]
+    return float(expected_sd(now.unknowns, together(triangle(now), T))[widest])
+
+
+def _widest_sd(now: Sensitivity, widest: int, R: np.ndarray, absent: np.ndarray) -> float:
+    """Of the parameter with the widest interval; inf while any of those that are not determined now
+    (q,) is not: they take part in one another."""
+    sds = expected_sd(now.unknowns, R)
+    return np.inf if np.any(sds[absent] >= DETERMINES) else float(sds[widest])
 
 
 def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[np.ndarray]:

@@ -2,12 +2,12 @@
 
 The record is cut into windows with initial states of their own, twice, the second time half a
 window later; the model at the start values is driven through all of them side by side by the logged
-inputs, and one Jacobian tells what each says. From these a set without overlap is taken, each time
-the window that gains most (greedy choice; the D-criterion: Mehra, 1974).
+inputs, each from where the whole record's simulation is, and one Jacobian tells what each says.
+From these a set without overlap is taken.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,19 +23,21 @@ from heli_jax.identification.identifiability.expected import (
     Sensitivity,
     expected_sd,
     sensitivity_at,
-    together,
     triangle,
 )
-from heli_jax.identification.identifiability.verdict import Unknown
+from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.chosen_windows import Choice, Window, chosen
 from heli_jax.identification.validation.usable_windows import Exclusions
+from heli_jax.identification.validation.window_states import (
+    begins_on_record,
+    prior_weights,
+    states_of_record,
+)
 
-ENOUGH = 0.9
-"""D-efficiency of the windows that are taken: the q-th root of the determinant of their information
-over that of all windows, about the part of all that is known of a parameter"""
 _PARTS = 12
 """windows in a record, unless their length is stated"""
 _SHORTEST, _LONGEST = 2.0, 20.0
@@ -44,42 +46,9 @@ _PER_PARAMETER = 3
 """samples of a window for each free parameter, at least (`Problem` asks that of a flight)"""
 _FEWEST = 8
 """samples of a window, at least"""
+_MOST = 200
+"""windows: each has unknowns of its own, so that time and memory grow with their square"""
 _ROUNDING = 1e-12
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Window:
-    """One window of a flight."""
-
-    flight: int
-    """its number among the flights that are fitted"""
-    label: str
-    first: int
-    last: int
-    """samples from `first` up to but not including `last`"""
-    start: float
-    end: float
-    """[s] from the beginning of the log, as `window` of a configuration counts; of a flight that is
-    from no log from its own"""
-    sd: Float[np.ndarray, " q"]
-    """expected by this window alone, relative; inf where it does not determine a parameter"""
-    excluded: str = ""
-    """why it is not to be used"""
-
-    def overlaps(self, other: "Window") -> bool:
-        """Whether both have samples in common."""
-        return self.flight == other.flight and self.first < other.last and other.first < self.last
-
-
-class Choice(NamedTuple):
-    """A window that was taken."""
-
-    window: Window
-    efficiency: float
-    """D-efficiency of all that are taken up to it"""
-    sd: Float[np.ndarray, " q"]
-    """expected by all that are taken up to it"""
-    reason: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,6 +64,14 @@ class Ranking:
     """the most telling first"""
     all_sd: Float[np.ndarray, " q"]
     """expected by all windows that may be used, without overlap"""
+    undetermined: tuple[str, ...] = ()
+    """parameters that the whole record does not determine, as `check` says; their sd is inf"""
+    guessed: tuple[str, ...] = ()
+    """flights and outputs whose noise was guessed, and is that of `noise`"""
+    noise: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """sd by `flight/output`, SI"""
+    notes: tuple[str, ...] = ()
+    """on how the windows were compared"""
 
 
 def window_samples(problem: Problem, length: float | None = None) -> int:
@@ -106,13 +83,13 @@ def window_samples(problem: Problem, length: float | None = None) -> int:
         length: [s]; a twelfth of the longest flight unless given, between 2 s and 20 s.
 
     Raises:
-        ValueError: no flight is as long, or the window holds too few samples.
+        ValueError: no flight is as long, the window holds too few samples, or there are too many.
     """
     flight = max(problem.training, key=lambda f: f.duration)
     least = max(_FEWEST, _PER_PARAMETER * len(problem.free))
     if length is None:
         samples = round(np.clip(flight.duration / _PARTS, _SHORTEST, _LONGEST) / flight.dt)
-        samples = min(max(samples, least), flight.n_samples)
+        samples = min(max(samples, least, _fewest(problem)), flight.n_samples)
     else:
         samples = round(length / flight.dt)
         if samples > flight.n_samples:
@@ -125,10 +102,21 @@ def window_samples(problem: Problem, length: float | None = None) -> int:
             f"windows of {samples * flight.dt:.3g} s hold {samples} samples, expected {least} at "
             f"least for {len(problem.free)} free parameters"
         )
+    if length is not None and samples < _fewest(problem):
+        count = sum(2 * f.n_samples // samples for f in problem.training)
+        raise ValueError(
+            f"windows of {length:g} s: expected at most {_MOST} windows, got {count}, half "
+            f"overlapping; {_fewest(problem) * flight.dt:.3g} s is the shortest length for this log"
+        )
     if problem.window is not None:
         cell = round(problem.window / flight.dt)
         samples = max(1, round(samples / cell)) * cell
     return min(samples, flight.n_samples)
+
+
+def _fewest(problem: Problem) -> int:
+    """Samples of a window of which there are not too many."""
+    return -(-2 * sum(f.n_samples for f in problem.training) // _MOST)
 
 
 def rank_windows(
@@ -147,9 +135,11 @@ def rank_windows(
     """
     samples = window_samples(problem, length)
     if at.layout.estimator.rows_are_samples:
-        s, spans = _simulated(problem, at, samples)
+        s, spans, notes = _simulated(problem, at, e, samples)
     else:
-        s, spans = _filtered(problem, at, e, samples)
+        s, spans, notes = *_filtered(problem, at, e, samples), ()
+    undetermined = _undetermined(problem, at.layout, e)
+    unknown = np.array([u.name in undetermined for u in s.unknowns])
     windows, triangles = [], []
     reasons = Exclusions(problem.training)
     for span, rows in spans:
@@ -158,17 +148,42 @@ def rank_windows(
             T = triangle(s, rows)
         else:
             excluded = excluded or "the simulation at the start values diverges"
-        windows.append(_window(problem, span, expected_sd(s.unknowns, T), excluded))
+        sd = np.where(unknown, np.inf, expected_sd(s.unknowns, T))
+        windows.append(_window(problem, span, sd, excluded))
         triangles.append(T)
     order = sorted(range(len(windows)), key=lambda k: (windows[k].flight, windows[k].first))
     windows, triangles = [windows[k] for k in order], [triangles[k] for k in order]
     usable = [k for k, w in enumerate(windows) if not w.excluded]
     if not usable:
         raise ValueError(f"no window of {samples} samples may be used: {windows[0].excluded}")
-    taken, total = _greedy(s.unknowns, windows, triangles, usable)
-    names = tuple(u.name for u in s.unknowns)
-    dt = problem.training[0].dt
-    return Ranking(names, samples * dt, tuple(windows), taken, expected_sd(s.unknowns, total))
+    taken, total = chosen(s.unknowns, windows, triangles, usable, unknown)
+    names, every = tuple(u.name for u in s.unknowns), labels(problem.training)
+    sds = {
+        f"{i}/{n}": float(v)
+        for i, sd in zip(every, at.noise.sd, strict=True)
+        for n, v in sd.items()
+    }
+    stated = {f"{i}/{n}" for i, f in zip(every, problem.training, strict=True) for n in f.sd}
+    return Ranking(
+        names,
+        samples * problem.training[0].dt,
+        tuple(windows),
+        taken,
+        np.where(unknown, np.inf, expected_sd(s.unknowns, total)),
+        undetermined,
+        tuple(n for n in sds if n not in stated),
+        sds,
+        notes,
+    )
+
+
+def _undetermined(problem: Problem, layout: Layout, e: Evaluation) -> tuple[str, ...]:
+    """What the whole record does not determine: then none of its parts does."""
+    # Of one that diverges nothing is known, and its windows stand for themselves.
+    if not np.isfinite(e.J).all():
+        return ()
+    verdict = verdict_of(problem, layout, e)
+    return (*verdict.undetermined, *verdict.without_effect)
 
 
 class _Span(NamedTuple):
@@ -187,9 +202,10 @@ def _window(problem: Problem, span: _Span, sd: np.ndarray, excluded: str) -> Win
 
 
 def _simulated(
-    problem: Problem, at: Solution, samples: int
-) -> tuple[Sensitivity, list[tuple[_Span, np.ndarray]]]:
-    """The rows of all windows, each simulated from an initial state of its own."""
+    problem: Problem, at: Solution, e: Evaluation, samples: int
+) -> tuple[Sensitivity, list[tuple[_Span, np.ndarray]], tuple[str, ...]]:
+    """The rows of all windows, each simulated from an initial state of its own, and what is to be
+    said of these."""
     cell = (
         samples
         if problem.window is None
@@ -205,15 +221,28 @@ def _simulated(
     )
     data = at.data._replace(flights=tuple(_numbers(at.data, *cut) for cut in cuts))
     noise = Noise(tuple(at.noise.sd[i] for i, _, _ in cuts), at.noise.log_variance_ratio)
-    z = start_vector(layout, data, problem)
-    z = jnp.concatenate([at.z[: at.layout.first_nuisance], z[layout.first_nuisance :]])
-    e = evaluate(layout, data, noise, z)
-    # What diverges is left out window by window.
-    if problem.model.linear and np.isfinite(e.J).all():
-        z = _best_states(layout, e, z)
-        e = evaluate(layout, data, noise, z)
-    s = sensitivity_at(problem, layout, e)
-    return s, _rows_of_spans(layout, data, cuts, samples, cell)
+    nuisances, notes = start_vector(layout, data, problem)[layout.first_nuisance :], ()
+    states = states_of_record(at, e) if problem.window is None else None
+    if states is not None:
+        nuisances = begins_on_record(layout, data, cuts, at, states)
+    z = jnp.concatenate([at.z[: at.layout.first_nuisance], nuisances])
+    here = evaluate(layout, data, noise, z)
+    if states is None and problem.window is None:
+        notes = (_DIVERGES,)
+        # What diverges is left out window by window.
+        if problem.model.linear and np.isfinite(here.J).all():
+            here = evaluate(layout, data, noise, _best_states(layout, here, z))
+    s = sensitivity_at(problem, layout, here)
+    sizes = [f.n_samples for f in problem.training]
+    weights = prior_weights(layout, cuts, sizes, samples, shooting=problem.window is not None)
+    s = s._replace(own=s.own / weights)
+    return s, _rows_of_spans(layout, data, cuts, samples, cell), notes
+
+
+_DIVERGES = (
+    "At the start values the simulation of the whole record leaves what was measured, so each "
+    "window begins where its own samples say, and check may expect more or less of the record."
+)
 
 
 def _cuts(flights: Sequence[Flight], samples: int, cell: int) -> list[tuple[int, int, int]]:
@@ -278,9 +307,12 @@ def _filtered(
     flight, k = _places(at.layout, at.data)
     # As many rows again, the last ones, are of the variances.
     more = len(s.shared) - flight.size
-    spans = []
+    of_rows = np.concatenate([flight, flight]) if more >= flight.size else flight
+    own, spans = s.own.copy(), []
     for i, f in enumerate(problem.training):
         begins = list(range(0, f.n_samples - samples + 1, max(samples // 2, 1)))
+        # All windows together have one weak prior of a bias, as the whole record has.
+        own[np.flatnonzero(of_rows == i)] /= min(samples / f.n_samples, 1.0) ** 0.5
         for begin in dict.fromkeys([*begins, max(f.n_samples - samples, 0)]):
             if begin + samples > f.n_samples:
                 continue
@@ -288,65 +320,7 @@ def _filtered(
             if more >= flight.size:
                 rows = np.concatenate([rows, rows + more])
             spans.append((_Span(i, begin, begin + samples), rows))
-    return s, spans
-
-
-def _greedy(
-    unknowns: tuple[Unknown, ...],
-    windows: list[Window],
-    triangles: list[np.ndarray],
-    usable: list[int],
-) -> tuple[tuple[Choice, ...], np.ndarray]:
-    """Windows without overlap, the one that gains most first, until they say enough."""
-    size = triangles[0].shape[0]
-    begin = np.zeros((size, size))
-    order, left, R = [], list(usable), begin
-    steps = []
-    while left:
-        # The first of equal ones: the same record gives the same windows.
-        gains = [_log_det(unknowns, together(R, triangles[k])) for k in left]
-        best = left[int(np.argmax(gains))]
-        R = together(R, triangles[best])
-        order.append(best)
-        steps.append((R, max(gains)))
-        left = [k for k in left if not windows[k].overlaps(windows[best])]
-    q, total = len(unknowns), steps[-1][1]
-    taken, sd = [], np.full(q, np.inf)
-    for k, (R, log_det) in zip(order, steps, strict=True):
-        efficiency = float(np.exp((log_det - total) / q))
-        after = expected_sd(unknowns, R)
-        taken.append(Choice(windows[k], efficiency, after, _reason(unknowns, sd, after)))
-        sd = after
-        if efficiency >= ENOUGH:
-            break
-    return tuple(taken), steps[-1][0]
-
-
-def _log_det(unknowns: tuple[Unknown, ...], R: np.ndarray) -> float:
-    """Logarithm of the determinant of what is known of the parameters of interest."""
-    q = len(unknowns)
-    # What nothing tells yet has the sd of its interval or of a factor of e, so that the determinant
-    # is never zero; of the noise's own unknowns, which are eliminated, that is an sd of ten.
-    weak = np.diag([max(u.prior, 1.0 / u.scale) for u in unknowns] + [0.1] * (len(R) - q))
-    whole = np.linalg.qr(np.vstack([R, weak]), mode="r")
-    # With the parameters last their corner of the triangle is what is left without the others.
-    whole = np.linalg.qr(np.hstack([whole[:, q:], whole[:, :q]]), mode="r")
-    corner = np.abs(np.diag(whole)[len(R) - q :])
-    return 2.0 * float(np.sum(np.log(np.maximum(corner, 1e-300))))
-
-
-def _reason(unknowns: tuple[Unknown, ...], before: np.ndarray, after: np.ndarray) -> str:
-    """Of which parameter a window told most."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        fall = np.where(np.isfinite(after), np.log(before / after), 0.0)
-    fall = np.nan_to_num(fall, nan=0.0, posinf=np.inf)
-    i = int(np.argmax(fall))
-    if not np.isfinite(after[i]):
-        return "determines no parameter by itself"
-    if not np.isfinite(before[i]):
-        new = [u.name for u, f in zip(unknowns, fall, strict=True) if np.isinf(f)]
-        return f"determines {', '.join(new)}"
-    return f"{unknowns[i].name}: sd {100 * before[i]:.2g} % to {100 * after[i]:.2g} %"
+    return s._replace(own=own), spans
 
 
 def window_flights(problem: Problem, ranking: Ranking) -> dict[int, tuple[Flight, ...]]:

@@ -178,6 +178,10 @@ def _coarse_output(name: str, y: np.ndarray, step: float, ratio: float, stated: 
             f"is {ratio:.2g} times the noise that is assumed; {remedy}, at least "
             f"{step / 12**0.5:.2g}."
         )
+    samples = int(np.isfinite(y).sum())
+    # Hardly a value twice: there are few values because there are few samples.
+    if levels < _COARSE and levels > 0.5 * samples:
+        return f"the record has only {samples} samples of {name}."
     if levels < _COARSE:
         return f"{name} has only {levels} distinct values: it moves by few steps of the log."
     return ""
@@ -188,7 +192,7 @@ def _coarse_inputs(flight: Flight) -> list[str]:
     for name, u in flight.inputs.items():
         levels = np.unique(u).size
         # Steps that are commanded have few values rightly.
-        if 1 < levels < _COARSE and np.mean(np.diff(u) != 0) > _MOVES:
+        if 1 < levels < min(_COARSE, 0.5 * u.size) and np.mean(np.diff(u) != 0) > _MOVES:
             sentences.append(
                 f"{name} moves at {100 * np.mean(np.diff(u) != 0):.0f} % of the samples between "
                 f"only {levels} distinct values: steps of the log, not of the stick."

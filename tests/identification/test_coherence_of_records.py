@@ -1,0 +1,159 @@
+"""What is said of the excited band where samples are missing, inputs are feeble, records short."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax.identification.validation.enough import _of_feedback
+from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.feedback import feedback_of
+from heli_jax.identification.validation.logging_rate import logging_rate
+from heli_jax.identification.validation.seen_parts import seen_parts
+from heli_jax.identification.validation.signal_quality import quantisation
+from tests.identification.test_enough import DT, TRUTH, flight, problem, response
+
+
+def swept(n=4000, noise=0.02):
+    """A stick of noise below 2 Hz, and the response."""
+    rng = np.random.default_rng(0)
+    sos = scipy.signal.butter(4, 2.0, fs=1 / DT, output="sos")
+    u = scipy.signal.sosfilt(sos, rng.standard_normal(n))
+    phi, _ = response(u, np.zeros(n))
+    y = phi + noise * np.std(phi) * rng.standard_normal(n)
+    return replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
+
+
+def without(f, *holes):
+    y = f.outputs["phi"].copy()
+    for hole in holes:
+        y[hole] = np.nan
+    return replace(f, outputs={"phi": y})
+
+
+def band(f):
+    return [x for x in bands([f]) if x.topic == "excited band"]
+
+
+def test_few_missing_samples_leave_the_band_as_it_is():
+    f = swept()
+    [whole] = band(f)
+    assert "phi follows it from" in whole.sentence
+    for holes in ((slice(0, 17),), (slice(100, 103), slice(2000, 2005), slice(3000, 3001))):
+        [found] = band(without(f, *holes))
+        assert found.severity == "ok"
+        assert "phi follows it from" in found.sentence
+    # A long hole cuts the record in two, and each part has whole segments.
+    parts = seen_parts([without(f, slice(2000, 2100))]).parts
+    assert [p.n_samples for p in parts] == [2000, 1900]
+    assert "phi follows it from" in band(without(f, slice(2000, 2100)))[0].sentence
+
+
+def test_a_bridged_hole_is_a_straight_line():
+    f = swept()
+    [part] = seen_parts([without(f, slice(100, 103))]).parts
+    y = f.outputs["phi"]
+    expected = y[99] + (y[103] - y[99]) * np.array([0.25, 0.5, 0.75])
+    np.testing.assert_allclose(part.outputs["phi"][100:103], expected)
+    assert part.outputs["phi"][99] == y[99]
+
+
+def test_no_coherence_is_no_tick():
+    f = swept()
+    sparse = np.full(4000, np.nan)
+    sparse[::5] = f.outputs["phi"][::5]
+    for record, why in (
+        (replace(f, outputs={"phi": sparse}), "phi lacks 80 % of its samples"),
+        (flight(n=150), "the record is too short"),
+    ):
+        [found] = band(record)
+        assert found.severity == "doubt"
+        assert "was not computed" in found.sentence
+        assert why in found.sentence
+    # Beside an output that is seen the other is named.
+    both = replace(f, outputs={"phi": sparse, "p": f.outputs["phi"]})
+    [found] = band(both)
+    assert found.severity == "ok"
+    assert "phi was not looked at: it lacks 80 %" in found.sentence
+
+
+def test_a_line_of_vibration_is_no_band():
+    rng, n = np.random.default_rng(0), 1000
+    t = np.arange(n) * DT
+    # Both hear one line, and have nothing else in common.
+    line = 5.0 * np.sin(2 * np.pi * 11.0 * t)
+    u, y = (line + rng.standard_normal(n) for _ in range(2))
+    f = replace(flight(n=n), inputs={"u": u, "v": np.zeros(n)}, outputs={"phi": y})
+    sentences = [x.sentence for x in band(f)]
+    assert "no output follows it alone" in sentences[0]
+    assert "no output follows any input coherently" in sentences[1]
+
+
+def test_inputs_of_one_count_or_one_sample_are_doubted():
+    f, n = swept(), 4000
+    spike = np.zeros(n)
+    spike[700] = 0.002
+    count = np.full(n, 0.030)
+    count[700:900] = 0.032
+    for u, words in (
+        (spike, "u moves in 1 of 4000 samples alone"),
+        (count, "one step of the log alone, between 0.03 and 0.032"),
+    ):
+        first = band(replace(f, inputs={"u": u, "v": np.zeros(n)}))[0]
+        assert first.severity == "doubt"
+        assert words in first.sentence
+    pulse = np.where((np.arange(n) > 700) & (np.arange(n) < 760), 0.1, -0.1)
+    assert not [
+        x
+        for x in band(replace(f, inputs={"u": pulse, "v": np.zeros(n)}))
+        if "u moves" in x.sentence
+    ]
+
+
+def test_feedback_that_was_not_tested_is_said():
+    short = problem(replace(swept(150), sd={"phi": 0.01}))
+    [found] = _of_feedback(short, feedback_of(short))
+    assert found.severity == "doubt"
+    assert "was not tested: the record is too short (3 s, expected 4 s" in found.sentence
+    jumps = problem(flight(0))
+    [found] = _of_feedback(jumps, feedback_of(jumps))
+    assert found.severity == "ok"
+    assert "between jumps" in found.sentence
+
+
+def test_modes_that_do_not_swing_ask_for_a_rate_too():
+    # 400 = 10 * 40: two decays, the faster of 40 rad/s = 6.4 Hz.
+    model = problem(flight(0))
+    vehicle = TRUTH._replace(k=400.0, d=50.0, b=220.0)
+    free = {n: f._replace(start=getattr(vehicle, n)) for n, f in model.free.items()}
+    for every, severity in ((1, "ok"), (3, "doubt"), (8, "refuse")):
+        f = flight(0, 3000)
+        slow = replace(
+            f,
+            dt=DT * every,
+            inputs={n: u[::every] for n, u in f.inputs.items()},
+            outputs={"phi": f.outputs["phi"][::every]},
+            sd={"phi": 1e-6},
+        )
+        asked = replace(model, vehicle=vehicle, flights=(slow,), free=free)
+        [found] = logging_rate(asked, [("one", slow)], [{"phi": 1e-6}])
+        assert found.severity == severity
+        assert found.value == pytest.approx(2.0 * np.pi / 40.0 / (DT * every))
+        # Guessed noise as large as the motion hides no mode; a stated one does, and it is said.
+        [guessed] = logging_rate(asked, [("one", replace(slow, sd={}))], [{"phi": 1.0}])
+        assert guessed.severity == severity
+        [hidden] = logging_rate(asked, [("one", slow)], [{"phi": 1.0}])
+        assert hidden.severity == "doubt"
+        assert "was not judged" in hidden.sentence
+
+
+def test_few_samples_are_not_taken_for_coarse_steps():
+    f = swept(100)
+    short = replace(
+        f,
+        inputs={n: u[:10] for n, u in f.inputs.items()},
+        outputs={"phi": f.outputs["phi"][:10]},
+    )
+    [found] = quantisation([("one", short)], [{"phi": 1.0}])
+    assert "the record has only 10 samples of phi" in found.sentence
