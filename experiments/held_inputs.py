@@ -16,6 +16,7 @@ import math
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -69,8 +70,10 @@ def record(rng: np.random.Generator, with_stamps: bool) -> tuple[np.ndarray, ...
         edges = np.unique(rows[np.clip(np.searchsorted(rows, edges), 0, count - 1)])
     levels = 2e-6 * rng.uniform(-1, 1, edges.size + 1)
     stick = levels[np.searchsorted(edges, np.arange(n), side="right")]
-    A, B, *_ = scipy.signal.cont2discrete((*dynamics(), np.eye(4), np.zeros((4, 1))), STEP)
-    states = scipy.signal.dlsim((A, B, np.eye(4), np.zeros((4, 1)), STEP), stick)[2]
+    # Any: the stubs know these functions for transfer functions alone.
+    signal: Any = scipy.signal
+    A, B, *_ = signal.cont2discrete((*dynamics(), np.eye(4), np.zeros((4, 1))), STEP)
+    states = signal.dlsim((A, B, np.eye(4), np.zeros((4, 1)), STEP), stick)[2]
     noisy = states[rows, 0] + NOISE * rng.standard_normal(count)
     return rows * STEP, stick[rows], noisy
 
@@ -85,7 +88,7 @@ def flights(rows: np.ndarray, rate: float, folder: Path) -> dict[str, Flight]:
     """
     path = folder / "log.csv"
     np.savetxt(path, rows, delimiter=",", header="t,stick,phi", comments="", fmt="%.9g")
-    signals = {
+    signals: Any = {
         "inputs": {"x_roll": Signal("stick", "m", "m", hold="zero-order")},
         "outputs": {"roll": Signal("phi", "rad", "rad")},
     }

@@ -79,8 +79,7 @@ def _channel(part: Any, where: str, output: OutputConfig, path: Path, logs: Open
         if not _is_derived(output.signal) and output.signal not in log.names:
             near = nearest(output.signal[:60], {n[:60] for n in log.names})
             raise InputError(
-                f"{path}: flights[{i}].signals.outputs.{name}.signal: {part.log} has no channel "
-                f"{shown(output.signal)}{near}"
+                f"{path}: {where}.signal: {part.log} has no channel {shown(output.signal)}{near}"
             )
         # A table has no settings.
         settings = (log.firmware, log.parameters) if isinstance(log, ChannelLog) else ("", {})

@@ -139,11 +139,12 @@ def _as_channels(
     a clock too are topics of their own."""
     topic, start = _table_topic(table, selection, notes)
     topics, clockless = [topic], {}
-    lengths = table.lengths() if isinstance(table, ArrayTable) else {}
-    for size, names in lengths.items():
+    parts = {}
+    if isinstance(table, ArrayTable):
+        parts = {size: (names, table.only(names)) for size, names in table.lengths().items()}
+    for size, (names, part) in parts.items():
         if size == topic.times.size:
             continue
-        part = table.only(names)
         try:
             another, first = _table_topic(part, Selection(), said := [])
         except InputError:
@@ -276,7 +277,7 @@ def _clocks(
         key=lambda times: times[-1],
     )
     end, step = float(longest[-1]) - log.first_time, float(np.median(np.diff(longest)))
-    notes += window_note(selection.window, end, step)
+    notes += window_note(window, end, step)
     # Events that came in a moment would leave no time that all topics share.
     spans = {name: float(clock.seconds[-1] - clock.seconds[0]) for name, clock in clocks.items()}
     for name, span in spans.items():
