@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.signal_facts import SignalFacts
 
 HOLDS = ("zero-order", "linear")
 """What an input may do between samples: stay until the next, or follow a straight line to it."""
@@ -79,6 +80,7 @@ class Source:
         cautions: sentences on what biases a fit to the log as it is used, which every fit repeats.
         inputs: by the model's name, what each is in the log.
         outputs: likewise.
+        facts: by the model's name and `input` or `output`, what each was before resampling.
     """
 
     path: str
@@ -90,6 +92,9 @@ class Source:
     cautions: tuple[str, ...] = ()
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
+    facts: Mapping[tuple[str, str], SignalFacts] = field(
+        default_factory=dict, compare=False, repr=False
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.errors import InputError
+from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -86,12 +87,15 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
+    logged = as_logged(request, {key: Timed(stamps.seconds, x) for key, x in signals.items()})
+    signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
-    notes = (*notes, *repeated, *missing_notes(request, signals), *more)
+    notes = (*notes, *logged.notes, *repeated, *missing_notes(request, signals), *more)
     source = Source(table.path, table.sha256, notes)
+    source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
 

@@ -12,7 +12,7 @@ from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
-from heli_jax.identification.validation.signal_quality import quantisation, saturation
+from heli_jax.identification.validation.signal_quality import quantisation, saturation, stuck
 
 _ORDER = {"refuse": 0, "doubt": 1, "ok": 2}
 
@@ -40,6 +40,7 @@ def is_it_enough(
         *bands(problem.training),
         *_of_feedback(problem, feedback),
         *saturation(flights),
+        *stuck(flights),
         *quantisation(flights, at.noise.sd),
     ]
     if compare:
