@@ -36,6 +36,10 @@ _MOST = 0.2
 """part of the samples that are marks, at most: what is there more often may be a value"""
 _JUMP = (0.75, 1.001)
 """of a turn: by how much a wrapped angle jumps from a sample to the next, at least and at most"""
+_TURNS = (360.0, 2 * np.pi, 36000.0)
+"""degrees, radians, hundredths of a degree"""
+_NEARLY = 0.9
+"""turns that an angle of no stated unit has to go over"""
 _TURN = 1.001
 """turns that a wrapped angle goes over, at most; its ends may be rounded"""
 
@@ -90,6 +94,23 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     facts = facts_of_all({key: tuple(timed) for key, timed in made.items()}, outputs)
     facts = {key: replace(f, marks=marks[key]) for key, f in facts.items()}
     return AsLogged(made, facts, tuple(notes))
+
+
+def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Numbers (N,) of a log whose unit nobody states, with marks as missing and angles unwrapped
+    that are surely some, and what was done in words."""
+    notes, at = [], at_marks(numbers)
+    if at.any():
+        notes.append(f"has {mark_words(counted(numbers, at))}: taken as missing")
+        numbers = np.where(at, np.nan, numbers)
+    for turn in _TURNS:
+        y = numbers[np.isfinite(numbers)]
+        # All of a turn, and beside its jumps no step that is more than a part of one.
+        if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
+            after, words = unwrapped(numbers, turn)
+            if np.nanmax(np.abs(np.diff(after[np.isfinite(after)]))) < (1 - _JUMP[0]) * turn:
+                return after, [*notes, words]
+    return numbers, notes
 
 
 def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:

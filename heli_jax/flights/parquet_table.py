@@ -77,12 +77,15 @@ class ParquetTable:
     """A `Table` on a Parquet file; only the columns asked for are read."""
 
     format = "parquet"
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
         self.path, self.size = path, size
         self._digest, self._file = digest, file
         self._schema = file.schema_arrow
         self.names: tuple[str, ...] = tuple(self._schema.names)
+        stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
+        self.units = {name: unit.decode("utf-8", "replace") for name, unit in stated.items()}
 
     @property
     def sha256(self) -> str:
