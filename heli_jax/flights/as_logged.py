@@ -105,10 +105,12 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
         numbers = np.where(at, np.nan, numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]
-        # All of a turn, and beside its jumps no step that is more than a part of one.
         if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
             after, words = unwrapped(numbers, turn)
-            if np.nanmax(np.abs(np.diff(after[np.isfinite(after)]))) < (1 - _JUMP[0]) * turn:
+            steps = np.abs(np.diff(after[np.isfinite(after)]))
+            # Beside its jumps it goes through all of a turn by small steps: a mode or a switch
+            # between 0 and 360 does not.
+            if steps.max() < (1 - _JUMP[0]) * turn and steps.sum() > _NEARLY * turn:
                 return after, [*notes, words]
     return numbers, notes
 

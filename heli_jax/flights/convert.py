@@ -270,13 +270,11 @@ def _resampled(
     for name in names:
         topic = log.topic_of(name).name
         clock = clocks[topic]
-        values = _finite(log.channel(name).values[clock.rows])
+        values, said = without_marks_and_turns(_finite(log.channel(name).values[clock.rows]))
+        notes += [f"{shown(name)} {words}" for words in said]
         # How a signal moves is asked of the samples that there are: a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"
-        if not stays:
-            values, said = without_marks_and_turns(values)
-            notes += [f"{shown(name)} {words}" for words in said]
         new = (hold if stays else resampled)(clock.seconds, values, times)
         # A hold and a straight line go on through any gap, so what they say there is taken out
         # again.
