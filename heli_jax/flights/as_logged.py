@@ -32,6 +32,8 @@ _ABSURD = 1e9
 """in the log's own numbers: larger ones are no measurement, such as 1e10 and 3.4e38"""
 _APART = 1.0
 """times the range of all other values, by which a mark lies outside of it"""
+_LEVELS = 4
+"""distinct values that a signal has beside its marks, at least"""
 _MOST = 0.2
 """part of the samples that are marks, at most: what is there more often may be a value"""
 _JUMP = (0.75, 1.001)
@@ -71,6 +73,11 @@ def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     Raises:
         InputError: an input has marks; it acts all the time, so that none of it may be missing.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # differences of huge values
+        return _as_logged(request, signals)
+
+
+def _as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
     made, marks, notes = {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
@@ -117,19 +124,21 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
 
 def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:
     """What stands in the log for values (N,) in SI."""
-    with np.errstate(over="ignore"):
-        return signal.from_si(values)
+    return signal.from_si(values)
 
 
 def at_marks(numbers: np.ndarray) -> np.ndarray:
     """Which of the numbers (N,) of a log stand for no value, far outside of all others."""
     with np.errstate(invalid="ignore"):
-        at = np.abs(numbers) >= _ABSURD
+        at = np.abs(numbers) > _ABSURD
     i = np.clip(np.searchsorted(_SORTED, numbers), 1, _SORTED.size - 1)
     for mark in (_SORTED[i - 1], _SORTED[i]):
         at |= np.abs(numbers - mark) <= _SINGLE * np.abs(mark)
     rest = numbers[np.isfinite(numbers) & ~at]
     if not at.any() or rest.size < FEWEST or at.sum() > _MOST * (at.sum() + rest.size):
+        return np.zeros(numbers.shape, bool)
+    # Of a switch between a few values any of them may be one.
+    if np.unique(rest).size < _LEVELS:
         return np.zeros(numbers.shape, bool)
     low, high = float(rest.min()), float(rest.max())
     away = _APART * (high - low)

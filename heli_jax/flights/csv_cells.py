@@ -7,8 +7,8 @@ import numpy as np
 
 from heli_jax import units
 
-MISSING = ("NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A")
-"""cells that say that there is no value"""
+MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A")
+"""cells that say that there is no value, beside NaN, which is a number"""
 # What counts as a number. float() would also take 1_000, and digits of any script.
 _NUMBER = re.compile(
     r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?"

@@ -150,13 +150,15 @@ def facts_of_all[K: Hashable](
         signals: stamps (N,) [s] and samples (N,) by key.
         outputs: keys of those that a machine cannot hold still.
     """
-    facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
-    for key in outputs:
-        stuck = _stuck(*signals[key], facts[key])
-        others = (one for other, one in signals.items() if other != key)
-        # A machine that stands on the ground holds everything still, and no sensor is stuck.
-        if stuck is not None and any(_changes(*other, stuck) for other in others):
-            facts[key] = replace(facts[key], stuck=stuck)
+    # Differences of huge values overflow, and no more is known of such signals then.
+    with np.errstate(over="ignore", invalid="ignore"):
+        facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
+        for key in outputs:
+            stuck = _stuck(*signals[key], facts[key])
+            others = (one for other, one in signals.items() if other != key)
+            # A machine that stands on the ground holds everything still, and no sensor is stuck.
+            if stuck is not None and any(_changes(*other, stuck) for other in others):
+                facts[key] = replace(facts[key], stuck=stuck)
     return facts
 
 
@@ -262,6 +264,8 @@ def _lattice(levels: np.ndarray) -> float:
     steps = np.diff(levels)
     # Smaller differences are rounding of one value.
     steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
+    if not steps.size or not np.isfinite(steps).all():  # of huge values
+        return 0.0
     step = float(steps.min())
     multiples = steps / step
     whole = np.abs(multiples - np.round(multiples)) <= _LATTICE * multiples
