@@ -98,7 +98,7 @@ def _as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
             notes.append(f"{name} {note}")
         made[key] = Timed(timed.seconds, values)
     outputs = frozenset(key for key in made if key[1] == "output")
-    facts = facts_of_all({key: tuple(timed) for key, timed in made.items()}, outputs)
+    facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
     facts = {key: replace(f, marks=marks[key]) for key, f in facts.items()}
     return AsLogged(made, facts, tuple(notes))
 
