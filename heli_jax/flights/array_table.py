@@ -44,7 +44,8 @@ class ArrayTable:
         self.path, self.format, self.size, self.notes = path, kind, len(data), notes
         self.sha256 = hashlib.sha256(data).hexdigest()
         self.names = tuple(arrays)
-        self._arrays, self.units = arrays, dict(units or {})
+        self._arrays = arrays
+        self.units: Mapping[str, str] = dict(units or {})
         if not arrays:
             raise wrong(path, "holds no rows of numbers, expected a log")
         require_few_columns(path, len(arrays))
@@ -111,7 +112,7 @@ def open_mat(path: Path) -> ArrayTable:
         raise wrong(str(path), str(e)) from e
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
-    real = {name: array.real for name, array in whole.items()}
+    real = {name: np.real(array) for name, array in whole.items()}
     arrays = {n: part for name, array in real.items() for n, part in _vectors(name, array)}
     complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
     words = f"complex numbers, of which the real part is read: {complex_ones}"

@@ -20,8 +20,8 @@ def as_utf8(path: str, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
             return data.decode("utf-16").encode(), ("text in UTF-16 was read as such",)
-        except UnicodeError as e:
-            problem = f"begins as text in UTF-16, and is none ({e.reason})"  # pyright: ignore[reportAttributeAccessIssue]
+        except UnicodeDecodeError as e:
+            problem = f"begins as text in UTF-16, and is none ({e.reason})"
             raise wrong(path, f"{problem}, expected whole text") from e
     if data.isascii() or b"\x00" in data or _is_utf8(data):
         return data, ()

@@ -144,7 +144,8 @@ class CsvTable:
         units: Mapping[str, str] | None = None,
     ) -> None:
         self.path, self.size, self.names = body.path, size, names
-        self.notes, self.units = notes, dict(units or {})
+        self.notes = notes
+        self.units: Mapping[str, str] = dict(units or {})
         self._digest, self._body = digest, body
         self._dates: set[str] = set()
 

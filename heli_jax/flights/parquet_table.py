@@ -1,7 +1,7 @@
 """Logs in Apache Parquet."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -85,7 +85,9 @@ class ParquetTable:
         self._schema = file.schema_arrow
         self.names: tuple[str, ...] = tuple(self._schema.names)
         stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
-        self.units = {name: unit.decode("utf-8", "replace") for name, unit in stated.items()}
+        self.units: Mapping[str, str] = {
+            name: unit.decode("utf-8", "replace") for name, unit in stated.items()
+        }
 
     @property
     def sha256(self) -> str:

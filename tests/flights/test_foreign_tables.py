@@ -22,7 +22,7 @@ def written(tmp_path, lines, name="log.csv", encoding="utf-8"):
     return path
 
 
-def read(path, time="t", u="u", p="p"):
+def read(path, time: str | Signal = "t", u="u", p="p"):
     return read_flight(
         path, time=time, inputs={"u": Signal(u, "1", "1")}, outputs={"p": Signal(p, "1", "1")}
     )
