@@ -40,11 +40,13 @@ class ArrayTable:
         data: bytes,
         arrays: Mapping[str, np.ndarray],
         units: Mapping[str, str] | None = None,
+        notes: tuple[str, ...] = (),
     ) -> None:
-        self.path, self.format, self.size = path, kind, len(data)
+        self.path, self.format, self.size, self.notes = path, kind, len(data), notes
         self.sha256 = hashlib.sha256(data).hexdigest()
         self.names = tuple(arrays)
-        self._arrays, self._units = arrays, dict(units or {})
+        self._arrays = arrays
+        self.units: Mapping[str, str] = dict(units or {})
         if not arrays:
             raise wrong(path, "holds no rows of numbers, expected a log")
         require_few_columns(path, len(arrays))
@@ -98,7 +100,7 @@ class ArrayTable:
         """The unit that the file states, where it is one of time."""
         # The CF conventions write a clock's unit as 'seconds since 1970-01-01', of which the epoch
         # does not matter: times count from the first sample.
-        unit = self._units.get(name, "").split(" since ")[0].strip()
+        unit = self.units.get(name, "").split(" since ")[0].strip()
         words = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
         unit = words.get(unit, unit)
         return unit if unit in words.values() else None
@@ -123,8 +125,11 @@ def open_mat(path: Path) -> ArrayTable:
         raise wrong(str(path), str(e)) from e
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
-    arrays = {n: part for name, array in whole.items() for n, part in _vectors(name, array)}
-    return ArrayTable(str(path), "mat", data, arrays)
+    real = {name: np.real(array) for name, array in whole.items()}
+    arrays = {n: part for name, array in real.items() for n, part in _vectors(name, array)}
+    complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
+    words = f"complex numbers, of which the real part is read: {complex_ones}"
+    return ArrayTable(str(path), "mat", data, arrays, notes=(words,) if complex_ones else ())
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

@@ -10,9 +10,11 @@ import numpy as np
 
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.as_logged import without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
 from heli_jax.flights.describe import describe_table
+from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog, Topic
 from heli_jax.flights.named import NamedBy
@@ -29,6 +31,8 @@ _SHARE = 0.5
 """of the longest topic's time: where nothing is asked for, topics of less are left out"""
 _INTERPOLATED = 2.0
 """times a topic's rate, from which on it is said that most values are none that were measured"""
+_MOST_NAMED = 6
+"""columns that notes name"""
 _LONGEST = 3 * 10**8
 """cells: 2.4 GB"""
 
@@ -105,7 +109,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     if selection.rate is None:
         columns = _as_logged(log, names, clocks)
     else:
-        columns = _resampled(log, names, clocks, selection.rate)
+        columns = _resampled(log, names, clocks, selection.rate, notes)
         for clock in clocks.values():
             notes += [f"{clock.words}: {n}" for n in new_clock(clock.seconds, selection.rate).notes]
             # A table has a value in every row; a fit takes slow outputs as missing in between.
@@ -191,7 +195,12 @@ def _table_topic(table: Table, selection: Selection, notes: list[str]) -> tuple[
     clock = info.time
     if clock is None or clock.problem:
         why = clock.problem if clock else "no column looks like a clock"
-        raise wrong(table.path, f"{why}, expected --time NAME, a column of increasing times")
+        remedy = "expected --time NAME, a column of increasing times"
+        if clock:
+            remedy += ", or a file without the rows that go back"
+        elif texts := [c.name for c in info.columns if c.kind == "text"]:
+            why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
+        raise wrong(table.path, f"{why}, {remedy}")
     if clock.guessed:
         notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
     rows = next(c.count for c in info.columns if c.name == clock.column)
@@ -199,16 +208,32 @@ def _table_topic(table: Table, selection: Selection, notes: list[str]) -> tuple[
     whole = not isinstance(table, ArrayTable)
     numeric = [c for c in info.columns if c.kind == "number"]
     names = [c.name for c in numeric if whole or c.count == rows]
+    notes += table.notes
+    notes += _left_out(table, [c.name for c in info.columns if c.kind == "text"])
     twice = next((n for n in names if names.count(n) > 1), None)
     # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
     numbers = dict(table.numbers(names))
-    stamps = numbers.pop(clock.column)
+    stamps, more = without_overflow(numbers.pop(clock.column))
+    notes += more
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
     return topic, float(stamps[0]) * scale
+
+
+def _left_out(table: Table, names: Sequence[str]) -> list[str]:
+    """Notes on columns that hold text, with where and what it is."""
+    notes = []
+    for name in names[:_MOST_NAMED]:
+        try:
+            table.numbers([name])
+        except InputError as e:
+            notes.append(f"left out: {str(e).removeprefix(table.path).lstrip(',: ')}")
+    if len(names) > _MOST_NAMED:
+        notes.append(f"left out: {len(names) - _MOST_NAMED} more columns of text")
+    return notes
 
 
 def _names(log: DerivedLog, patterns: Sequence[str]) -> list[str]:
@@ -317,7 +342,11 @@ def _as_logged(
 
 
 def _resampled(
-    log: ChannelLog, names: Sequence[str], clocks: Mapping[str, TopicClock], rate: float
+    log: ChannelLog,
+    names: Sequence[str],
+    clocks: Mapping[str, TopicClock],
+    rate: float,
+    notes: list[str],
 ) -> dict[str, np.ndarray]:
     # Counted before any signal is resampled, so that a slip in the rate is refused before it fills
     # the memory.
@@ -330,7 +359,8 @@ def _resampled(
     for name in names:
         topic = log.topic_of(name).name
         clock = clocks[topic]
-        values = _finite(log.channel(name).values[clock.rows])
+        values, said = without_marks_and_turns(_finite(log.channel(name).values[clock.rows]))
+        notes += [f"{shown(name)} {words}" for words in said]
         # How a signal moves is asked of the samples that there are: a move to or from NaN is none.
         known = values[~np.isnan(values)]
         stays = not known.size or decide(known).hold == "zero-order"

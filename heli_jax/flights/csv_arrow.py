@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from heli_jax.flights.csv_cells import MISSING
 from heli_jax.flights.csv_text import Body
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
@@ -121,8 +122,8 @@ def _table(body: Body, width: int, kinds: dict[int, Any], sign: str) -> "pa.Tabl
             convert_options=arrow_csv.ConvertOptions(
                 column_types=stated,
                 include_columns=[str(i) for i in kinds],
-                # Its own list has words, of which each would pass for an empty cell.
-                null_values=[""],
+                # Not its own list, which has words such as #N/A N/A.
+                null_values=["", *MISSING],
                 decimal_point=sign,
             ),
         )

@@ -4,8 +4,7 @@ pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes
 takes the fast way, and `Body.records` walks the text again to say where an error is.
 """
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,15 @@ import numpy as np
 
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import floats, likely_numbers, number_columns, text_columns
+from heli_jax.flights.csv_cells import (
+    MISSING,
+    is_date,
+    is_number,
+    number,
+    row_of_units,
+    seconds_of_dates,
+)
+from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
@@ -42,12 +50,6 @@ from heli_jax.regular_file import read_regular, size_words
 if TYPE_CHECKING:
     import pyarrow as pa
 
-# What counts as a number. float() would also take 1_000, and digits of any script.
-_NUMBER = re.compile(
-    r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-    r"|[+-]?(?:nan|inf|infinity)",
-    re.IGNORECASE,
-)
 _LARGEST = 16 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
 _LARGEST_TEXT = 2 * 10**9
@@ -64,7 +66,8 @@ def open_csv(path: Path) -> "CsvTable":
     """
     where = str(path)
     data = read_regular(path, "a log in CSV", _LARGEST)
-    digest = Digest(data)
+    digest, size = Digest(data), len(data)
+    data, notes = as_utf8(where, data)
     check_text(where, data)
     head = find_header(data)
     if head is None:
@@ -85,9 +88,45 @@ def open_csv(path: Path) -> "CsvTable":
     # Counted before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(where, header.count(delimiter) + 1, line)
     names = header_names(where, header, delimiter, head.number)
+    if all(is_number(name) for name in names):
+        listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
+        problem = "got numbers, expected the names of the columns; write a line of names above"
+        raise wrong(where, f"{problem}, such as {shown(listed)}", line)
     has_quotes = data.find(b'"', head.after) >= 0
     body = Body(where, rows, delimiter, head.number + 1, has_quotes)
-    return CsvTable(len(data), digest, names, body)
+    units = _units_below(body, names)
+    if units is None:
+        return CsvTable(size, digest, names, body, notes)
+    body, number_of_line = _below(body)
+    listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
+    notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
+    return CsvTable(size, digest, names, body, notes, dict(zip(names, units, strict=True)))
+
+
+def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
+    """The units in the first row of the body; None where it holds none."""
+    first = first_row(bytes(body.data[:LONGEST_HEADER]), 0) or ""
+    cells = first.split(body.delimiter)
+    return row_of_units(cells) if len(cells) == len(names) else None
+
+
+def _below(body: Body) -> tuple[Body, int]:
+    """The body without its first row, and that row's line."""
+    data = bytes(body.data[:LONGEST_HEADER])
+    line, at = body.first_line, 0
+    while not data[at : (end := _end_of_line(data, at))].strip():
+        line, at = line + 1, end
+    rows = body.data[_end_of_line(data, at) :]
+    if not len(rows):
+        raise wrong(body.path, "holds a header and units alone, expected rows of numbers")
+    return Body(body.path, rows, body.delimiter, line + 1, body.has_quotes), line
+
+
+def _end_of_line(data: bytes, at: int) -> int:
+    """Where the next line begins."""
+    ends = [i for i in (data.find(b"\n", at), data.find(b"\r", at)) if i >= 0]
+    end = min(ends, default=len(data) - 1)
+    return end + 2 if data[end : end + 2] == b"\r\n" else end + 1
 
 
 class CsvTable:
@@ -95,9 +134,20 @@ class CsvTable:
 
     format = "csv"
 
-    def __init__(self, size: int, digest: Digest, names: tuple[str, ...], body: Body) -> None:
+    def __init__(
+        self,
+        size: int,
+        digest: Digest,
+        names: tuple[str, ...],
+        body: Body,
+        notes: tuple[str, ...] = (),
+        units: Mapping[str, str] | None = None,
+    ) -> None:
         self.path, self.size, self.names = body.path, size, names
+        self.notes = notes
+        self.units: Mapping[str, str] = dict(units or {})
         self._digest, self._body = digest, body
+        self._dates: set[str] = set()
 
     @property
     def sha256(self) -> str:
@@ -128,8 +178,9 @@ class CsvTable:
             raise wrong(self.path, str(e)) from e
         result = {}
         for name, text in zip(names, texts, strict=True):
-            values = _floats(text)
+            values = self._values(name, text)
             if isinstance(values, int):
+                self._require_no_names(values)
                 problem = f"got {self.cell_text(name, values)}, expected a number"
                 raise wrong(self.path, problem, self.place(values), column(name))
             result[name] = values
@@ -153,7 +204,7 @@ class CsvTable:
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
         try:
-            values = _floats(_decimal_points([text], self._body.delimiter)[0])
+            values = self._values(name, _decimal_points([text], self._body.delimiter)[0])
         # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
         except _TwoDecimalSigns:
             values = 0
@@ -169,20 +220,33 @@ class CsvTable:
         cell = self._record(row)[1][self.names.index(name)].strip()
         return shown(cell) if cell else "nothing"
 
-    def time_unit(self, name: str) -> None:
-        """Text has no type."""
-        return None
+    def time_unit(self, name: str) -> str | None:
+        """Seconds of a column of dates; else what a row of units says, where it is one of time."""
+        if name in self._dates:
+            return "s"
+        unit = self.units.get(name, "").replace("µ", "u").replace("sec", "s")
+        return unit if unit in ("s", "ms", "us", "ns", "min") else None
+
+    def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
+        """A column's numbers (N,), or the first row that holds none."""
+        values = _floats(text)
+        if not isinstance(values, int) or not is_date(text[values].as_py().strip()):
+            return values
+        dates = seconds_of_dates(_filled(text).to_pylist())
+        if not isinstance(dates, int):
+            self._dates.add(name)
+        return dates
+
+    def _require_no_names(self, row: int) -> None:
+        """Refuse a header between the rows: a logger began anew there."""
+        line, cells = self._record(row)
+        if tuple(cell.strip().strip('"') for cell in cells) == self.names:
+            problem = "holds the names of the columns again, as where a logger began anew, expected"
+            raise wrong(self.path, f"{problem} numbers; make two files of it here", f"line {line}")
 
     def _require(self, names: Sequence[str]) -> None:
         missing = [name for name in names if name not in self.names]
-        # The likeliest causes have a sentence of their own: "no column 't'; known are 0.0, 1.3"
-        # leaves a reader puzzled where the file has no header at all.
-        if missing and all(_NUMBER.fullmatch(name) for name in self.names):
-            raise wrong(
-                self.path,
-                f"got numbers, expected the names of the columns, {shown(missing[0])} among them",
-                f"line {self._body.first_line - 1}",
-            )
+        # The likeliest cause has a sentence of its own.
         if missing and len(self.names) == 1:
             raise wrong(
                 self.path,
@@ -284,20 +348,28 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
     if "," not in signs:
         return texts
     if "." in signs:
-        problem = f"got both {signs[',']} and {signs['.']}, expected one decimal sign"
+        both = f"both {signs[',']} and {signs['.']}"
+        if signs[","] == signs["."]:
+            both = f"{signs[',']}, with commas and points"
+        problem = f"got {both}, expected one decimal sign"
         raise _TwoDecimalSigns(problem)
     return [pc.replace_substring(text, ",", ".") for text in texts]
 
 
 def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
-    """Cells without the blanks around them, null where nothing is left."""
+    """Cells without the blanks around them, null where nothing or a mark for it is left."""
     import pyarrow as pa
 
     pc = _compute()
     trimmed = pc.utf8_trim_whitespace(text)
     # Not compared with "": pyarrow imports pandas, a fifth of a second, to take a value of Python.
     nothing = pa.nulls(1, trimmed.type)[0]
-    return pc.if_else(pc.cast(pc.utf8_length(trimmed), pa.bool_()), trimmed, nothing)
+    marks = pa.array(MISSING, trimmed.type)
+    is_filled = pc.and_(
+        pc.cast(pc.utf8_length(trimmed), pa.bool_()),
+        pc.invert(pc.is_in(trimmed, value_set=marks)),
+    )
+    return pc.if_else(is_filled, trimmed, nothing)
 
 
 def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
@@ -319,7 +391,8 @@ def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:
     for row, cell in enumerate(cell for piece in pieces for cell in piece.to_pylist()):
         if cell is None:
             continue
-        if not _NUMBER.fullmatch(cell):
+        value = number(cell)
+        if value is None:
             return row
-        values[row] = float(cell)
+        values[row] = value
     return values

@@ -23,8 +23,11 @@ def part(flight: Flight, first: int, last: int, name: str = "", note: str = "") 
             f"expected a part of samples 0 to {flight.n_samples}, got {first} to {last}"
         )
     source = flight.source
-    if source is not None and note:
-        source = dataclasses.replace(source, notes=(*source.notes, note))
+    if source is not None:
+        notes = (*source.notes, note) if note else source.notes
+        begin, end = first * flight.dt, (last - 1) * flight.dt
+        facts = {key: f.within(begin, end) for key, f in source.facts.items()}
+        source = dataclasses.replace(source, notes=notes, facts=facts)
     return dataclasses.replace(
         flight,
         inputs={n: u[first:last] for n, u in flight.inputs.items()},

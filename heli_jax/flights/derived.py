@@ -239,6 +239,7 @@ class DerivedTable:
         self.table, self.swashplate = table, swashplate
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
+        self.notes, self.units = table.notes, table.units
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.

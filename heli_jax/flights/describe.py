@@ -18,6 +18,7 @@ from heli_jax.flights.grid import (
     not_increasing,
     rounding_of,
     uniform_grid,
+    without_overflow,
 )
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
@@ -236,10 +237,10 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         size=table.size,
         sha256=table.sha256,
         n_rows=_n_rows(surveys),
-        columns=tuple(_describe_column(each) for each in surveys),
+        columns=tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
-        notes=_other_lengths(surveys),
+        notes=(*table.notes, *_other_lengths(surveys)),
     )
 
 
@@ -358,6 +359,7 @@ def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     """What stamps (N,) in a unit of time are as a clock."""
     scale = _SECONDS[unit] if unit in _SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
+        stamps, _ = without_overflow(stamps)
         seconds = stamps * scale
         steps = np.diff(seconds)
     # A column that was named as the clock may be anything, so what follows has to hold: finite

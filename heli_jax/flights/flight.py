@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.signal_facts import SignalFacts
 
 HOLDS = ("zero-order", "linear")
 """What an input may do between samples: stay until the next, or follow a straight line to it."""
@@ -80,6 +81,7 @@ class Source:
         inputs: by the model's name, what each is in the log.
         outputs: likewise.
         first_time: from which windows of the log count [s], in the log's own count.
+        facts: by the model's name and `input` or `output`, what each was before resampling.
     """
 
     path: str
@@ -92,6 +94,9 @@ class Source:
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
     first_time: float = 0.0
+    facts: Mapping[tuple[str, str], SignalFacts] = field(
+        default_factory=dict, compare=False, repr=False
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ _DRIFT_ALLOWED = 0.5  # of a step
 _FEWEST_DIGITS = 5  # nobody logs fewer significant digits
 _FEWEST_STAMPS = 8  # fewer may be round numbers by accident
 _COARSEST = 0.9  # of a step; stamps rounded to a whole step cannot show a lost sample otherwise
+_ON = 100.0  # usual steps, within which a counter goes on after its end
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,27 @@ def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
         return None
     row = int(rows[0])
     return row + 1, "stands still" if steps[row] == 0 else "runs backwards"
+
+
+_COUNTER = 2.0**32
+"""ticks after which a counter of 32 bits begins anew: 71.6 minutes of microseconds"""
+
+
+def without_overflow(stamps: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Stamps (N,) of a counter of 32 bits that began anew, as going on, and a note of it."""
+    steps = np.diff(stamps)
+    back = np.flatnonzero(steps < 0)
+    # Whole numbers below its end, that fall by nearly all of it and then go on as before.
+    if not back.size or not (stamps.min() >= 0 and stamps.max() < _COUNTER):
+        return stamps, ()
+    on = steps[back] + _COUNTER
+    usual = float(np.median(steps))
+    if not np.all((on > 0) & (on <= _ON * usual)) or np.any(stamps != np.rint(stamps)):
+        return stamps, ()
+    turns = np.cumsum(np.r_[0, steps < 0])
+    times = "once" if back.size == 1 else f"{back.size} times"
+    note = f"the time began anew at 2^32 ticks {times}, as a counter of 32 bits does: it goes on"
+    return stamps + _COUNTER * turns, (note,)
 
 
 def uniform_grid(elapsed: np.ndarray, rounding: float) -> Grid | Uneven:

@@ -20,6 +20,7 @@ _NUMBERS = {
 }  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 6, 15
+_COMPLEX = 0x800
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 _MOST_BYTES = 2 * 10**9
 """of all arrays once they are unpacked"""
@@ -139,9 +140,9 @@ def _matrix(
     if not data or depth > _DEEPEST:
         return
     flags = _element(data, 0, order)
-    # The class of an array is the lowest byte; those above say whether it is complex or logical. Of
-    # a complex one the real part comes first, and is what is read.
-    kind = struct.unpack_from(f"{order}I", flags.data)[0] & 0xFF
+    # The class of an array is the lowest byte; those above say whether it is complex or logical.
+    word = struct.unpack_from(f"{order}I", flags.data)[0]
+    kind, is_complex = word & 0xFF, bool(word & _COMPLEX)
     shape, at = _numbers(data, flags.end, order)
     # As floating point: the product of what a damaged shape claims could overflow integers, and
     # come out small.
@@ -155,7 +156,8 @@ def _matrix(
         values, _ = _numbers(data, label.end, order)
         if values.size != np.prod(shape):
             raise DamagedMatFile(f"an array of {values.size} values claims {np.prod(shape)}")
-        yield name, values.reshape(shape, order="F")
+        # The real part comes first, and is what is read; the type says that there is another.
+        yield name, (values + 0j if is_complex else values).reshape(shape, order="F")
     elif kind == _CELL:
         yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
     elif kind == _STRUCT:

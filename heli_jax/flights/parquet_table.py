@@ -1,7 +1,7 @@
 """Logs in Apache Parquet."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -79,12 +79,17 @@ class ParquetTable:
     """A `Table` on a Parquet file; only the columns asked for are read."""
 
     format = "parquet"
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: str, size: int, digest: Digest, file: "pq.ParquetFile") -> None:
         self.path, self.size = path, size
         self._digest, self._file = digest, file
         self._schema = file.schema_arrow
         self.names: tuple[str, ...] = tuple(self._schema.names)
+        stated = {f.name: (f.metadata or {}).get(b"unit", b"") for f in self._schema}
+        self.units: Mapping[str, str] = {
+            name: unit.decode("utf-8", "replace") for name, unit in stated.items()
+        }
 
     @property
     def sha256(self) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
@@ -108,16 +109,19 @@ def flight_of_signals(
     Raises:
         InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
+    logged = as_logged(request, {key: signal.timed for key, signal in signals.items()})
+    values = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
-    values = {key: signal.values for key, signal in signals.items()}
     holds = decided_holds(request, values)
     values, repeated = measured_once(request, values)
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
     said = sample_notes(request, {key: signal.timed for key, signal in signals.items()})
     start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
-    notes = (*source.notes, *repeated, *said, *notes)
+    notes = (*source.notes, *logged.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates, first_time=first_time)
+    end = start + dt * (next(iter(samples.values())).size - 1)
+    source = logged.source(source, start, end)
     return flight_of(request, samples, dt, first_time + start, holds, source)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.errors import InputError
+from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -19,6 +20,7 @@ from heli_jax.flights.grid import (
     not_increasing,
     rounding_of,
     uniform_grid,
+    without_overflow,
 )
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.onto_grid import (
@@ -38,7 +40,12 @@ from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.slower import Timed
-from heli_jax.flights.table import Table, column, wrong
+from heli_jax.flights.table import Table, column, shown, wrong
+
+_MANY = 0.1
+"""part of the stamps that are not later than the one before, which no hand takes out"""
+_FEW_ROWS = 10
+"""rows out of order that are left out by hand"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +101,39 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
+    logged = as_logged(request, {key: Timed(stamps.seconds, x) for key, x in signals.items()})
+    signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
-    notes = (*notes, *repeated, *sample_notes(request, timed), *more)
+    notes = (*table.notes, *clock.notes, *_other_units(table, request), *notes)
+    notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
     source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
+    source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
+
+
+def _other_units(table: Table, request: Request) -> list[str]:
+    """Notes on units that the file states otherwise than the configuration."""
+    notes = []
+    for (name, _), signal in request.signals.items():
+        stated = table.units.get(signal.name, "").strip()
+        if stated in ("", "-", "1") or signal.scale != 1.0:
+            continue
+        try:
+            same = math.isclose(units.factor(stated, signal.unit), 1.0)
+        # The file's own words need be no unit that is known here.
+        except ValueError:
+            same = not units.is_unit(stated)
+        if not same:
+            notes.append(
+                f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
+                f" the file says {shown(stated)}"
+            )
+    return notes
 
 
 def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
@@ -127,6 +158,7 @@ class _Clock:
 
     stamps: np.ndarray
     scale: float
+    notes: tuple[str, ...] = ()
 
     @property
     def elapsed(self) -> np.ndarray:
@@ -161,13 +193,33 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         row = int(bad[0])
         problem = f"got {table.cell_text(time.name, row)}, expected a time"
         raise wrong(table.path, problem, table.place(row), place)
+    stamps, notes = without_overflow(stamps)
     back = not_increasing(stamps)
     if back is not None:
         row, fault = back
         after, now = table.cell_text(time.name, row - 1), table.cell_text(time.name, row)
         problem = f"the time {fault}, got {now} after {after}, expected increasing times"
-        raise wrong(table.path, problem, table.place(row), place)
-    return _Clock(stamps, scale)
+        remedy = _remedy(table, stamps, row)
+        raise wrong(table.path, f"{problem}; {remedy}", table.place(row), place)
+    return _Clock(stamps, scale, notes)
+
+
+def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
+    """What to do about a stamp that is not later than the one before it, in words."""
+    # Where the one before is left out the times go on: it is the wrong one.
+    if row > 1 and stamps[row - 2] < stamps[row] and stamps[row] < stamps[row - 1]:
+        return f"{table.place(row - 1)} is out of order with those around it: leave it out"
+    steps = np.diff(stamps)
+    if np.count_nonzero(steps == 0) > _MANY * stamps.size:
+        return "the stamps have too few digits: log them with more"
+    if np.count_nonzero(steps < 0) > _MANY * stamps.size:
+        return "sort the rows by time"
+    later = np.flatnonzero(stamps[row:] > stamps[row - 1])
+    if later.size and later[0] <= _FEW_ROWS:
+        last = row + int(later[0]) - 1
+        what = table.place(row) if last == row else f"{table.place(row)} to {table.place(last)}"
+        return f"leave {what} out"
+    return f"make two files of it, the second from {table.place(row)} on"
 
 
 def _rows(

@@ -100,6 +100,7 @@ def flight_from(logs: Opened, request: Request) -> Flight:
         source = Source(log.path, log.sha256, (*log.notes, *notes), log.firmware, log.parameters)
         first = log.first_time
     else:
+        notes = (*log.table.notes, *log.clock.notes, *notes)
         source, first = Source(log.table.path, log.table.sha256, notes), log.first_time
     return flight_of_signals(clocked(logs, request), request, source, first)
 

@@ -1,7 +1,7 @@
 """A log as named columns of numbers, whatever the file's format."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -29,6 +29,10 @@ class Table(Protocol):
     format: str
     size: int
     names: tuple[str, ...]
+    notes: tuple[str, ...]
+    """what was assumed or left out when it was opened, in sentences"""
+    units: Mapping[str, str]
+    """by column, where the file states one"""
 
     @property
     def sha256(self) -> str:

@@ -1,32 +1,35 @@
-"""Signals that were cut off at the ends of their range, or logged in steps too coarse."""
+"""Signals that were cut off at the ends of their range, stuck, or logged in steps too coarse.
+
+Judged as they were logged, where the flight knows it: what was resampled has no flat tops and no
+steps, and suffers from them all the same.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from heli_jax.flights.as_logged import mark_words
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.signal_facts import (
+    RAIL_SHARE,
+    STUCK_SECONDS,
+    SignalFacts,
+    at_rails,
+    facts_of_all,
+    quantum,
+)
 from heli_jax.identification.validation.finding import Finding
 
-_FEW = 8
-"""distinct values of a signal below which its extremes are no rails: steps between a few levels"""
-_PILE = 5.0
-"""times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
-steps has 3 times as many at its turning points as at the three values before"""
-_RUN = 3
-"""samples in a row at a rail, once at least"""
-_VISITS = 2
-"""times at least that a signal comes to a rail"""
-_SHARE = 0.005
-"""part of the samples at a rail from which on it is spoken of"""
-_RAIL_LIMIT = f"share of the samples at a rail, {_SHARE}"
+__all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "stuck"]
+
+_RAIL_LIMIT = f"share of the samples at a rail, {RAIL_SHARE}"
 _COARSE = 16
 """distinct values of a moving signal below which it is called coarse"""
 _MOVES = 0.2
 """part of the samples at which an input moves, from which on it is no sequence of steps"""
-_LATTICE = 1e-3
-"""of a step, by which differences of values may miss a multiple of it: units are converted"""
+_STUCK_LIMIT = f"seconds at one value while others change, {STUCK_SECONDS}"
 _MOST_NAMED = 4
 """signals in a sentence"""
 
@@ -46,46 +49,19 @@ def rails(x: Float[np.ndarray, " N"]) -> Rails:
     """
     at_low, at_high = at_rails(x)
     seen = max(int(np.isfinite(x).sum()), 1)
-    return Rails(at_low.sum() / seen, at_high.sum() / seen)
+    return Rails(float(at_low.sum() / seen), float(at_high.sum() / seen))
 
 
-def at_rails(x: Float[np.ndarray, " N"]) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """The samples at the lower and at the upper rail; all False where there is none."""
-    finite = x[np.isfinite(x)]
-    levels, counts = np.unique(finite, return_counts=True)
-    none = np.zeros(x.shape, bool)
-    if levels.size < _FEW:
-        return none, none
-    low = x == levels[0] if _is_rail(finite, levels[0], counts) else none
-    high = x == levels[-1] if _is_rail(finite, levels[-1], counts[::-1]) else none
-    return low, high
-
-
-def _is_rail(x: np.ndarray, rail: float, counts: np.ndarray) -> bool:
-    """Whether samples pile up at an extreme; `counts` by distinct value, the extreme first."""
-    at = x == rail
-    if at[0] and at[-1]:
-        return False
-    edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    # Beside the values next to it also those of all the signal: random steps are held unequally.
-    usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
-    piled = counts[0] > _PILE * usual and counts[0] >= _SHARE * x.size
-    return bool(piled and begins.size >= _VISITS and (ends - begins).max() >= _RUN)
-
-
-def quantum(x: Float[np.ndarray, " N"]) -> float:
-    """The step of which all differences of a signal's values are multiples; 0 if there is none."""
-    levels = np.unique(x[np.isfinite(x)])
-    if levels.size < 2:
-        return 0.0
-    steps = np.diff(levels)
-    # Smaller differences are rounding of one value.
-    steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
-    step = float(steps.min())
-    multiples = steps / step
-    whole = np.abs(multiples - np.round(multiples)) <= _LATTICE * multiples
-    return step if bool(np.all(whole)) else 0.0
+def facts_of(flight: Flight) -> dict[tuple[str, str], SignalFacts]:
+    """Of all signals, by name and kind: as they were logged, where the flight knows it."""
+    known = flight.source.facts if flight.source else {}
+    signals = {(n, "input"): u for n, u in flight.inputs.items()}
+    signals |= {(n, "output"): y for n, y in flight.outputs.items()}
+    if signals.keys() <= known.keys():
+        return {key: known[key] for key in signals}
+    timed = {key: (flight.times, x) for key, x in signals.items()}
+    outputs = frozenset(key for key in signals if key[1] == "output")
+    return {**facts_of_all(timed, outputs), **{k: known[k] for k in signals if k in known}}
 
 
 def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
@@ -96,28 +72,22 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     """
     found = []
     for label, flight in flights:
-        for kind in ("input", "output"):
-            for name, x in (flight.inputs if kind == "input" else flight.outputs).items():
-                shares = rails(x)
-                if max(shares) > 0:
-                    found.append((sum(shares), label, kind, name, x, shares))
+        for (name, kind), facts in facts_of(flight).items():
+            if sum(facts.shares) > 0:
+                found.append((sum(facts.shares), label, kind, name, facts))
     if not found:
         words = "no signal piles up at an end of its range."
-        return [
-            Finding("saturation", "ok", words, 0.0, f"share of the samples at a rail, {_SHARE}")
-        ]
+        return [Finding("saturation", "ok", words, 0.0, _RAIL_LIMIT)]
     found.sort(key=lambda f: -f[0])
     return [_saturated(*f) for f in found[:_MOST_NAMED]]
 
 
-def _saturated(
-    total: float, label: str, kind: str, name: str, x: np.ndarray, shares: Rails
-) -> Finding:
+def _saturated(total: float, label: str, kind: str, name: str, facts: SignalFacts) -> Finding:
     ends = [
-        f"at its {word} value {float(end(x)):.4g} in {100 * share:.2g} % of the samples"
-        for word, end, share in (
-            ("smallest", np.nanmin, shares.low),
-            ("largest", np.nanmax, shares.high),
+        f"{'at' if rail.exact else 'within a hundredth of its range of'} its {word} value "
+        f"{rail.value:.4g} in {100 * share:.2g} % of the samples"
+        for word, rail, share in zip(
+            ("smallest", "largest"), (facts.low, facts.high), facts.shares, strict=True
         )
         if share
     ]
@@ -128,6 +98,36 @@ def _saturated(
         does = "if it was cut off there after it was logged, or the stick went on, inputs are wrong"
     text = f"{label}: {name} is {' and '.join(ends)}: {does}; leave these parts out."
     return Finding("saturation", "doubt", text, round(total, 6), _RAIL_LIMIT)
+
+
+def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
+    """Outputs that stay at one value while others move, and values that stand for none.
+
+    Args:
+        flights: by what each is called.
+    """
+    found: list[tuple[float, str]] = []
+    for label, flight in flights:
+        for (name, kind), facts in facts_of(flight).items():
+            if facts.marks and kind == "output":
+                words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
+                found.append((0.0, f"{words}at what the log says of such values."))
+            if (at := facts.stuck) is not None:
+                length = at.end - at.begin
+                words = (
+                    f"{label}: {name} stays at {at.value:.4g} for {length:.3g} s from "
+                    f"{at.begin:.4g} s on, while other signals change: it is no measurement there;"
+                    " leave this part out."
+                )
+                found.append((length, words))
+    if not found:
+        words = "no output stays at one value while others change."
+        return [Finding("stuck outputs", "ok", words, 0.0, _STUCK_LIMIT)]
+    found.sort(key=lambda f: -f[0])
+    return [
+        Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
+        for length, words in found[:_MOST_NAMED]
+    ]
 
 
 def quantisation(
@@ -141,16 +141,20 @@ def quantisation(
     """
     doubts, worst = [], 0.0
     for (label, flight), noise in zip(flights, sd, strict=True):
-        for name, y in flight.outputs.items():
-            # Rounding to steps of q adds an error of q / sqrt(12), rms, where the signal moves by
-            # more than a step from sample to sample or has noise of that size.
-            step = quantum(y)
-            ratio = step / 12**0.5 / float(noise[name])
-            worst = max(worst, ratio if np.unique(y[np.isfinite(y)]).size > 1 else 0.0)
+        facts = facts_of(flight)
+        for name in flight.outputs:
+            logged = facts[name, "output"]
+            rounding = _rounding(logged, flight.dt)
+            ratio = rounding / float(noise[name])
+            worst = max(worst, ratio if logged.levels > 1 else 0.0)
             stated = name in flight.sd
-            if sentence := _coarse_output(name, y, step, ratio, stated):
+            if sentence := _coarse_output(name, logged, rounding, ratio, stated):
                 doubts.append((ratio, f"{label}: {sentence}"))
-        doubts += [(0.0, f"{label}: {s}") for s in _coarse_inputs(flight)]
+        doubts += [
+            (0.0, f"{label}: {sentence}")
+            for name in flight.inputs
+            if (sentence := _coarse_input(name, facts[name, "input"]))
+        ]
     if not doubts:
         words = "no output is logged in steps that show."
         if worst > 0:
@@ -163,9 +167,22 @@ def quantisation(
     ]
 
 
-def _coarse_output(name: str, y: np.ndarray, step: float, ratio: float, stated: bool) -> str:
-    levels = np.unique(y[np.isfinite(y)]).size
-    if levels == 1:
+def _rounding(facts: SignalFacts, dt: float) -> float:
+    """The error of rounding, rms, that is left at a step of `dt` [s].
+
+    Rounding to steps of q adds an error of q / sqrt(12), rms, where the signal moves by more than
+    a step from sample to sample or has noise of that size. It is white then, and the low-pass
+    filter before a lower rate takes its part of it; where a value stays for several samples, their
+    error is one and the same, and nothing is averaged.
+    """
+    run = facts.usual / facts.moves if facts.moves > 0 else dt
+    return facts.step / 12**0.5 * min(1.0, (run / dt) ** 0.5)
+
+
+def _coarse_output(
+    name: str, facts: SignalFacts, rounding: float, ratio: float, stated: bool
+) -> str:
+    if facts.levels == 1:
         return f"{name} has one value in the whole record: it is no measurement."
     if ratio > 1.0:
         remedy = (
@@ -174,27 +191,22 @@ def _coarse_output(name: str, y: np.ndarray, step: float, ratio: float, stated: 
             else "the noise was guessed from the record, and steps hide it: state the output's sd"
         )
         return (
-            f"{name} is logged in steps of {step:.3g}, whose rounding ({step / 12**0.5:.2g} rms) "
-            f"is {ratio:.2g} times the noise that is assumed; {remedy}, at least "
-            f"{step / 12**0.5:.2g}."
+            f"{name} is logged in steps of {facts.step:.3g}, whose rounding ({rounding:.2g} rms) "
+            f"is {ratio:.2g} times the noise that is assumed; {remedy}, at least {rounding:.2g}."
         )
-    samples = int(np.isfinite(y).sum())
     # Hardly a value twice: there are few values because there are few samples.
-    if levels < _COARSE and levels > 0.5 * samples:
-        return f"the record has only {samples} samples of {name}."
-    if levels < _COARSE:
-        return f"{name} has only {levels} distinct values: it moves by few steps of the log."
+    if facts.levels < _COARSE and facts.levels > 0.5 * facts.size:
+        return f"the record has only {facts.size} samples of {name}."
+    if facts.levels < _COARSE:
+        return f"{name} has only {facts.levels} distinct values: it moves by few steps of the log."
     return ""
 
 
-def _coarse_inputs(flight: Flight) -> list[str]:
-    sentences = []
-    for name, u in flight.inputs.items():
-        levels = np.unique(u).size
-        # Steps that are commanded have few values rightly.
-        if 1 < levels < min(_COARSE, 0.5 * u.size) and np.mean(np.diff(u) != 0) > _MOVES:
-            sentences.append(
-                f"{name} moves at {100 * np.mean(np.diff(u) != 0):.0f} % of the samples between "
-                f"only {levels} distinct values: steps of the log, not of the stick."
-            )
-    return sentences
+def _coarse_input(name: str, facts: SignalFacts) -> str:
+    # Steps that are commanded have few values rightly.
+    if not (1 < facts.levels < min(_COARSE, 0.5 * facts.size) and facts.moves > _MOVES):
+        return ""
+    return (
+        f"{name} moves at {100 * facts.moves:.0f} % of the samples between only {facts.levels} "
+        "distinct values: steps of the log, not of the stick."
+    )

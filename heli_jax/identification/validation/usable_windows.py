@@ -3,7 +3,7 @@
 import numpy as np
 
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.validation.signal_quality import at_rails
+from heli_jax.identification.validation.signal_quality import facts_of
 
 _RAILS = 0.05
 """part of a window's samples at an end of a signal's range, from which on it is left out"""
@@ -16,10 +16,7 @@ class Exclusions:
 
     def __init__(self, flights: tuple[Flight, ...]) -> None:
         self.flights = flights
-        self.rails = [
-            {n: np.logical_or(*at_rails(x)) for n, x in (*f.inputs.items(), *f.outputs.items())}
-            for f in flights
-        ]
+        self.facts = [facts_of(f) for f in flights]
 
     def of(self, i: int, first: int, last: int) -> str:
         """In words; empty where it may be used.
@@ -34,8 +31,12 @@ class Exclusions:
         for name, y in flight.outputs.items():
             if missing := _missing(y, inside, flight.dt):
                 return f"{name}: {missing}"
-        for name, at_end in self.rails[i].items():
-            share = float(np.mean(at_end[inside]))
+        for (name, _), whole in self.facts[i].items():
+            facts = whole.within(first * flight.dt, (last - 1) * flight.dt)
+            if facts.stuck is not None:
+                length = facts.stuck.end - facts.stuck.begin
+                return f"{name} stuck at one value for {length:.2g} s"
+            share = sum(facts.shares)
             if share >= _RAILS:
                 return f"{name} at an end of its range in {100 * share:.0f} % of the samples"
         return ""

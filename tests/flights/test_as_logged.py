@@ -1,0 +1,103 @@
+"""What is known of signals before they are resampled: rails, steps, marks for no value, turns."""
+
+import numpy as np
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights.cut import part
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.read import read_flight
+from heli_jax.flights.signal_facts import signal_facts
+from heli_jax.identification.validation.signal_quality import quantisation, saturation, stuck
+
+N, DT = 2000, 0.01
+T = DT * np.arange(N)
+RNG = np.random.default_rng(0)
+STICK = np.repeat(RNG.uniform(-1, 1, N // 50), 50)
+RATE = np.sin(1.7 * T) + np.sin(2.9 * T) + 0.02 * RNG.standard_normal(N)
+
+
+def read(tmp_path, rate=None, unit="1", si="1", window=None, u=STICK, **outputs):
+    names = ["t", "u", *outputs]
+    rows = np.column_stack([T, u, *outputs.values()])
+    path = tmp_path / "log.csv"
+    np.savetxt(path, rows, "%.17g", ",", header=",".join(names), comments="")
+    return read_flight(
+        path,
+        time="t",
+        inputs={"u": Signal("u", "1", "1")},
+        outputs={n: Signal(n, unit, si) for n in outputs},
+        rate=rate,
+        window=window,
+    )
+
+
+@pytest.mark.parametrize("rate", [None, 50.0, 33.0])
+def test_flat_tops_are_seen_at_any_rate(tmp_path, rate):
+    f = read(tmp_path, rate, p=np.clip(RATE, -1.0, 1.2))
+    (found,) = saturation([("one", f)])
+    assert found.severity == "doubt"
+    assert found.value == pytest.approx(np.mean((RATE <= -1.0) | (RATE >= 1.2)), abs=1e-6)
+    # Of a part of it the share is that of the part.
+    half = part(f, 0, f.n_samples // 2)
+    assert half.source is not None
+    low, high = half.source.facts["p", "output"].shares
+    seen = RATE[: N // 2]
+    assert low + high == pytest.approx(np.mean((seen <= -1.0) | (seen >= 1.2)), abs=0.01)
+
+
+def test_a_rail_with_noise_of_the_converter_is_one_and_a_plateau_is_none():
+    clipped = np.clip(RATE, -1.0, 1.0) + 0.0025 * RNG.standard_normal(N)
+    facts = signal_facts(T, clipped)
+    assert facts.shares[1] == pytest.approx(np.mean(RATE >= 1.0), abs=0.01)
+    assert not facts.high.exact
+    # A first-order answer to steps comes to rest by itself, at the same value each time.
+    u = np.repeat(RNG.choice([-1.0, 0.0, 1.0], N // 50), 50)
+    y = np.zeros(N)
+    for k in range(N - 1):
+        y[k + 1] = y[k] + DT / 0.1 * (u[k] - y[k])
+    for sd in (0.0, 1e-3, 1e-2):
+        assert signal_facts(T, y + sd * RNG.standard_normal(N)).shares == (0.0, 0.0)
+    assert signal_facts(T, np.sin(1.7 * T)).shares == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("rate", [None, 40.0])
+def test_coarse_steps_and_a_stuck_sensor_are_seen_at_any_rate(tmp_path, rate):
+    held = np.where((T > 5) & (T < 9), RATE[500], RATE)
+    f = read(tmp_path, rate, p=np.round(RATE / 0.4) * 0.4, q=held, r=RATE)
+    steps = quantisation([("one", f)], [dict.fromkeys("pqr", 0.02)])
+    assert [s.severity for s in steps] == ["doubt"]
+    assert steps[0].value == pytest.approx(0.4 / 12**0.5 / 0.02, rel=1e-6)
+    (found,) = stuck([("one", f)])
+    assert found.severity == "doubt"
+    assert found.value == pytest.approx(4.0, abs=0.03)
+    assert stuck([("one", read(tmp_path, rate, r=RATE))])[0].severity == "ok"
+
+
+def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
+    y = RATE.copy()
+    y[700:710], y[900] = -9999.0, 1e10
+    f = read(tmp_path, 50.0, p=y)
+    missing = np.where(np.abs(y) > 100, np.nan, y)
+    np.testing.assert_array_equal(f.outputs["p"], read(tmp_path, 50.0, p=missing).outputs["p"])
+    assert f.source is not None
+    assert "10 samples of -9999 and 1 of 1e+10" in " ".join(f.source.notes)
+    assert stuck([("one", f)])[0].severity == "doubt"
+    with pytest.raises(InputError, match=r"'u'.*2 samples of 65535"):
+        read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
+    # The same number among others of its size is a value.
+    near = read(tmp_path, p=1e4 + 10 * np.round(RATE)).outputs["p"]
+    assert np.isfinite(near).all()
+
+
+@pytest.mark.parametrize("rate", [None, 50.0])
+@pytest.mark.parametrize("low", [-180.0, 0.0])
+def test_a_wrapped_heading_is_unwrapped_before_anything_else(tmp_path, rate, low):
+    psi = 170 + 20 * T + 5 * np.sin(T)
+    f = read(tmp_path, rate, "deg", "rad", psi=(psi - low) % 360 + low)
+    smooth = read(tmp_path, rate, "deg", "rad", psi=psi)
+    np.testing.assert_allclose(f.outputs["psi"], smooth.outputs["psi"], atol=1e-9)
+    assert f.source is not None
+    assert "unwrapped" in " ".join(f.source.notes)
+    assert smooth.source is not None
+    assert "unwrapped" not in " ".join(smooth.source.notes)

@@ -1,0 +1,168 @@
+"""Tables as strangers write them: marks for nothing, rows of units, dates, encodings, counters."""
+
+import numpy as np
+import pytest
+import scipy.io
+
+from heli_jax.errors import InputError
+from heli_jax.flights import describe_log
+from heli_jax.flights.convert import Selection, convert_log
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.read import read_flight
+
+N, DT = 300, 0.01
+T = DT * np.arange(N)
+U, P = np.sin(7.0 * T), np.cos(5.0 * T)
+ROWS = [f"{t:.2f},{u:.6f},{p:.6f}" for t, u, p in zip(T, U, P, strict=True)]
+
+
+def written(tmp_path, lines, name="log.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(("\n".join(lines) + "\n").encode(encoding))
+    return path
+
+
+def read(path, time: str | Signal = "t", u="u", p="p"):
+    return read_flight(
+        path, time=time, inputs={"u": Signal(u, "1", "1")}, outputs={"p": Signal(p, "1", "1")}
+    )
+
+
+def notes(flight):
+    return " ".join(flight.source.notes)
+
+
+@pytest.mark.parametrize(
+    "mark", ["", "NaN", "nan", "NA", "N/A", "null", "None", "-", "#N/A", " - "]
+)
+def test_marks_for_nothing_are_missing_samples(tmp_path, mark):
+    rows = ROWS.copy()
+    rows[100] = f"1.00,{U[100]:.6f},{mark}"
+    path = written(tmp_path, ["t,u,p", *rows])
+    y = read(path).outputs["p"]
+    assert np.flatnonzero(np.isnan(y)).tolist() == [100]
+    np.testing.assert_allclose(np.delete(y, 100), np.delete(P, 100), atol=1e-6)
+    assert "p" in convert_log(path, Selection()).columns
+    rows[100] = f"1.00,{mark},0"
+    with pytest.raises(InputError, match="line 102, column 'u'"):
+        read(written(tmp_path, ["t,u,p", *rows]))
+
+
+def test_columns_that_are_left_out_are_named_with_their_text(tmp_path):
+    rows = [f"{r},{'auto' if i < 250 else 'manual'}" for i, r in enumerate(ROWS)]
+    rows[40] = rows[40].replace(f"{P[40]:.6f}", "ERR")
+    got = convert_log(written(tmp_path, ["t,u,p,mode", *rows]), Selection())
+    assert list(got.columns) == ["time", "u"]
+    said = " ".join(got.notes)
+    assert "left out: line 42, column 'p': got 'ERR'" in said
+    assert "column 'mode': got 'auto'" in said
+
+
+def test_a_row_of_units_is_no_sample(tmp_path):
+    path = written(tmp_path, ["t,u,p", "[ms],[-],[deg/s]", *(r for r in ROWS)])
+    f = read(path, Signal("t", "s", "s"))
+    assert f.n_samples == N
+    assert f.dt == pytest.approx(DT * 1e-3)
+    assert "line 2 was taken for units" in notes(f)
+    assert "the file says 'deg/s'" in notes(f)
+    assert [c.unit for c in describe_log(path).columns] == ["ms", "-", "deg/s"]
+    # A line further down, and between blanks.
+    rows = [r.replace(",", "  ") for r in ROWS]
+    f = read(written(tmp_path, ["t  u  p", "s  -  rad/s", *rows], "log.asc"))
+    np.testing.assert_allclose(f.outputs["p"], P, atol=1e-6)
+
+
+def test_numbers_where_names_should_stand_are_refused_with_the_remedy(tmp_path):
+    path = written(tmp_path, ROWS)
+    for use in (read, describe_log, lambda p: convert_log(p, Selection())):
+        with pytest.raises(InputError, match=r"line 1: got numbers.*'time,column2,column3'"):
+            use(path)
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+01:00"])
+def test_dates_and_times_of_day_are_clocks(tmp_path, zone):
+    stamps = np.datetime64("2024-02-29T23:59:58", "ms") + np.round(1e3 * T).astype("m8[ms]")
+    cells = [row.partition(",")[2] for row in ROWS]
+    rows = [f"{s}{zone},{c}" for s, c in zip(stamps.astype(str), cells, strict=True)]
+    path = written(tmp_path, ["t,u,p", *rows])
+    f = read(path)
+    assert (f.n_samples, f.dt) == (N, DT)
+    assert f.t0 == pytest.approx(86398.0)
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.unit, info.time.guessed) == ("s", False)
+    # Over midnight.
+    days = [f"{str(s)[11:]},{c}" for s, c in zip(stamps.astype(str), cells, strict=True)]
+    f = read(written(tmp_path, ["t,u,p", *days]))
+    assert f.dt == DT
+    days[7] = days[7].replace("23:59", "yesterday")
+    with pytest.raises(InputError, match="line 9, column 't': got 'yesterday"):
+        read(written(tmp_path, ["t,u,p", *days]))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16", "utf-16-be"])
+def test_other_encodings_are_read_and_named(tmp_path, encoding):
+    lines = ["t,Knüppel,Rate [°/s]", *ROWS]
+    lines[0] = "\ufeff" * (encoding == "utf-16-be") + lines[0]
+    path = written(tmp_path, lines, encoding=encoding)
+    f = read(path, u="Knüppel", p="Rate [°/s]")
+    np.testing.assert_allclose(f.outputs["p"], P, atol=1e-6)
+    assert ("Latin-1" if encoding == "latin-1" else "UTF-16") in notes(f)
+
+
+def test_a_counter_of_32_bits_goes_on_and_other_clocks_get_a_remedy(tmp_path):
+    ticks = (np.round(1e6 * T).astype(np.int64) + 2**32 - 1_000_000) % 2**32
+    cells = [row.partition(",")[2] for row in ROWS]
+
+    def log(stamps):
+        rows = [f"{s},{c}" for s, c in zip(stamps, cells, strict=True)]
+        return written(tmp_path, ["t,u,p", *rows])
+
+    f = read(log(ticks), Signal("t", "us", "s"))
+    assert f.dt == pytest.approx(DT)
+    assert "32 bits" in notes(f)
+    got = convert_log(log(ticks), Selection(time_unit="us"))
+    np.testing.assert_allclose(got.columns["time"], T, atol=1e-9)
+    twice, spike = T.copy(), T.copy()
+    twice[100], spike[100] = twice[99], 1e6
+    for stamps, remedy in (
+        (np.round(twice, 3), "leave line 102 out"),
+        (np.round(spike, 3), "line 102 is out of order"),
+        (np.round(T[::-1], 3), "sort the rows"),
+        (np.round(T % 1.5, 3), "the second from line 152 on"),
+        (np.round(T, 1), "too few digits"),
+    ):
+        with pytest.raises(InputError, match=remedy):
+            read(log(stamps))
+
+
+def test_a_header_between_rows_and_exponents_of_fortran(tmp_path):
+    rows = [*ROWS[:50], "t,u,p", *ROWS[50:]]
+    with pytest.raises(InputError, match=r"line 52: .*began anew"):
+        read(written(tmp_path, ["t,u,p", *rows]))
+    rows = [f"{t:.6E},{u:.6E},{p:.6E}".replace("E", "D") for t, u, p in zip(T, U, P, strict=True)]
+    f = read(written(tmp_path, ["t,u,p", *rows]))
+    np.testing.assert_allclose(f.outputs["p"], P, atol=1e-6)
+
+
+def test_complex_numbers_are_named(tmp_path):
+    path = tmp_path / "log.mat"
+    scipy.io.savemat(path, {"t": T, "u": U, "p": P + 2j * U})
+    f = read(path)
+    np.testing.assert_array_equal(f.outputs["p"], P)
+    assert "complex numbers, of which the real part is read: 'p'" in notes(f)
+
+
+def test_convert_spreads_neither_marks_nor_turns(tmp_path):
+    psi = (170 + 40 * np.arange(3000) * DT + 180) % 360 - 180
+    p = np.cos(5.0 * np.arange(3000) * DT)
+    p[500:505] = -9999.0
+    rows = [f"{DT * i:.2f},{a:.6f},{b:.6f}" for i, (a, b) in enumerate(zip(psi, p, strict=True))]
+    got = convert_log(written(tmp_path, ["t,psi,p", *rows]), Selection(rate=50.0))
+    # A straight line, but for the filter's ends.
+    middle = slice(50, -50)
+    line = 170 + 40 * got.columns["time"]
+    np.testing.assert_allclose(got.columns["psi"][middle], line[middle], atol=1e-3)
+    assert np.nanmax(np.abs(got.columns["p"])) < 1.1
+    assert "unwrapped" in " ".join(got.notes)
+    assert "5 samples of -9999" in " ".join(got.notes)
