@@ -98,9 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(sweep)
     cli_options.add_sweep_options(sweep)
     info = command("info", _info, "signals, rates, duration and gaps of a log")
-    _add_info_options(info)
+    cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
-    _add_convert_options(convert)
+    cli_options.add_convert_options(convert)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -116,45 +116,6 @@ def _add_config(command: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="replace a value of the configuration: fit.free.a.start=5 or flights.0.rate=50",
     )
-
-
-def _add_info_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
-    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
-    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
-    command.add_argument(
-        "--flight", type=cli_options.count, metavar="N", help="this one alone (from 1)"
-    )
-    command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
-    command.add_argument("--json", action="store_true", help="everything, for other programs")
-
-
-def _add_convert_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
-    command.add_argument("out", metavar="OUT", help=".csv, .parquet or .nc")
-    command.add_argument(
-        "--signals",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)",
-    )
-    command.add_argument("--preset", metavar="NAME", help="its signals, by its names and in SI")
-    command.add_argument(
-        "--config",
-        metavar="CONFIG",
-        help="the signals of its first flight, by the model's names and in SI; or its swashplate, "
-        "for --signals ccpm.roll",
-    )
-    command.add_argument("--rate", type=float, metavar="HZ", help="resample to this rate")
-    command.add_argument(
-        "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="[s] from the log's beginning"
-    )
-    command.add_argument(
-        "--flight", type=cli_options.count, metavar="N", help="of a log of several (from 1)"
-    )
-    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
-    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
 
 
 def _say(text: str) -> None:

@@ -47,6 +47,42 @@ def add_sweep_options(command: argparse.ArgumentParser) -> None:
     )
 
 
+def add_info_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax info`."""
+    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
+    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+    command.add_argument("--flight", type=count, metavar="N", help="this one alone (from 1)")
+    command.add_argument("--channels", metavar="PATTERN", help="list these: 'vehicle_attitude*'")
+    command.add_argument("--json", action="store_true", help="everything, for other programs")
+
+
+def add_convert_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("log", metavar="LOG", help="a table or an autopilot's log: docs/logs.md")
+    command.add_argument("out", metavar="OUT", help=".csv, .parquet or .nc")
+    command.add_argument(
+        "--signals",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="'vehicle_attitude.*', 'euler(vehicle_attitude.q).roll' (default all)",
+    )
+    command.add_argument("--preset", metavar="NAME", help="its signals, by its names and in SI")
+    command.add_argument(
+        "--config",
+        metavar="CONFIG",
+        help="the signals of its first flight, by the model's names and in SI; or its swashplate, "
+        "for --signals ccpm.roll",
+    )
+    command.add_argument("--rate", type=float, metavar="HZ", help="resample to this rate")
+    command.add_argument(
+        "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="[s] from the log's beginning"
+    )
+    command.add_argument("--flight", type=count, metavar="N", help="of a log of several (from 1)")
+    command.add_argument("--time", metavar="NAME", help="of a table: the column of time stamps")
+    command.add_argument("--time-unit", metavar="UNIT", help="of the stamps: s, ms, us or ns")
+
+
 def selection(options: argparse.Namespace) -> "Selection":
     """What `heli-jax convert` takes of a log.
 

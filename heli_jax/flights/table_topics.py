@@ -1,0 +1,120 @@
+"""A table of rows, or arrays of several lengths, as topics with clocks of their own."""
+
+import fnmatch
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from heli_jax.errors import InputError
+from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.describe import describe_table
+from heli_jax.flights.grid import without_overflow
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.table import Table, shown, wrong
+
+_MOST_NAMED = 6
+"""columns that notes name"""
+
+type Clockless = Mapping[str, int]
+"""arrays without a clock of their own length, with their numbers of samples"""
+
+
+def as_channels(
+    table: Table, time: str | None, unit: str | None, notes: list[str]
+) -> tuple[ChannelLog, Clockless]:
+    """A table as a log of one topic, its clock named or guessed; arrays of other lengths that have
+    a clock too are topics of their own."""
+    topic, start = _table_topic(table, time, unit, notes)
+    topics, clockless = [topic], {}
+    parts = {}
+    if isinstance(table, ArrayTable):
+        parts = {size: (names, table.only(names)) for size, names in table.lengths().items()}
+    for size, (names, part) in parts.items():
+        if size == topic.times.size:
+            continue
+        try:
+            another, first = _table_topic(part, None, None, said := [])
+        except InputError:
+            another, first, said = None, 0.0, []
+        if another is None or not another.columns:
+            clockless |= dict.fromkeys(names, size)
+            continue
+        # One machine's clocks have one zero.
+        times = another.times + (first - start)
+        topics.append(replace(another, name=f"arrays of {size} samples", times=times))
+        notes += said
+    return ChannelLog(table.path, table.format, table.size, table.sha256, tuple(topics)), clockless
+
+
+def require_clocks(
+    log: ChannelLog, clockless: Clockless, patterns: Sequence[str], notes: list[str]
+) -> None:
+    """Refuse, or where they were not asked for by name note, arrays without a clock."""
+    rows = log.topics[0].times.size
+    for pattern in patterns:
+        matches = matching(clockless, pattern)
+        if matches and not matching(log.names, pattern):
+            name = matches[0]
+            problem = f"has {clockless[name]} samples and the clock {shown(log.topics[0].clock)}"
+            problem += f" {rows}, expected an array of {clockless[name]} times beside it"
+            raise wrong(log.path, problem, f"array {shown(name)}")
+    asked = [n for p in patterns or ["*"] for n in matching(clockless, p)]
+    for size in dict.fromkeys(clockless[name] for name in asked):
+        names = [shown(n) for n in dict.fromkeys(asked) if clockless[n] == size]
+        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+        words = f"left out: {', '.join(names[:6])}{more}"
+        notes.append(f"{words}, of {size} samples, for which there is no clock")
+
+
+def matching(names: Iterable[str], pattern: str) -> list[str]:
+    # The brackets of gyroADC[0] are meant as they stand.
+    literal = pattern.replace("[", "[[]")
+    return [name for name in names if fnmatch.fnmatchcase(name, literal)]
+
+
+def _table_topic(
+    table: Table, time: str | None, unit: str | None, notes: list[str]
+) -> tuple[Topic, float]:
+    """The columns of a table's clock, which is named or guessed, and its first time [s]."""
+    info = describe_table(table, time, unit)
+    clock = info.time
+    if clock is None or clock.problem:
+        why = clock.problem if clock else "no column looks like a clock"
+        remedy = "expected --time NAME, a column of increasing times"
+        if clock:
+            remedy += ", or a file without the rows that go back"
+        elif texts := [c.name for c in info.columns if c.kind == "text"]:
+            why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
+        raise wrong(table.path, f"{why}, {remedy}")
+    if clock.guessed:
+        notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
+    rows = next(c.count for c in info.columns if c.name == clock.column)
+    # Arrays may have lengths of their own; rows of a table with empty cells are of one length.
+    whole = not isinstance(table, ArrayTable)
+    numeric = [c for c in info.columns if c.kind == "number"]
+    names = [c.name for c in numeric if whole or c.count == rows]
+    notes += table.notes
+    notes += _left_out(table, [c.name for c in info.columns if c.kind == "text"])
+    twice = next((n for n in names if names.count(n) > 1), None)
+    # The columns are keyed by name from here on, and one of the two would be lost without a word.
+    if twice is not None:
+        raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
+    numbers = dict(table.numbers(names))
+    stamps, more = without_overflow(numbers.pop(clock.column))
+    notes += more
+    # By the clock's own measure of its length, which knows its unit.
+    scale = clock.duration / float(stamps[-1] - stamps[0])
+    topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)
+    return topic, float(stamps[0]) * scale
+
+
+def _left_out(table: Table, names: Sequence[str]) -> list[str]:
+    """Notes on columns that hold text, with where and what it is."""
+    notes = []
+    for name in names[:_MOST_NAMED]:
+        try:
+            table.numbers([name])
+        except InputError as e:
+            notes.append(f"left out: {str(e).removeprefix(table.path).lstrip(',: ')}")
+    if len(names) > _MOST_NAMED:
+        notes.append(f"left out: {len(names) - _MOST_NAMED} more columns of text")
+    return notes
