@@ -104,8 +104,9 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
     if one.lag < 0:
         return begun + (
             f"{-one.lag:.2g} s before it moved: the response precedes {name} as it is logged. "
-            f"So {name} is logged late (free a delay: nuisance.time_shift, or delays of the model) "
-            "or follows the response (feedback); no servo or filter that is missing does that."
+            f"So {name} is logged late (free a delay, if none is: nuisance.time_shift, or delays "
+            "of the model) or follows the response (feedback); no servo or filter that is missing "
+            "does that."
         )
     return begun + f"{one.lag:.2g} s after it moved: {remedy}"
 
