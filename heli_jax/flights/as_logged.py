@@ -38,6 +38,8 @@ _MOST = 0.2
 """part of the samples that are marks, at most: what is there more often may be a value"""
 _JUMP = (0.75, 1.001)
 """of a turn: by how much a wrapped angle jumps from a sample to the next, at least and at most"""
+_STEP = 0.125
+"""of a turn: by how much else it moves from a sample to the next, at most"""
 _TURNS = (360.0, 2 * np.pi, 36000.0)
 """degrees, radians, hundredths of a degree"""
 _NEARLY = 0.9
@@ -178,7 +180,9 @@ def is_wrapped(values: np.ndarray, turn: float) -> bool:
     if y.size < FEWEST or not np.ptp(y) <= _TURN * turn:
         return False
     jumps = np.abs(np.diff(y)) / turn
-    return bool(np.any((jumps >= _JUMP[0]) & (jumps <= _JUMP[1])))
+    wraps = (jumps >= _JUMP[0]) & (jumps <= _JUMP[1])
+    # Beside them it moves by little from sample to sample, or it is a switch or a sawtooth.
+    return bool(wraps.any() and np.max(jumps[~wraps], initial=0.0) <= _STEP)
 
 
 def unwrapped(values: np.ndarray, turn: float) -> tuple[np.ndarray, str]:
@@ -194,7 +198,8 @@ def unwrapped(values: np.ndarray, turn: float) -> tuple[np.ndarray, str]:
     made = np.array(values)
     made[seen] = after
     n = int(np.count_nonzero(np.abs(np.diff(after) - np.diff(before)) > 0.5 * turn))
-    words = f"jumps by a turn {n} times, at the ends of its range: taken as going on (unwrapped)"
+    often = "once" if n == 1 else f"{n} times"
+    words = f"jumps by a turn {often}, at the ends of its range: taken as going on (unwrapped)"
     unsure = int(np.count_nonzero(np.abs(np.diff(after)) > (1 - _JUMP[0]) * turn))
     if unsure:
         words += f"; {unsure} steps of more than a quarter of a turn remain, and may be wrong"

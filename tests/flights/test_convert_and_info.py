@@ -281,7 +281,6 @@ def test_an_autopilots_log_under_the_name_of_a_table(tmp_path):
         ("# t,u\n0,1\n1,2\n", ("t", "u")),
         ("% t[s] lat\n0 1e-3\n1 2\n", ("t[s]", "lat")),
         ("%u,t\n0,1\n1,2\n", ("%u", "t")),
-        ("# of today\n0,1\n1,2\n", ("0", "1")),
     ],
 )
 def test_comments_above_the_header(tmp_path, text, names):

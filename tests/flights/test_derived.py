@@ -185,8 +185,9 @@ def test_an_angle_that_jumps_is_told_with_its_remedy(tmp_path):
     asked = {"time": "t", "inputs": {"u": Signal("u", "1", "1")}}
     jumping = read_flight(path, **asked, outputs={"yaw": Signal("heading", "deg", "rad")})
     (note,) = jumping.source.notes
-    assert note.startswith("'heading' jumps by a turn once")
-    assert note.endswith("name the channel unwrap(heading, 360) instead")
+    assert note.startswith("'heading' jumps by a turn")
+    assert note.endswith("taken as going on (unwrapped)")
+    np.testing.assert_allclose(np.rad2deg(jumping.outputs["yaw"]), 350 + np.arange(60))
     whole = Signal("unwrap(heading, 360)", "deg", "rad")
     flight = read_flight(path, **asked, outputs={"yaw": whole})
     assert flight.source.notes == ()

@@ -247,6 +247,10 @@ def _run(
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
     constants = constants_of(layout, z0, scaling(r0, J0, trusted))
+    if held is not None:
+        # Initial states alone, from far off: steps that are shortened end in the next valley (a
+        # pendulum near the top of its swing).
+        constants = constants._replace(with_radius=jnp.asarray(False))
     return _descend(evaluate, constants, first, count, max_steps, SINGLE)
 
 

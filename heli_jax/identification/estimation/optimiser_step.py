@@ -42,6 +42,8 @@ class Constants(NamedTuple):
     """the unknowns whose steps say whether the optimiser has arrived"""
     reach: Float[Array, " q"]
     """how far one step may go, by unknown"""
+    with_radius: Bool[Array, ""]
+    """whether a refused step shortens the next ones, beside what damping does"""
 
 
 class _Rows(NamedTuple):
@@ -116,7 +118,7 @@ def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State
     """One step of optimistix's solver, whose next point is `state.solver.y_eval`."""
     rows, solver = _rows(constants, R, state.solver.y_eval), _solver(constants)
     xi, new, _ = solver.step(_linear, state.xi, rows, _OPTIONS, state.solver, frozenset())
-    new = within_radius(new, xi)
+    new = within_radius(new, xi, constants.with_radius)
     new = within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
     done |= arrived(new.f_info, constants.scaling.residual_norm)
@@ -166,4 +168,5 @@ def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
         at < len(layout.of_interest) + len(layout.disturbance)
     )
     reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
-    return Constants(z0, units, tikhonov, jnp.asarray(mask), jnp.asarray(reach, z0.dtype))
+    reach = jnp.asarray(reach, z0.dtype)
+    return Constants(z0, units, tikhonov, jnp.asarray(mask), reach, jnp.asarray(True))

@@ -66,7 +66,7 @@ def changes_sign(free: Free) -> bool:
     """Whether a parameter is free to change its sign, rather than asked to stay between bounds."""
     low, high = limits(free)
     bounded = math.isfinite(low) and math.isfinite(high)
-    return free.sign == "any" and low < 0 < high and not bounded
+    return bool(free.sign == "any" and low < 0 < high and not bounded)
 
 
 def scale(free: Free) -> float:

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 from jaxtyping import Bool, Complex, Float
 
-from heli_jax.analysis.spectra import partial_coherence, segment_transforms
+from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.hardly_moving import hardly_moving
@@ -144,13 +145,38 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
         followed = True
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
         findings.append(Finding("excited band", "ok", words, best.peak, criterion))
-    if not followed:
+    if not followed and not _follow_together(pooled):
         words = (
             "no output follows any input coherently over a band of frequencies: noise, "
             "disturbances or something else moves the machine more than the sticks do."
         )
         findings.append(Finding("excited band", "doubt", words, None, criterion))
     return findings
+
+
+def _follow_together(pooled: _Pooled) -> bool:
+    """Whether an output follows all inputs taken together over a band, though none alone: where
+    several move all the time, each has the others' power against it."""
+    k, segments, m = pooled.inputs.shape
+    outputs = pooled.outputs.shape[2]
+    free = max(0.9 * segments - m, 1.0)
+    # Of m inputs that explain nothing the multiple coherence is distributed as Beta(m, n - m).
+    chance = float(scipy.special.betaincinv(m, free, 1.0 - _CHANCE / (k * outputs)))
+    step = pooled.hz[1] - pooled.hz[0]
+    for i in range(outputs):
+        y = pooled.outputs[:, :, i]
+        left = np.sum(np.abs(without(pooled.inputs, y)) ** 2, axis=1)
+        multiple = 1.0 - left / np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
+        run = _longest(pooled.hz, multiple >= max(COHERENT, chance))
+        if run is not None and _is_band(run, step):
+            return True
+    return False
+
+
+def _is_band(run: tuple[float, float], step: float) -> bool:
+    # Each frequency stands for the step about it.
+    wide = np.log2((run[1] + step / 2) / (run[0] - step / 2)) >= _WIDTH
+    return bool(wide and run[1] - run[0] >= (_BINS - 1.5) * step)
 
 
 class _Band(NamedTuple):
@@ -173,9 +199,7 @@ def _best_band(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) ->
         c = np.nan_to_num(partial_coherence(others, u, pooled.outputs[:, :, i]))
         good = (c >= limit) & (power >= _LEAST_POWER * power.max())
         run = _longest(pooled.hz, good)
-        # Each frequency stands for the step about it.
-        wide = run is not None and np.log2((run[1] + step / 2) / (run[0] - step / 2)) >= _WIDTH
-        if run is None or not wide or run[1] - run[0] < (_BINS - 1.5) * step:
+        if run is None or not _is_band(run, step):
             continue
         if best is None or run[1] / run[0] > best.high / best.low:
             best = _Band(output, *run, float(np.max(c[good])))
