@@ -23,6 +23,8 @@ from heli_jax.identification.validation.operating_point import operating_point
 
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
+_SETTLED = 1.0
+"""the first for a mode that does not swing: in 2 pi of its time constants it is over"""
 _PART = 0.1
 """of an output's own motion, from which on a mode matters whatever the noise is guessed to be: a
 guess from slow samples takes the motion between them for noise"""
@@ -67,7 +69,10 @@ def logging_rate(
         modes, hidden = _modes_that_show(problem, params, flight, _shown_from(flight, noise))
         if hidden:
             findings.append(_not_judged(label, hidden))
-        found = [*_of_inputs(label, flight, modes, where), *_of_outputs(label, flight, modes)]
+        found = [
+            *_of_inputs(label, flight, modes, where),
+            *_of_outputs(label, flight, modes, where),
+        ]
         findings += [f for f in found if f.severity != "ok"]
         every += found
     return findings if findings or not every else [min(every, key=_value)]
@@ -146,30 +151,31 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
     return findings
 
 
-def _of_outputs(label: str, flight: Flight, modes: list[_Mode]) -> list[Finding]:
+def _of_outputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> list[Finding]:
     if not modes:
         return []
     # The fastest alone: what is too slow for it is said once.
     mode = max(modes, key=lambda m: m.hz)
     rate = max(output_rate(flight, y) for y in flight.outputs)
     # A decay has no alias, but between two samples all of it may be over.
-    moves = "swings" if abs(mode.eigenvalue.imag) > 0 else "settles"
+    swings = abs(mode.eigenvalue.imag) > 0
+    moves = "swings" if swings else "settles"
     begun = (
         f"{label}: outputs are logged at {rate:.3g} Hz, and {mode.output} {moves} at {mode.hz:.3g} "
-        f"Hz (a mode at the start values)"
+        f"Hz (a mode at the {where})"
     )
-    return [_judged(begun, rate / mode.hz, mode.hz)]
+    return [_judged(begun, rate / mode.hz, mode.hz, HOPELESS if swings else _SETTLED)]
 
 
-def _judged(begun: str, ratio: float, hz: float) -> Finding:
-    criterion = f"samples in a period of the fastest mode that shows, {ENOUGH:g} ({HOPELESS:g})"
+def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> Finding:
+    criterion = f"samples in a period of the fastest mode that shows, {ENOUGH:g} ({hopeless:g})"
     severity: Severity = "ok"
     ending = f": {ratio:.2g} samples in a period are enough."
-    if ratio < HOPELESS:
+    if ratio < hopeless:
         severity = "refuse"
         ending = (
             f": {ratio:.2g} samples in a period cannot show it, so this log cannot be fitted with "
-            f"this model; log at {HOPELESS * hz:.3g} Hz at least, better {ENOUGH * hz:.3g} Hz."
+            f"this model; log at {hopeless * hz:.3g} Hz at least, better {ENOUGH * hz:.3g} Hz."
         )
     elif ratio < ENOUGH:
         severity = "doubt"
