@@ -12,6 +12,7 @@ import numpy as np
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.flights.write import write_table
+from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
@@ -220,11 +221,8 @@ def useful_band(omega: np.ndarray, pair: Pair) -> tuple[str, str, str]:
     if not seen.any():
         return "not determined", "–", "–"
     mean = f"{np.mean(pair.coherence[seen]):.2f}"
-    good = np.concatenate([[False], np.where(seen, pair.coherence, 0.0) > COHERENT, [False]])
-    edges = np.flatnonzero(np.diff(good.astype(int)))
-    bands = list(zip(edges[::2], edges[1::2] - 1, strict=True))
-    if not bands:
+    band = longest_band(omega, np.where(seen, pair.coherence, 0.0) > COHERENT)
+    if band is None:
         return mean, "–", "–"
-    first, last = max(bands, key=lambda b: omega[b[1]] / omega[b[0]])
-    low, high = (number(float(omega[k]) / (2.0 * np.pi), 3) for k in (first, last))
+    low, high = (number(float(w) / (2.0 * np.pi), 3) for w in band)
     return mean, low, high

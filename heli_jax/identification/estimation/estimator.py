@@ -174,15 +174,30 @@ class Estimator(abc.ABC):
             noise: that the rows were divided by.
             e: the evaluation that holds the rows.
         """
+        errors = self.rows_by_signal(layout, data, noise, e)
+        # The row of a missing sample is zero, which is no error of that size.
+        return [
+            error[np.isfinite(np.asarray(data.flights[i].outputs[name]))]
+            for (i, name), error in zip(signals(layout), errors, strict=True)
+        ]
+
+    def rows_by_signal(
+        self, layout: Layout, data: Data, noise: Noise, e: Evaluation
+    ) -> list[np.ndarray]:
+        """By signal all of its rows times its sd, SI.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that the rows were divided by.
+            e: the evaluation that holds the rows.
+        """
         numbers, rows = self.row_signals(layout, data), np.asarray(e.r)
-        errors = []
-        for k, (i, name) in enumerate(signals(layout)):
-            # The row of a missing sample is zero, which is no error of that size.
-            seen = np.isfinite(np.asarray(data.flights[i].outputs[name]))
-            # The first rows alone: defects and priors follow.
-            of_signal = rows[: numbers.size][numbers == k]
-            errors.append(of_signal[seen] * np.asarray(noise.sd[i][name]))
-        return errors
+        # The first rows alone: defects and priors follow.
+        return [
+            rows[: numbers.size][numbers == k] * np.asarray(noise.sd[i][name])
+            for k, (i, name) in enumerate(signals(layout))
+        ]
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Gaussian, in SI units of the outputs, at the noise of the greatest likelihood where that

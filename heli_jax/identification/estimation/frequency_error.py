@@ -26,9 +26,9 @@ from jaxtyping import Array, Complex, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals, signals
+from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
-from heli_jax.identification.estimation.simulated_flights import driven, predict
+from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -186,11 +186,7 @@ class FrequencyError(Estimator):
             noise: that the rows were divided by.
             e: the evaluation that holds the rows.
         """
-        numbers, rows = self.row_signals(layout, data), np.asarray(e.r)
-        return [
-            rows[: numbers.size][numbers == k] * np.asarray(noise.sd[i][n])
-            for k, (i, n) in enumerate(signals(layout))
-        ]
+        return self.rows_by_signal(layout, data, noise, e)
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
         """Of the whitened rows, the spectrum taken as it was estimated.
@@ -215,11 +211,7 @@ class FrequencyError(Estimator):
             runs: how many records; one simulation serves them all.
             seed: of nothing here, since nothing is drawn.
         """
-        layout = reached.layout
-        return [
-            dict(zip(names, run.outputs, strict=True))
-            for names, run in zip(layout.outputs, predict(layout, reached.data, u), strict=True)
-        ]
+        return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
 def _diagonal(S: np.ndarray) -> np.ndarray:

@@ -167,7 +167,7 @@ def _follow_together(pooled: _Pooled) -> bool:
         y = pooled.outputs[:, :, i]
         left = np.sum(np.abs(without(pooled.inputs, y)) ** 2, axis=1)
         multiple = 1.0 - left / np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
-        run = _longest(pooled.hz, multiple >= max(COHERENT, chance))
+        run = longest_band(pooled.hz, multiple >= max(COHERENT, chance))
         if run is not None and _is_band(run, step):
             return True
     return False
@@ -198,7 +198,7 @@ def _best_band(pooled: _Pooled, j: int, outputs: Sequence[str], limit: float) ->
     for i, output in enumerate(outputs):
         c = np.nan_to_num(partial_coherence(others, u, pooled.outputs[:, :, i]))
         good = (c >= limit) & (power >= _LEAST_POWER * power.max())
-        run = _longest(pooled.hz, good)
+        run = longest_band(pooled.hz, good)
         if run is None or not _is_band(run, step):
             continue
         if best is None or run[1] / run[0] > best.high / best.low:
@@ -212,8 +212,13 @@ def _power_band(hz: np.ndarray, power: np.ndarray) -> tuple[float, float]:
     return float(hz[min(first, hz.size - 1)]), float(hz[min(last, hz.size - 1)])
 
 
-def _longest(hz: np.ndarray, good: Bool[np.ndarray, " k"]) -> tuple[float, float] | None:
-    """The widest band (in octaves) without a hole; None where nothing is good."""
+def longest_band(hz: np.ndarray, good: Bool[np.ndarray, " k"]) -> tuple[float, float] | None:
+    """The widest band (in octaves) without a hole; None where nothing is good.
+
+    Args:
+        hz: (k,) rising, any unit.
+        good: (k,)
+    """
     edges = np.diff(np.concatenate([[0], good.astype(int), [0]]))
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     if not begins.size:
@@ -235,7 +240,7 @@ def _moving_together(pooled: _Pooled, moving: list[str]) -> list[Finding]:
         weights = np.min([p / p.sum() for p in powers], axis=0)
         mean = float(np.average(c, weights=weights))
         excited = weights >= _LEAST_POWER * weights.max()
-        band = _longest(pooled.hz, (c >= limit) & excited)
+        band = longest_band(pooled.hz, (c >= limit) & excited)
         pairs.append((mean, moving[a], moving[b], band))
     return _pair_findings(pairs, limit)
 

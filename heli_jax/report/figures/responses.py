@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from heli_jax.analysis.transfer_fit import Z95
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import Panels, panels
+from heli_jax.report.frequency import phase
 from heli_jax.report.style import legend_above, subtitle
 
-_Z95 = 1.959963984540054
 _COLOURS = (style.VERMILLION, style.GREEN, style.PURPLE)
 _WIDE = 1.0
 """relative random error past which a bin says nothing, and is not drawn"""
@@ -64,7 +65,7 @@ def draw_response(
 
 def _draw_measured(axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray) -> None:
     f, H = hz[known], pair.H[known]
-    relative = _Z95 * pair.sd[known] / np.abs(H)
+    relative = Z95 * pair.sd[known] / np.abs(H)
     bars: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
@@ -74,7 +75,7 @@ def _draw_measured(axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray) -
         f, gain, yerr=[down, up], color=style.BLUE, label="one window, 95 % intervals", **bars
     )
     axes[1].errorbar(
-        f, _phase(H), yerr=np.degrees(np.minimum(relative, np.pi)), color=style.BLUE, **bars
+        f, phase(H), yerr=np.degrees(np.minimum(relative, np.pi)), color=style.BLUE, **bars
     )
     if f.size:
         low, high = np.min(gain), np.max(gain)
@@ -86,11 +87,4 @@ def _curve(
 ) -> None:
     good = known & np.isfinite(H) & (np.abs(H) > 0)
     axes[0].plot(hz[good], 20.0 * np.log10(np.abs(H[good])), **line_style)
-    axes[1].plot(hz[good], _phase(H[good]), **line_style)
-
-
-def _phase(H: np.ndarray) -> np.ndarray:
-    """Unwrapped [deg], begun between -270 and 90."""
-    from heli_jax.report.frequency import phase
-
-    return phase(H)
+    axes[1].plot(hz[good], phase(H[good]), **line_style)
