@@ -101,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    listing = command("keys", _keys, "what may stand in a configuration")
+    cli_options.add_keys_options(listing)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -351,6 +353,21 @@ def _convert(options: argparse.Namespace) -> int:
         _say(f"{options.log}: {note}")
     columns = converted.columns
     _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
+    return DONE
+
+
+def _keys(options: argparse.Namespace) -> int:
+    from heli_jax import reference
+
+    if options.schema is not None:
+        place = Path(options.schema)
+        run_directory.require_place(place, f"--schema {place}")
+        reference.write_schema(place)
+        _say(f"wrote {place}")
+    elif options.json:
+        print(reference.as_json(options.pattern))
+    else:
+        reference.print_keys(options.pattern)
     return DONE
 
 

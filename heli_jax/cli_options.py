@@ -119,6 +119,17 @@ def add_frf_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 
 
+def add_keys_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax keys`."""
+    command.add_argument(
+        "pattern", nargs="?", metavar="TEXT", help="of keys or their meaning (default: all keys)"
+    )
+    command.add_argument("--json", action="store_true", help="for other programs")
+    command.add_argument(
+        "--schema", metavar="FILE", help="write the JSON schema, by which editors complete YAML"
+    )
+
+
 def count(text: str) -> int:
     """An option's value that is a number from 1."""
     if not text.isdigit() or int(text) < 1:
