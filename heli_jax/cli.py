@@ -101,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    new = command("new", _new, "a configuration that begins with what a log holds")
+    cli_options.add_new_options(new)
     listing = command("keys", _keys, "what may stand in a configuration")
     cli_options.add_keys_options(listing)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
@@ -353,6 +355,17 @@ def _convert(options: argparse.Namespace) -> int:
         _say(f"{options.log}: {note}")
     columns = converted.columns
     _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
+    return DONE
+
+
+def _new(options: argparse.Namespace) -> int:
+    from heli_jax.new_config import write_config
+
+    log = Path(options.log)
+    out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
+    written = write_config(log, out, options.model, options.vehicle, options.flight)
+    for note in written.notes:
+        _say(note)
     return DONE
 
 
