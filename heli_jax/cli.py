@@ -243,7 +243,7 @@ def _simulate(options: argparse.Namespace) -> int:
             run_directory.require_place(place, f"{option} {place}")
     _prepare_jax()
     from heli_jax import config as configuration
-    from heli_jax import generate, output
+    from heli_jax import generate, simulation_output
 
     experiment = configuration.load(options.config, options.set)
     if experiment.config.simulate is not None:
@@ -252,11 +252,11 @@ def _simulate(options: argparse.Namespace) -> int:
         simulated = generate.follow(experiment)
     for note in simulated.notes:
         _say(f"{options.config}: {note}")
-    output.write_table(out, simulated.columns)
+    simulation_output.write_table(out, simulated.columns)
     if out is not None:
         _say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
-        output.write_view(view, experiment, simulated)
+        simulation_output.write_view(view, experiment, simulated)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         _say(f"wrote {view}{whole}")
     return DONE
@@ -278,7 +278,7 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import output, workflow
+    from heli_jax import simulation_output, workflow
 
     experiment = workflow.load_config(config, options.set)
 
@@ -289,7 +289,7 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.words = interrupted
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with output.sweep_progress() as progress, _client(options, config) as client:
+    with simulation_output.sweep_progress() as progress, _client(options, config) as client:
         workflow.run_sweep(
             experiment,
             out,
@@ -302,7 +302,7 @@ def _sweep(options: argparse.Namespace) -> int:
             progress=progress,
             say=_say,
         )
-    output.print_sweep(out)
+    simulation_output.print_sweep(out)
     return DONE
 
 

@@ -12,7 +12,7 @@ from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, Vibr
 from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
 from heli_jax.config.simulate_section import SimulateConfig, StartConfig
 from heli_jax.errors import nearest
-from heli_jax.identification.equation_error.stepwise import F_ENTER
+from heli_jax.identification.equation_error.limits import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
