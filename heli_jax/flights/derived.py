@@ -6,7 +6,7 @@ written here.
 
 import dataclasses
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,9 @@ import numpy as np
 from heli_jax.errors import nearest
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.marks import at_marks, counted, mark_words, without_marks
 from heli_jax.flights.resample import longest_gap
+from heli_jax.flights.signal_facts import Counts
 from heli_jax.flights.table import Survey, Table, shown, wrong
 
 EULER = ("roll", "pitch", "yaw")
@@ -214,7 +216,16 @@ class DerivedLog(ChannelLog):
                 problem = f"{shown(names[0])} and {shown(name)} are of different topics, expected"
                 raise wrong(self.path, f"{problem} channels of one", place)
         values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
-        return topics[0], np.stack(values)
+        # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
+        return topics[0], np.stack([without_marks(x) for x in values])
+
+    def source_marks(self, name: str) -> dict[str, Counts]:
+        """The marks in the channels that a derived one is computed from, by channel."""
+        return _marks({n: self.channel(n).values for n in self._sources(name)})
+
+    def _sources(self, name: str) -> list[str]:
+        known = frozenset(self.names)
+        return [] if name in known else sources(name, known, self.swashplate)
 
 
 def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -240,6 +251,7 @@ class DerivedTable:
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
         self.notes, self.units = table.notes, table.units
+        self._marks: dict[str, dict[str, Counts]] = {}
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -252,9 +264,15 @@ class DerivedTable:
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
         for name, d in derived.items():
-            groups = [np.stack([columns[n] for n in group]) for group in d.groups]
-            columns[name] = d.compute(*groups)
+            self._marks[name] = _marks({n: columns[n] for group in d.groups for n in group})
+            clean = [[without_marks(columns[n]) for n in group] for group in d.groups]
+            columns[name] = d.compute(*(np.stack(group) for group in clean))
         return {name: columns[name] for name in names}
+
+    def source_marks(self, name: str) -> dict[str, Counts]:
+        """The marks in the columns that a derived one was computed from, by column; none of one
+        that was not asked for yet."""
+        return self._marks.get(name, {})
 
     def _derivation(self, name: str) -> Derivation | None:
         try:
@@ -279,6 +297,28 @@ class DerivedTable:
     def time_unit(self, name: str) -> str | None:
         """The unit of a column of time stamps."""
         return self.table.time_unit(name) if name in self.names else None
+
+
+def _marks(columns: Mapping[str, np.ndarray]) -> dict[str, Counts]:
+    """By channel the marks in samples (N,), of those that have some."""
+    return {n: counted(x, at) for n, x in columns.items() if (at := at_marks(x)).any()}
+
+
+def marks_of_sources(log: Table | ChannelLog, name: str) -> dict[str, Counts]:
+    """The marks in the channels that a derived one is computed from, by channel.
+
+    Args:
+        log: where it is none of `with_derived`, nothing is derived.
+        name: of any channel; of a table's derived one after it was read.
+    """
+    return log.source_marks(name) if isinstance(log, DerivedTable | DerivedLog) else {}
+
+
+def why_missing(log: Table | ChannelLog, name: str) -> str:
+    """Why a derived input has missing samples, where its sources have marks: for a message."""
+    for source, counts in marks_of_sources(log, name).items():
+        return f"; {shown(source)} has {mark_words(counts)}; give a window without them"
+    return ""
 
 
 def with_derived(

@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
+from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -39,6 +40,7 @@ from heli_jax.flights.onto_grid import (
 from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
+from heli_jax.flights.signal_facts import Counts
 from heli_jax.flights.slower import Timed
 from heli_jax.flights.table import Table, column, shown, wrong
 
@@ -101,7 +103,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
-    logged = as_logged(request, {key: Timed(stamps.seconds, x) for key, x in signals.items()})
+    timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
+    logged = as_logged(request, timed, _of_sources(table, request))
     signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
@@ -114,6 +117,10 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
+
+
+def _of_sources(table: Table, request: Request) -> dict[Key, dict[str, Counts]]:
+    return {key: marks_of_sources(table, s.name) for key, s in request.signals.items()}
 
 
 def _other_units(table: Table, request: Request) -> list[str]:
@@ -149,7 +156,8 @@ def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSig
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     _check_step(stamps)
     topic = TopicClock(Path(table.path).name, stamps.seconds, rows)
-    return {key: ClockedSignal(topic, x) for key, x in signals.items()}
+    marks = _of_sources(table, request)
+    return {key: ClockedSignal(topic, x, marks[key]) for key, x in signals.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +271,7 @@ def _to_si(
         if bad.size:
             row = rows.start + int(bad[0])
             problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"
+            problem += why_missing(table, signal.name)
             raise wrong(table.path, problem, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples

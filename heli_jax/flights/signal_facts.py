@@ -61,6 +61,25 @@ class Stuck:
     value: float
 
 
+Counts = tuple[tuple[float, int], ...]
+"""values, as the log has them, and how many of each there are"""
+
+
+@dataclass(frozen=True, eq=False)
+class Strays:
+    """Samples that may stand for no value and are kept, since nobody knows: their times (K,) [s],
+    their values (K,), as the log has them, and `why` they are odd."""
+
+    times: np.ndarray
+    values: np.ndarray
+    why: str
+
+    def within(self, begin: float, end: float) -> "Strays":
+        """Those from `begin` to `end` [s], with times from `begin`."""
+        at = (self.times >= begin) & (self.times <= end)
+        return Strays(self.times[at] - begin, self.values[at], self.why)
+
+
 @dataclass(frozen=True, eq=False)
 class SignalFacts:
     """Of one signal as it was logged, in SI; times count from the flight's first sample.
@@ -76,6 +95,7 @@ class SignalFacts:
         stuck: the longest time at one value, of an output while other signals change.
         marks: values that stand for none, such as -9999, as the log has them, and how many there
             were; they are missing in the flight.
+        strays: samples that may stand for none, and are kept.
     """
 
     size: int
@@ -86,7 +106,8 @@ class SignalFacts:
     moves: float
     usual: float
     stuck: Stuck | None = None
-    marks: tuple[tuple[float, int], ...] = ()
+    marks: Counts = ()
+    strays: tuple[Strays, ...] = ()
 
     @property
     def shares(self) -> tuple[float, float]:
@@ -108,7 +129,9 @@ class SignalFacts:
             longer = inside[1] - inside[0] >= STUCK_SECONDS
             stuck = Stuck(*inside, stuck.value) if longer else None
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
-        return replace(self, size=size, low=cut(self.low), high=cut(self.high), stuck=stuck)
+        left = [inside for s in self.strays if (inside := s.within(begin, end)).times.size]
+        low, high, strays = cut(self.low), cut(self.high), tuple(left)
+        return replace(self, size=size, low=low, high=high, stuck=stuck, strays=strays)
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:

@@ -189,7 +189,7 @@ def _shifted(signal: ClockedSignal, lag: float, name: str) -> ClockedSignal:
     # Two files may well have topics of the same name.
     topic = signal.clock.topic if signal.clock.topic == name else f"{name}, {signal.clock.topic}"
     clock = TopicClock(topic, signal.clock.seconds + lag, signal.clock.rows)
-    return ClockedSignal(clock, signal.values)
+    return dataclasses.replace(signal, clock=clock)
 
 
 def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
@@ -202,4 +202,5 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     if seconds.size < FEWEST:
         problem = f"holds {seconds.size} samples from {window[0]:g} s to {window[1]:g} s"
         raise wrong(request.path, f"{problem}, expected at least {FEWEST}", signal.clock.topic)
-    return ClockedSignal(TopicClock(signal.clock.topic, seconds, rows), signal.values[rows])
+    clock = TopicClock(signal.clock.topic, seconds, rows)
+    return dataclasses.replace(signal, clock=clock, values=signal.values[rows])
