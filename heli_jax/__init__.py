@@ -88,7 +88,14 @@ _HOMES = {
 }
 
 
+__all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
 def __getattr__(name: str) -> Any:  # any of them
+    if name == "__version__":
+        from heli_jax.versions import version
+
+        return version()
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax' has no attribute {name!r}")
     # A module itself: `heli_jax.models` has no attribute `models` to ask for.
@@ -99,4 +106,4 @@ def __getattr__(name: str) -> Any:  # any of them
 
 def __dir__() -> list[str]:
     # For completion in a session: without it only the names used so far would be offered.
-    return sorted(_HOMES)
+    return sorted([*_HOMES, "__version__"])
