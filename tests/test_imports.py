@@ -118,8 +118,8 @@ def test_imports_point_one_way(name):
 # Within identification, from what a problem is to its result: each room imports those before it.
 ROOMS = (
     "methods", "free", "arguments", "push_scale", "problem", "unknowns", "estimation",
-    "identifiability", "validation", "equation_error", "result", "uncertainty", "agreement", "assemble", "fit",
-    "model_selection", "disturbed_sets",
+    "identifiability", "validation", "equation_error", "result", "uncertainty", "agreement",
+    "assemble", "fit", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 
