@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from heli_jax.identification.uncertainty.comparison import intervals as intervals
     from heli_jax.linear_models.read import LinearModel as LinearModel
     from heli_jax.linear_models.read import linear_model as linear_model
+    from heli_jax.report.compared_runs import compare_runs as compare_runs
     from heli_jax.report.saved_fit import SavedFit as SavedFit
     from heli_jax.report.saved_fit import load_fit as load_fit
     from heli_jax.simulation.accumulate import accumulate as accumulate
@@ -78,6 +79,7 @@ _HOMES = {
     "intervals": "identification.uncertainty.comparison",
     "SavedFit": "report.saved_fit",
     "load_fit": "report.saved_fit",
+    "compare_runs": "report.compared_runs",
     "FitRun": "workflow",
     "compare_models": "workflow",
     "load_config": "workflow",

@@ -9,7 +9,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import cli_options, file_commands, interrupts, reading_progress, run_directory
+from heli_jax import (
+    cli_options,
+    file_commands,
+    interrupts,
+    reading_progress,
+    run_commands,
+    run_directory,
+)
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -111,6 +118,10 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    listing = command("runs", run_commands.runs, "the fits that a folder holds")
+    cli_options.add_runs_options(listing)
+    compare = command("compare", _compare, "fits side by side: estimates, verdicts, agreement")
+    cli_options.add_compare_options(compare)
     new = command("new", _new, "a configuration that begins with what a log holds")
     cli_options.add_new_options(new)
     listing = command("keys", _keys, "what may stand in a configuration")
@@ -366,6 +377,10 @@ def _convert(options: argparse.Namespace) -> int:
     columns = converted.columns
     _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
     return DONE
+
+
+def _compare(options: argparse.Namespace) -> int:
+    return run_commands.compare(options, _say)
 
 
 def _new(options: argparse.Namespace) -> int:

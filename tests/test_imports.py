@@ -53,7 +53,7 @@ ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
     "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
-    "file_commands",
+    "file_commands", "run_commands",
     "__init__",
     "__main__",
 }  # fmt: skip
@@ -176,7 +176,15 @@ def test_nothing_imports_the_command_line(name):
         ("zarr", {"sweeps/store.py"}),
         ("filelock", {"sweeps/store.py"}),
         ("distributed", {"sweeps/cluster.py"}),
-        ("pandas", {"exports.py", "identification/result.py", "report/saved_fit.py"}),
+        (
+            "pandas",
+            {
+                "exports.py",
+                "identification/result.py",
+                "report/saved_fit.py",
+                "report/compared_runs.py",
+            },
+        ),
         ("arviz", {"exports.py"}),
         (
             "xarray",
