@@ -13,6 +13,8 @@ from heli_jax.identification.free import Free
 
 _HEADINGS = {"psi", "yaw"}
 """angles that may go on for more than a turn"""
+_FURTHEST = 6 * math.pi
+"""rad: linear models of an axis roll over in long records, with no pilot to hold them"""
 
 
 def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
@@ -74,8 +76,8 @@ def warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
             largest = float(np.nanmax(np.abs(np.asarray(values)), initial=0.0))
             if largest > 2 * math.pi:
                 warnings.warn(
-                    f"{flight.name or 'a flight'}: {name} reaches {largest:.4g} rad, more than a "
-                    "turn; angles are in radians here: np.radians(degrees)",
+                    f"{flight.name or 'a flight'}: {name} reaches {largest:.4g} rad, more than "
+                    "three turns; angles are in radians here: np.radians(degrees)",
                     UserWarning,
                     stacklevel=4,
                 )
