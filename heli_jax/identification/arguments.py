@@ -74,7 +74,7 @@ def warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
             if flight.source is not None or not of_angle or name in _HEADINGS:
                 continue
             largest = float(np.nanmax(np.abs(np.asarray(values)), initial=0.0))
-            if largest > 2 * math.pi:
+            if largest > _FURTHEST:
                 warnings.warn(
                     f"{flight.name or 'a flight'}: {name} reaches {largest:.4g} rad, more than "
                     "three turns; angles are in radians here: np.radians(degrees)",
