@@ -38,6 +38,11 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
         TypeError: it is no Model.
         ValueError: naming the function, what was expected, what it did, and the remedy.
     """
+    if isinstance(model, str):
+        raise TypeError(
+            "model: expected a heli_jax.Model, as heli_jax.models.by_name or heli_jax.linear_model "
+            f"gives one of a name, got the name {model!r:.60}"
+        )
     if not isinstance(model, Model):
         raise TypeError(
             f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "
