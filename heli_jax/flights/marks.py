@@ -211,7 +211,7 @@ def _first(at: np.ndarray) -> int:
 
 
 def _alone(out: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
-    """Which of the samples that are `out` (N,) stand between others, at `most` so many on one side."""
+    """Which of the samples that are `out` (N,) stand between others, at most `most` in a row."""
     edges = np.flatnonzero(np.diff(np.r_[False, out, False].astype(int)))
     at = np.zeros(out.shape, bool)
     middle = float(np.median(y))
