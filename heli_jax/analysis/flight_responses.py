@@ -9,6 +9,7 @@ from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import CrossSpectra, Responses, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
@@ -179,10 +180,8 @@ def _records(
             continue
         y = f.outputs[output]
         signals = [*(f.inputs[n] for n in inputs), *(f.instruments[n] for n in instruments), y]
-        seen = np.concatenate([[False], np.isfinite(y), [False]])
-        edges = np.flatnonzero(np.diff(seen.astype(int)))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
-            longest = max(longest, int(last - first))
+        for first, last in spans([y]):
+            longest = max(longest, last - first)
             if last - first >= window:
                 parts.append(np.stack([s[first:last] for s in signals]))
     if parts:

@@ -6,7 +6,11 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
+from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_error import smoothed
+from heli_jax.identification.estimation.residual import differentiate
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of
 from tests.identification.bench import BENCH, record, vehicle
 
 DT = 0.02
@@ -122,16 +126,48 @@ def test_the_noise_spectrum_of_two_outputs_is_found():
     np.testing.assert_allclose(S[middle, 1, 1].real, slow[middle], rtol=0.25)
 
 
-def test_what_it_cannot_do_is_refused_with_what_can():
-    flight = record(BENCH, seed=3, n=1500)
+def with_holes(flight: Flight, *holes: slice, **more) -> Flight:
     roll = flight.outputs["roll"].copy()
-    roll[7] = np.nan
-    gap = Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, name="first")
-    with pytest.raises(ValueError, match="first: output roll has 1 missing samples"):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [gap], {"Ixx": Free(0.03)},
-            method="frequency-error",
-        )  # fmt: skip
+    for hole in holes:
+        roll[hole] = np.nan
+    return Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, **more)
+
+
+def problem_of(*flights: Flight, **free: Free) -> Problem:
+    frees = free or {"Ixx": Free(0.035), "kappa": Free(7.0)}
+    return Problem(models.roll_on_stand, vehicle(BENCH), flights, frees, method="frequency-error")
+
+
+def test_a_flight_is_cut_at_its_missing_samples():
+    holes = slice(700, 701), slice(1200, 1260), slice(1290, 1500)
+    # Of SciPy's noiseless record the model's error is nothing but rounding in each part.
+    exact = problem_of(with_holes(record(BENCH, seed=3, n=1500, noise=0.0), *holes))
+    layout = layout_of(exact, exact.training)
+    assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
+    noisy = with_holes(record(BENCH, seed=3, n=1500), *holes)
+    found = fit(problem_of(noisy, with_holes(noisy, slice(3, 500, 2), hold_out=True)))
+    data, noise = data_of(exact, exact.training, layout), found.reached.noise
+    # The coordinates of positive parameters are their logarithms.
+    z = start_vector(layout, data, exact)
+    z = z.at[:2].set(jnp.log(jnp.asarray([BENCH["Ixx"], BENCH["kappa"]])))
+    rows = differentiate(layout, data, noise, z).r[: 2 * (349 + 249)]
+    np.testing.assert_allclose(rows, 0.0, atol=1e-6)
+    assert layout.estimator.row_signals(layout, data).size == rows.size
+
+    assert found.status == "converged"
+    [note] = [n for n in found.notes if "cut" in n]
+    assert "23.98 of 30 s are used, in 2 parts" in note
+    for name, one in found.estimates.items():
+        assert one.lower95 < BENCH[name] < one.upper95
+    # A flight held out is predicted in time, with an initial state and a bias of its own.
+    assert found.validation["roll"].vaf > 0.999
+
+
+def test_an_output_that_is_sparse_throughout_is_refused():
+    whole = record(BENCH, seed=3, n=1500)
+    sparse = with_holes(whole, *(slice(k, None, 5) for k in range(1, 5)), name="first")
+    with pytest.raises(ValueError, match=r"first: output roll lacks 80 % .* lower flights\[\]"):
+        problem_of(sparse)
 
 
 @pytest.mark.slow

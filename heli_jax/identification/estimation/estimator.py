@@ -9,7 +9,7 @@ rows are something else says what follows from them.
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +40,8 @@ class Evaluation(NamedTuple):
     """values of the named unknowns, in their units"""
     slopes: np.ndarray
     """their derivatives by their own coordinates"""
+    z: np.ndarray
+    """(q,) where it is"""
 
 
 class Residuals(NamedTuple):
@@ -107,6 +109,15 @@ class Estimator(abc.ABC):
             problem: its model and flights have been checked by themselves.
         """
         return None
+
+    def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
+        """By flight what the method has to know of it before anything is traced; hashable.
+
+        Args:
+            problem: what is fitted.
+            flights: those of a layout, in its order.
+        """
+        return ()
 
     def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """The first guess of the noise as the method needs it.

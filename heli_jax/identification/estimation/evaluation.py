@@ -34,7 +34,7 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
     )
-    return Evaluation(simulated, raw, outputs.state_rms, *rest)
+    return Evaluation(simulated, raw, outputs.state_rms, *rest, np.asarray(z))
 
 
 def simulated_outputs(

@@ -27,6 +27,14 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.frequency_records import (
+    FlightFacts,
+    Record,
+    cut_notes,
+    parts_of,
+    records_of,
+    without_parts,
+)
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
@@ -49,7 +57,7 @@ _ROUNDING = 1e-10
 
 
 class _Lines(NamedTuple):
-    """A flight at its own frequencies k = 1 ... K, below the Nyquist frequency."""
+    """A record at its own frequencies k = 1 ... K, below the Nyquist frequency."""
 
     z: Complex[Array, " K"]
     error: Complex[Array, "K p"]
@@ -66,22 +74,24 @@ class FrequencyError(Estimator):
     errors = "residuals"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The whitened errors, real and imaginary parts, flight after flight.
+        """The whitened errors, real and imaginary parts, record after record.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
-            noise: with the whitening of each flight.
+            noise: with the whitening of each record.
             u: the unknowns, in the units of the model.
         """
         rows = [
-            _rows(_lines(layout, data, u, i, noise.whitening[i]), noise.whitening[i])
-            for i in range(len(data.flights))
+            _rows(lines, whitening)
+            for lines, whitening in zip(
+                _all_lines(layout, data, noise, u), noise.whitening, strict=True
+            )
         ]
         return Residuals(jnp.concatenate(rows), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Other than linear models, and records with missing samples.
+        """Other than linear models, and flights without a part in which every output is there.
 
         Args:
             problem: what is to be fitted.
@@ -90,16 +100,16 @@ class FrequencyError(Estimator):
             return (
                 f"model {problem.model.name} is not linear; expected output-error or filter-error"
             )
-        for flight in problem.training:
-            for name, y in flight.outputs.items():
-                missing = int(np.count_nonzero(~np.isfinite(y)))
-                if missing:
-                    return (
-                        f"{flight.name or 'a flight'}: output {name} has {missing} missing "
-                        "samples, which a Fourier transform has no place for; expected a window "
-                        "without them, gaps: split, or another method"
-                    )
-        return None
+        return without_parts(problem.training)
+
+    def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
+        """Where all outputs are there.
+
+        Args:
+            problem: what is fitted.
+            flights: those of a layout, in its order.
+        """
+        return tuple(FlightFacts(parts_of(flight)) for flight in flights)
 
     def one_program(self, layout: Layout) -> bool:
         """Thousands of small matrices are inverted: a step is cheap to call for beside that."""
@@ -114,9 +124,11 @@ class FrequencyError(Estimator):
         """
         measured = []
         for flight, sd in zip(flights, noise.sd, strict=True):
-            y = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
-            lines = np.fft.rfft(y - y.mean(axis=0), axis=0) / np.sqrt(len(y))
-            measured.append(lines[1 : 1 + _count(len(y))])
+            whole = np.stack([flight.outputs[n] for n in sorted(sd)], axis=1)
+            for first, last in parts_of(flight):
+                y = whole[first:last]
+                lines = np.fft.rfft(y - y.mean(axis=0), axis=0) / np.sqrt(len(y))
+                measured.append(lines[1 : 1 + Record(0, first, last).lines])
         # As if all of it were noise: each frequency by its own size. White noise would give all
         # the say to where the record is largest, gusts included.
         return noise._replace(whitening=_whitening(_diagonal(s) for s in smoothed(measured)))
@@ -140,11 +152,13 @@ class FrequencyError(Estimator):
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = _in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
-        sd = tuple(
-            {n: np.asarray(np.sqrt(np.mean(s[:, j, j].real))) for j, n in enumerate(names)}
-            for names, s in zip(layout.outputs, spectra, strict=True)
-        )
-        return z, Noise(sd, np.asarray(np.mean(logs)), _whitening(spectra))
+        of_flight = [record.flight for record in records_of(layout)]
+        sd = []
+        for i, names in enumerate(layout.outputs):
+            S = np.concatenate([s for s, f in zip(spectra, of_flight, strict=True) if f == i])
+            rms = np.sqrt(np.mean(np.real(np.einsum("kjj->kj", S)), axis=0))
+            sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), _whitening(spectra))
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Of complex normal errors at the lines used, in SI units of the outputs.
@@ -162,18 +176,20 @@ class FrequencyError(Estimator):
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))
 
     def row_signals(self, layout: Layout, data: Data) -> np.ndarray:
-        """Of the first rows (n,) the signal: real parts, then imaginary ones, flight by flight.
+        """Of the first rows (n,) the signal: real parts, then imaginary ones, record by record.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
         """
-        first, out = 0, []
-        for i, names in enumerate(layout.outputs):
-            K = _count(data.flights[i].outputs[names[0]].shape[0])
-            out.append(np.tile(first + np.arange(len(names)), 2 * K))
-            first += len(names)
-        return np.concatenate(out)
+        counts = [len(names) for names in layout.outputs]
+        first = np.cumsum([0, *counts])
+        return np.concatenate(
+            [
+                np.tile(first[r.flight] + np.arange(counts[r.flight]), 2 * r.lines)
+                for r in records_of(layout)
+            ]
+        )
 
     def errors_of(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation
@@ -202,6 +218,20 @@ class FrequencyError(Estimator):
         """None that is counted: a smooth spectrum, and that of each candidate model its own."""
         return 0
 
+    def notes(
+        self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
+    ) -> list[str]:
+        """How much of flights with missing samples is used.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that `e` was evaluated with.
+            e: at the optimum.
+            ill: whether it is ill-conditioned.
+        """
+        return cut_notes(layout, data)
+
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: what disturbs them is in the noise.
 
@@ -224,11 +254,6 @@ def _whitening(spectra: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
     return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)
 
 
-def _count(N: int) -> int:
-    """Lines of a record of N samples, without zero and the Nyquist frequency."""
-    return (N - 1) // 2
-
-
 @eqx.filter_jit
 def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
     """z with the biases, offsets and initial states by which the simulation is nearest in time."""
@@ -249,19 +274,18 @@ def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
 
 @eqx.filter_jit
 def _errors(layout: Layout, data: Data, noise: Noise, z: Array) -> list[Array]:
-    """By flight the errors (K, p), the ends of the record taken off, not whitened."""
-    u = unpack(layout, data, z)
-    return [_lines(layout, data, u, i, noise.whitening[i]).error for i in range(len(data.flights))]
+    """By record the errors (K, p), its ends taken off, not whitened."""
+    return [v.error for v in _all_lines(layout, data, noise, unpack(layout, data, z))]
 
 
 def smoothed(errors: Sequence[Complex[np.ndarray, "K p"]]) -> list[np.ndarray]:
-    """By flight the spectrum (K, p, p) of the errors of all flights, smoothed over frequency.
+    """By record the spectrum (K, p, p) of the errors of all records, smoothed over frequency.
 
     Args:
-        errors: by flight at its own lines, those of N samples K = (N - 1) // 2.
+        errors: by record at its own lines, those of N samples K = (N - 1) // 2.
     """
     powers = [np.einsum("ki,kj->kij", v, np.conj(v)) for v in errors]
-    # In parts of the rate, which all flights have in common.
+    # In parts of the rate, which all records have in common.
     at = [np.arange(1, len(v) + 1) / (2 * len(v) + 1) for v in errors]
     out = []
     for f in at:
@@ -292,23 +316,53 @@ def _real(v: Complex[Array, "r n"]) -> Float[Array, "s n"]:
     return jnp.concatenate([jnp.real(v), jnp.imag(v)])
 
 
-def _lines(layout: Layout, data: Data, u: Unknowns, i: int, whitening: Array) -> _Lines:
-    drive, names = driven(layout, data, u, i), layout.outputs[i]
-    model, flight = layout.model, data.flights[i]
+def _all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[_Lines]:
+    """Of every record."""
+    # Once for all parts of a flight.
+    machines = [_machine(layout, data, u, i) for i in range(len(data.flights))]
+    out = []
+    for record, whitening in zip(records_of(layout), noise.whitening, strict=True):
+        outputs = data.flights[record.flight].outputs
+        y = jnp.stack([outputs[n] for n in layout.outputs[record.flight]], axis=1)
+        out.append(_lines(machines[record.flight], y, record, whitening))
+    return out
+
+
+class _Machine(NamedTuple):
+    """What a flight's states and outputs follow, sample by sample."""
+
+    Ad: Float[Array, "n n"]
+    B: Float[Array, "n r"]
+    C: Float[Array, "p n"]
+    D: Float[Array, "p m"]
+    U: Float[Array, "N r"]
+    """what B multiplies"""
+    acting: Float[Array, "N m"]
+    """the inputs that act at the samples"""
+
+
+def _machine(layout: Layout, data: Data, u: Unknowns, i: int) -> _Machine:
+    drive, model = driven(layout, data, u, i), layout.model
     linear = linear_inputs(model, drive.inputs, layout.hold(i))
     Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in names])
-    C, D = C[rows], D[rows]
-    N = U.shape[0]
-    k = np.arange(1, (N - 1) // 2 + 1)
+    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
+    return _Machine(Ad, B, C[rows], D[rows], U, acting)
+
+
+def _lines(machine: _Machine, y: Array, record: Record, whitening: Array) -> _Lines:
+    Ad, B, C, D, *_ = machine
+    part = slice(record.first, record.last)
+    # Cut behind the inputs' delays: what acted in a part was logged before it.
+    y, U, acting = y[part], machine.U[part], machine.acting[part]
+    N = record.samples
+    k = np.arange(1, record.lines + 1)
     z = jnp.asarray(np.exp(2j * np.pi * k / N))
 
     def lines(v: Array) -> Array:
         # Without a mean: the zero line is not used, and rounding would carry it to the others.
         return jnp.fft.rfft(v - jnp.mean(v, axis=0, keepdims=True), axis=0)[k] * float(N) ** -0.5
 
-    y = jnp.stack([flight.outputs[n] for n in names], axis=1)
     identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
     still = jax.lax.stop_gradient(Ad).astype(z.dtype)
     P = jnp.linalg.inv(z[:, None, None] * identity[None] - still[None])

@@ -106,6 +106,8 @@ class Layout(eqx.Module):
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
     one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     """filter error: groups of flights that share the covariances of one Kalman filter"""
+    of_flights: tuple[Any, ...] = eqx.field(static=True, default=())
+    """by flight what the method takes of it before anything is traced (`Estimator.of_flights`)"""
 
     @property
     def of_interest(self) -> tuple[str, ...]:
@@ -175,7 +177,7 @@ class Noise(NamedTuple):
     the likelihood is laid out in rows, so that they have variance 1; frequency error: likewise the
     mean over all lines of log det(spectrum)"""
     whitening: Any = ()
-    """frequency error: by flight (K, p, p) what makes white noise of that at its lines; () else"""
+    """frequency error: by record (K, p, p) what makes white noise of that at its lines; () else"""
 
 
 class Solution(NamedTuple):
@@ -237,6 +239,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
         one_covariance=_one_covariance(problem, flights),
+        of_flights=estimator.of_flights(problem, flights),
     )
 
 

@@ -12,6 +12,7 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
@@ -48,6 +49,9 @@ def validate(
     """
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
+    # What no line of a spectrum knows, the initial states and biases, shows in time alone.
+    if not other.estimator.rows_are_samples:
+        other = replace(other, estimator=estimator_of("output-error"))
     data = data_of(problem, held, other)
     # From any point a linear model's are found in one step, so zero, the middle of their weak
     # priors, will do.
