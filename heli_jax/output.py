@@ -17,6 +17,7 @@ from heli_jax.flights import write as tables
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
+from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
@@ -119,8 +120,8 @@ def run_compatibility(
     return found.compatible
 
 
-def _print_first_guess(guess: EquationErrorStart) -> None:
-    print("Where the fit began, by equation error (no result):")
+def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
+    print(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
         if table.rows:
             print_table(table.head, table.rows)

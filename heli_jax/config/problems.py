@@ -13,7 +13,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
-from heli_jax.config.starts import first_guesses
+from heli_jax.config.starts import first_guesses, started_in_frequency
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
@@ -73,11 +73,13 @@ def problem(experiment: Experiment) -> Problem:
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
         )
-        return with_chosen_windows(whole)
+        whole = with_chosen_windows(whole)
     except ValueError as e:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
         place = path if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+    # Of the flights that are fitted: by now their windows are chosen.
+    return started_in_frequency(experiment, whole)
 
 
 def with_chosen_windows(problem: Problem) -> Problem:

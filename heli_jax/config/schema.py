@@ -220,8 +220,9 @@ class ShootingConfig(_Strict):
 class StartMethodConfig(_Strict):
     """Where the starts of the free parameters come from."""
 
-    method: Literal["given", "equation-error"] = "given"
-    """equation-error: by regression of the records themselves, for linear models"""
+    method: Literal["given", "equation-error", "frequency-error"] = "given"
+    """equation-error: by regression of the records themselves, for linear models; frequency-error:
+    by a fit in frequency, from the starts that are given"""
     stepwise: bool = False
     """whether terms that hardly help to predict are left at zero"""
     # Entry and removal have one limit unless stated; where its number comes from stands with
@@ -233,8 +234,10 @@ class StartMethodConfig(_Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> "StartMethodConfig":
-        if self.stepwise and self.method == "given":
-            raise ValueError("stepwise: expected method: equation-error with it, got given")
+        if self.stepwise and self.method != "equation-error":
+            raise ValueError(
+                f"stepwise: expected method: equation-error with it, got {self.method}"
+            )
         # A term that enters and at once falls below the limit of removal would be taken in and out
         # for ever.
         if self.f_remove > self.f_enter:
@@ -253,7 +256,7 @@ class FitConfig(_Strict):
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     free: dict[str, FreeConfig]
     start: Annotated[StartMethodConfig, BeforeValidator(_start_method)] = StartMethodConfig()
-    """given, equation-error, or {method: equation-error, stepwise: true}"""
+    """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
     # Unless given, the number depends on what is free: the misfit has a valley for each period by
@@ -266,6 +269,12 @@ class FitConfig(_Strict):
     """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
     several axes may be disturbed, all of them and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
+
+    @model_validator(mode="after")
+    def _another_start(self) -> "FitConfig":
+        if self.method == self.start.method:
+            raise ValueError(f"start: {self.method}: expected another method to fit by")
+        return self
 
 
 class RLSConfig(_Strict):

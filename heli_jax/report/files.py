@@ -12,7 +12,9 @@ from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Estimate, Fit, Signals
+from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
@@ -83,6 +85,7 @@ def fit_json(
             **_residuals(fit),
             "baseline_rls": _baseline(baseline),
             "equation_error_start": _first_guess(problem),
+            "frequency_error_start": _frequency_start(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
             "notes": list(fit.notes),
@@ -109,7 +112,7 @@ def _first_guess(problem: Problem) -> dict[str, Any] | None:
     guess = problem.first_guess
     # Not the fit's own `starts`: here stands how the first of them was found, with the noise's bias
     # that such values have.
-    if guess is None:
+    if not isinstance(guess, EquationErrorStart):
         return None
     selection = guess.selection
     return {
@@ -125,6 +128,20 @@ def _first_guess(problem: Problem) -> dict[str, Any] | None:
             "f_ratios": selection.f_ratios,
         },
         "sentences": list(guess.sentences),
+    }
+
+
+def _frequency_start(problem: Problem) -> dict[str, Any] | None:
+    """What a fit in frequency found to begin with."""
+    guess = problem.first_guess
+    if not isinstance(guess, FrequencyErrorStart):
+        return None
+    return {
+        "status": guess.status,
+        "seconds": guess.seconds,
+        "values": {n: v._asdict() for n, v in guess.values.items()},
+        "sentences": list(guess.sentences),
+        "notes": list(guess.notes),
     }
 
 

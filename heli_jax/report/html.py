@@ -202,6 +202,7 @@ def render(
         verdict=tables.verdict(fit),
         starts=tables.starts(fit),
         guess=problem.first_guess,
+        guess_method=tables.start_method(problem.first_guess) if problem.first_guess else "",
         first_guess=tables.first_guess(problem.first_guess) if problem.first_guess else None,
         selection=tables.selection_steps(problem.first_guess) if problem.first_guess else None,
         ratios=tables.baseline_ratios(fit, baseline) if baseline else None,

@@ -12,7 +12,7 @@ from heli_jax.report.tables.estimates import (
     starts,
     verdict,
 )
-from heli_jax.report.tables.first_guess import first_guess, selection_steps
+from heli_jax.report.tables.first_guess import first_guess, selection_steps, start_method
 from heli_jax.report.tables.headline import (
     Headline,
     adequate,
@@ -52,6 +52,7 @@ __all__ = [
     "prior_note",
     "residuals",
     "selection_steps",
+    "start_method",
     "starts",
     "verdict",
     "warnings",
