@@ -31,7 +31,7 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrument_notes,
     instrumented_inputs,
 )
-from heli_jax.identification.estimation.frequency_lines import all_lines
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
     Record,
@@ -97,7 +97,7 @@ class FrequencyError(Estimator):
             problem: what is fitted.
             flights: those of a layout, in its order.
         """
-        return tuple(FlightFacts(parts_of(flight)) for flight in flights)
+        return tuple(FlightFacts(parts_of(flight), flight.dt) for flight in flights)
 
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
@@ -157,7 +157,7 @@ class FrequencyError(Estimator):
             noise: so far.
             z: the unknowns.
         """
-        errors = [np.asarray(v) for v in _errors(layout, data, noise, z)]
+        errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
@@ -248,12 +248,6 @@ def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
     step = jnp.linalg.lstsq(J, -r)[0]
     # The simulation of an unstable machine over a whole record is no number: left as it is.
     return z.at[first:].add(jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0))
-
-
-@eqx.filter_jit
-def _errors(layout: Layout, data: Data, noise: Noise, z: Array) -> list[Array]:
-    """By record the errors (K, p), its ends taken off, not whitened."""
-    return [one.error for one in all_lines(layout, data, noise, unpack(layout, data, z))]
 
 
 ESTIMATOR = FrequencyError()
