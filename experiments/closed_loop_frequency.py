@@ -195,7 +195,7 @@ def one_fit(seed: int, method: str) -> dict[str, Any]:
         "all_seconds": time.perf_counter() - begin,
         "tic": doublet_tic(values),
         "untrusted": list(found.untrusted),
-        "moved": dict(found.moved_by_feedback),
+        "moved": found.moved_by_feedback,
         "error": {n: values[n] - t for n, t in truths().items()},
         "z": {n: (values[n] - t) / (found.estimates[n].sd or np.nan) for n, t in truths().items()},
     }

@@ -175,7 +175,7 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    moved = moved_by_feedback(solution, found) if bool(best.converged) else {}
+    moved = moved_by_feedback(solution) if bool(best.converged) else {}
     by_instrument = data.flights[0].by_instrument is not None
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
@@ -209,7 +209,7 @@ def assemble(
         notes=(
             *notes,
             *closed_loop,
-            *feedback_trust_notes(moved),
+            *feedback_trust_notes(moved, found),
             *adequacy.sentences,
             *missing,
             *held.notes,
