@@ -58,6 +58,11 @@ def print_fit(run: FitRun) -> None:
         print_table(table.head, table.rows)
         for sentence in supplementary.intervals.sentences:
             print(f"! {sentence}")
+    if supplementary.methods is not None:
+        side_by_side = report_tables.methods(supplementary.methods)
+        print_table(side_by_side.head, side_by_side.rows)
+        for sentence in supplementary.methods.sentences:
+            print(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
     # of those held out, where a model that was fitted too closely shows.
     for name, m in fit.metrics.items():

@@ -117,7 +117,7 @@ def test_imports_point_one_way(name):
 ROOMS = (
     "methods", "free", "push_scale", "problem", "unknowns", "estimation", "identifiability",
     "validation", "equation_error", "result", "uncertainty", "agreement", "assemble", "fit",
-    "frequency_start", "model_selection", "disturbed_sets",
+    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 

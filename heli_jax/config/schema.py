@@ -254,6 +254,8 @@ def _start_method(value: Any) -> Any:
 class FitConfig(_Strict):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
+    also: list[Literal[tuple(METHODS)]] = []  # pyright: ignore[reportInvalidTypeForm]
+    """further methods by which the same is fitted, their estimates laid beside those of `method`"""
     free: dict[str, FreeConfig]
     start: Annotated[StartMethodConfig, BeforeValidator(_start_method)] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
@@ -274,6 +276,13 @@ class FitConfig(_Strict):
     def _another_start(self) -> "FitConfig":
         if self.method == self.start.method:
             raise ValueError(f"start: {self.method}: expected another method to fit by")
+        return self
+
+    @model_validator(mode="after")
+    def _other_methods(self) -> "FitConfig":
+        for i, method in enumerate(self.also):
+            if method == self.method or method in self.also[:i]:
+                raise ValueError(f"also: expected methods beside {self.method}, got {method} again")
         return self
 
 

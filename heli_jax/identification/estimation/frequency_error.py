@@ -8,7 +8,8 @@ $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 is exact, for unstable machines too: nothing is simulated, and the ends of the record are n numbers
 that are found by linear least squares and projected out. The noise's spectrum, a matrix over the
 outputs, is estimated from the residual and weighs the frequencies; maximum likelihood then holds
-where gusts disturb the machine as well, as long as no feedback brings them into the inputs.
+where gusts disturb the machine as well, as long as no feedback brings them into the inputs. Models
+that are not linear are linearised where they fly.
 
 Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Klein and Morelli (2006), chapter 7;
 Golub and Pereyra (1973) and Kaufman (1975) for the projection.
@@ -23,20 +24,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from heli_jax import naming
-from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
+    Machine,
     Record,
     cut_notes,
+    machine_of,
     parts_of,
     records_of,
     without_parts,
 )
+from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
+from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
-from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -46,8 +48,6 @@ from heli_jax.identification.unknowns.layout import (
     Unknowns,
     unpack,
 )
-from heli_jax.simulation.hold import linear_inputs
-from heli_jax.simulation.stepping import held_columns
 
 _LEAST, _PART = 6.0, 0.08
 """sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
@@ -91,25 +91,21 @@ class FrequencyError(Estimator):
         return Residuals(jnp.concatenate(rows), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Other than linear models, and flights without a part in which every output is there.
+        """Flights without a part in which every output is there, and without a trim.
 
         Args:
             problem: what is to be fitted.
         """
-        if not problem.model.linear:
-            return (
-                f"model {problem.model.name} is not linear; expected output-error or filter-error"
-            )
-        return without_parts(problem.training)
+        return without_parts(problem.training) or cannot_linearise(problem)
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
-        """Where all outputs are there.
+        """Where all outputs are there, and about what the model is linearised.
 
         Args:
             problem: what is fitted.
             flights: those of a layout, in its order.
         """
-        return tuple(FlightFacts(parts_of(flight)) for flight in flights)
+        return tuple(FlightFacts(parts_of(f), condition_of(problem.model, f)) for f in flights)
 
     def one_program(self, layout: Layout) -> bool:
         """Thousands of small matrices are inverted: a step is cheap to call for beside that."""
@@ -221,7 +217,7 @@ class FrequencyError(Estimator):
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
     ) -> list[str]:
-        """How much of flights with missing samples is used.
+        """How much of flights with missing samples is used, and where models were linearised.
 
         Args:
             layout: what the unknowns are.
@@ -230,7 +226,7 @@ class FrequencyError(Estimator):
             e: at the optimum.
             ill: whether it is ill-conditioned.
         """
-        return cut_notes(layout, data)
+        return [*cut_notes(layout, data), *linearisation_notes(layout, data, noise, e)]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: what disturbs them is in the noise.
@@ -265,11 +261,12 @@ def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
         u = unpack(layout, data, z.at[first:].set(part))
         return jnp.concatenate([OUTPUT_ERROR.residuals(layout, data, noise, u).rows, part])
 
-    # Linear in them: one step is enough.
+    # Of a linear model one step is enough; of others each relaxation takes one.
     r, J = rows(z[first:]), jax.jacfwd(rows)(z[first:])
     step = jnp.linalg.lstsq(J, -r)[0]
     # The simulation of an unstable machine over a whole record is no number: left as it is.
-    return z.at[first:].add(jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0))
+    better = jnp.sum(rows(z[first:] + step) ** 2) < jnp.sum(r**2)
+    return z.at[first:].add(jnp.where(better, step, 0.0))
 
 
 @eqx.filter_jit
@@ -319,7 +316,7 @@ def _real(v: Complex[Array, "r n"]) -> Float[Array, "s n"]:
 def _all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[_Lines]:
     """Of every record."""
     # Once for all parts of a flight.
-    machines = [_machine(layout, data, u, i) for i in range(len(data.flights))]
+    machines = [machine_of(layout, data, u, i) for i in range(len(data.flights))]
     out = []
     for record, whitening in zip(records_of(layout), noise.whitening, strict=True):
         outputs = data.flights[record.flight].outputs
@@ -328,29 +325,7 @@ def _all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[_L
     return out
 
 
-class _Machine(NamedTuple):
-    """What a flight's states and outputs follow, sample by sample."""
-
-    Ad: Float[Array, "n n"]
-    B: Float[Array, "n r"]
-    C: Float[Array, "p n"]
-    D: Float[Array, "p m"]
-    U: Float[Array, "N r"]
-    """what B multiplies"""
-    acting: Float[Array, "N m"]
-    """the inputs that act at the samples"""
-
-
-def _machine(layout: Layout, data: Data, u: Unknowns, i: int) -> _Machine:
-    drive, model = driven(layout, data, u, i), layout.model
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return _Machine(Ad, B, C[rows], D[rows], U, acting)
-
-
-def _lines(machine: _Machine, y: Array, record: Record, whitening: Array) -> _Lines:
+def _lines(machine: Machine, y: Array, record: Record, whitening: Array) -> _Lines:
     Ad, B, C, D, *_ = machine
     part = slice(record.first, record.last)
     # Cut behind the inputs' delays: what acted in a part was logged before it.
