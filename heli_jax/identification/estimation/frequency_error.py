@@ -36,6 +36,7 @@ from heli_jax.identification.estimation.frequency_records import (
     records_of,
     without_parts,
 )
+from heli_jax.identification.estimation.in_time import nearest_in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -146,7 +147,7 @@ class FrequencyError(Estimator):
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
         # Biases and initial states are in none of these rows: the simulation in time has them.
-        z = _in_time(layout, data, noise, z)
+        z = nearest_in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
@@ -248,25 +249,6 @@ def _diagonal(S: np.ndarray) -> np.ndarray:
 def _whitening(spectra: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
     # Lower triangles: S = L L^H, and L^-1 e is white.
     return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)
-
-
-@eqx.filter_jit
-def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
-    """z with the biases, offsets and initial states by which the simulation is nearest in time."""
-    first = layout.first_nuisance
-    if first == z.shape[0]:
-        return z
-
-    def rows(part: Array) -> Array:
-        u = unpack(layout, data, z.at[first:].set(part))
-        return jnp.concatenate([OUTPUT_ERROR.residuals(layout, data, noise, u).rows, part])
-
-    # Of a linear model one step is enough; of others each relaxation takes one.
-    r, J = rows(z[first:]), jax.jacfwd(rows)(z[first:])
-    step = jnp.linalg.lstsq(J, -r)[0]
-    # The simulation of an unstable machine over a whole record is no number: left as it is.
-    better = jnp.sum(rows(z[first:] + step) ** 2) < jnp.sum(r**2)
-    return z.at[first:].add(jnp.where(better, step, 0.0))
 
 
 @eqx.filter_jit
