@@ -51,7 +51,7 @@ ALLOWED = {
 ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
-    "compatibility",
+    "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
     "__init__",
     "__main__",
 }  # fmt: skip
