@@ -68,6 +68,7 @@ def problem(experiment: Experiment) -> Problem:
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
+            instrument=config.fit.instrument,
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:

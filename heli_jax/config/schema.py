@@ -198,6 +198,19 @@ class NuisanceConfig(_Strict):
     the sticks of a machine in free flight"""
 
 
+def _instrument_choice(value: object) -> object:
+    # By hand, as above: a name, a list of names, or the word none.
+    if value is None or isinstance(value, tuple):
+        return value
+    if isinstance(value, str):
+        return () if value == "none" else (value,)
+    if isinstance(value, list) and value and all(isinstance(v, str) for v in value):
+        return tuple(value)
+    raise ValueError(
+        f"expected an input, a list of inputs such as [lat, lon], or none, got {value!r:.60}"
+    )
+
+
 class IntervalsConfig(_Strict):
     """Intervals beside the Gaussian one."""
 
@@ -264,6 +277,10 @@ class FitConfig(_Strict):
         BeforeValidator(_start_method, json_schema_input_type=str | StartMethodConfig),
     ] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
+    # Any, since the validator before it has said what it may be.
+    instrument: Annotated[Any, BeforeValidator(_instrument_choice)] = None
+    """frequency-error: inputs that are taken by their instrument, or none; unless given, all of
+    which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
     # Unless given, the number depends on what is free: the misfit has a valley for each period by

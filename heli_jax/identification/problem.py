@@ -89,6 +89,9 @@ class Problem:
     continuity: float | None = None
     """with windows: standard deviation of the jump of each state from one window to the next, as a
     part of what the state does; None leaves them apart"""
+    instrument: tuple[str, ...] | None = None
+    """frequency-error: inputs that are taken by their instrument (`Flight.instruments`); None: all
+    that every flight holds one of; (): none"""
     # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
     first_guess: Any = None
     """how the starts were found, for the report; None where they were given"""
@@ -202,6 +205,11 @@ class Problem:
 
 def _check_method(problem: Problem) -> None:
     model = problem.model
+    if problem.instrument and not estimator_of(problem.method).by_instrument:
+        raise ValueError(
+            f"instrument: method {problem.method} takes no input by an instrument, expected "
+            "frequency-error, or none"
+        )
     if not estimator_of(problem.method).process_noise:
         return
     if model.noise_intensity is None:

@@ -60,6 +60,7 @@ def fit_json(
             "status": fit.status,
             "model": fit.model,
             "method": fit.method,
+            "instruments": list(fit.instruments),
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
             "adequate": None if adequate_unjudged(fit) else fit.adequate,
@@ -108,6 +109,10 @@ def _residuals(fit: Fit) -> dict[str, Any]:
     return {
         "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
+        "moved_by_feedback": {
+            n: {"standard_deviations": m.by, "sd": m.uncertain, "trusted": m.trusted}
+            for n, m in fit.moved_by_feedback.items()
+        },
     }
 
 

@@ -75,6 +75,8 @@ class Estimator(abc.ABC):
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
+    by_instrument: ClassVar[bool] = False
+    """whether it can take inputs by their instrument (`Problem.instrument`)"""
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -118,6 +120,17 @@ class Estimator(abc.ABC):
             flights: those of a layout, in its order.
         """
         return ()
+
+    def instrumented(
+        self, problem: Problem, flights: Sequence[Flight]
+    ) -> tuple[dict[str, np.ndarray], ...] | None:
+        """By flight and input what of it follows the instruments (N,), SI; None without any.
+
+        Args:
+            problem: says which instruments are used.
+            flights: those of a layout, in its order.
+        """
+        return None
 
     def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """The first guess of the noise as the method needs it.

@@ -11,30 +11,40 @@ outputs, is estimated from the residual and weighs the frequencies; maximum like
 where gusts disturb the machine as well, as long as no feedback brings them into the inputs. Models
 that are not linear are linearised where they fly.
 
-Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Klein and Morelli (2006), chapter 7;
-Golub and Pereyra (1973) and Kaufman (1975) for the projection.
+Where flights hold an excitation that was added to an input and that no feedback reaches, the errors
+are weighed by the response to what of the input follows it: then feedback does no harm either.
+
+Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli (2006), chapter 7.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.frequency_instrument import (
+    absent_instrument,
+    instrument_notes,
+    instrumented_inputs,
+)
+from heli_jax.identification.estimation.frequency_lines import all_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
-    Machine,
     Record,
     cut_notes,
-    machine_of,
     parts_of,
     records_of,
     without_parts,
+)
+from heli_jax.identification.estimation.frequency_rows import rows_of_lines
+from heli_jax.identification.estimation.frequency_spectrum import (
+    smoothed,
+    whitening_of,
+    without_shared,
 )
 from heli_jax.identification.estimation.in_time import nearest_in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
@@ -50,22 +60,6 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 
-_LEAST, _PART = 6.0, 0.08
-"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
-part of the frequency. Narrower ones follow the noise itself: intervals are then too narrow"""
-_ROUNDING = 1e-10
-"""of the mean over all frequencies, below which a spectrum is not taken to fall"""
-
-
-class _Lines(NamedTuple):
-    """A record at its own frequencies k = 1 ... K, below the Nyquist frequency."""
-
-    z: Complex[Array, " K"]
-    error: Complex[Array, "K p"]
-    """measured less simulated, the ends of the record taken off"""
-    basis: Complex[Array, "K p n"]
-    """what the ends of the record may add, whitened"""
-
 
 class FrequencyError(Estimator):
     """The model's response to the inputs against the measured outputs, at each frequency."""
@@ -73,9 +67,10 @@ class FrequencyError(Estimator):
     rows_are_samples = False
     least_squares = False
     errors = "residuals"
+    by_instrument = True
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
-        """The whitened errors, real and imaginary parts, record after record.
+        """A row for each unknown of interest, and one for what is left of the errors.
 
         Args:
             layout: what the unknowns are.
@@ -83,13 +78,7 @@ class FrequencyError(Estimator):
             noise: with the whitening of each record.
             u: the unknowns, in the units of the model.
         """
-        rows = [
-            _rows(lines, whitening)
-            for lines, whitening in zip(
-                _all_lines(layout, data, noise, u), noise.whitening, strict=True
-            )
-        ]
-        return Residuals(jnp.concatenate(rows), None)
+        return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
         """Flights without a part in which every output is there, and without a trim.
@@ -97,7 +86,8 @@ class FrequencyError(Estimator):
         Args:
             problem: what is to be fitted.
         """
-        return without_parts(problem.training) or cannot_linearise(problem)
+        refused = without_parts(problem.training) or absent_instrument(problem)
+        return refused or cannot_linearise(problem)
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
         """Where all outputs are there, and about what the model is linearised.
@@ -107,6 +97,17 @@ class FrequencyError(Estimator):
             flights: those of a layout, in its order.
         """
         return tuple(FlightFacts(parts_of(f), condition_of(problem.model, f)) for f in flights)
+
+    def instrumented(
+        self, problem: Problem, flights: Sequence[Flight]
+    ) -> tuple[dict[str, np.ndarray], ...] | None:
+        """By flight and input what of it follows the instruments.
+
+        Args:
+            problem: says which instruments are used.
+            flights: those of a layout, in its order.
+        """
+        return instrumented_inputs(problem, flights)
 
     def one_program(self, layout: Layout) -> bool:
         """Thousands of small matrices are inverted: a step is cheap to call for beside that."""
@@ -128,7 +129,9 @@ class FrequencyError(Estimator):
                 measured.append(lines[1 : 1 + Record(0, first, last).lines])
         # As if all of it were noise: each frequency by its own size. White noise would give all
         # the say to where the record is largest, gusts included.
-        return noise._replace(whitening=_whitening(_diagonal(s) for s in smoothed(measured)))
+        whitening = whitening_of(without_shared(s) for s in smoothed(measured))
+        # Directly at first: near that estimate the equations by instrument have one solution.
+        return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
 
     def relax(
         self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
@@ -155,10 +158,12 @@ class FrequencyError(Estimator):
             S = np.concatenate([s for s, f in zip(spectra, of_flight, strict=True) if f == i])
             rms = np.sqrt(np.mean(np.real(np.einsum("kjj->kj", S)), axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), _whitening(spectra))
+        by = np.asarray(float(data.flights[0].by_instrument is not None))
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening_of(spectra), by)
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
-        """Of complex normal errors at the lines used, in SI units of the outputs.
+        """Of complex normal errors at the lines used, in SI units of the outputs; NaN for an
+        estimate by instrument, which has none.
 
         Args:
             layout: what the unknowns are.
@@ -166,40 +171,14 @@ class FrequencyError(Estimator):
             noise: that `e` was evaluated with.
             e: the evaluation.
         """
-        numbers = self.row_signals(layout, data).size
-        squares = float(np.sum(np.square(np.asarray(e.r)[:numbers])))
+        if data.flights[0].by_instrument is not None and float(noise.by_instrument) > 0:
+            return float("nan")
+        # A row for each unknown of interest, and one for all that is left of the errors.
+        rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
+        squares = float(np.sum(np.square(rows)))
         logs = sum(float(np.sum(np.linalg.slogdet(np.asarray(W))[1])) for W in noise.whitening)
-        lines = numbers / 2
+        lines = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))
-
-    def row_signals(self, layout: Layout, data: Data) -> np.ndarray:
-        """Of the first rows (n,) the signal: real parts, then imaginary ones, record by record.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-        """
-        counts = [len(names) for names in layout.outputs]
-        first = np.cumsum([0, *counts])
-        return np.concatenate(
-            [
-                np.tile(first[r.flight] + np.arange(counts[r.flight]), 2 * r.lines)
-                for r in records_of(layout)
-            ]
-        )
-
-    def errors_of(
-        self, layout: Layout, data: Data, noise: Noise, e: Evaluation
-    ) -> list[np.ndarray]:
-        """By signal the whitened rows times its sd, SI.
-
-        Args:
-            layout: what the unknowns are.
-            data: the numbers of the problem.
-            noise: that the rows were divided by.
-            e: the evaluation that holds the rows.
-        """
-        return self.rows_by_signal(layout, data, noise, e)
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
         """Of the whitened rows, the spectrum taken as it was estimated.
@@ -218,7 +197,8 @@ class FrequencyError(Estimator):
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
     ) -> list[str]:
-        """How much of flights with missing samples is used, and where models were linearised.
+        """How much of flights with missing samples is used, where models were linearised, and which
+        instruments are weak.
 
         Args:
             layout: what the unknowns are.
@@ -227,7 +207,11 @@ class FrequencyError(Estimator):
             e: at the optimum.
             ill: whether it is ill-conditioned.
         """
-        return [*cut_notes(layout, data), *linearisation_notes(layout, data, noise, e)]
+        return [
+            *cut_notes(layout, data),
+            *linearisation_notes(layout, data, noise, e),
+            *instrument_notes(layout, data, noise, e.z),
+        ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: what disturbs them is in the noise.
@@ -241,114 +225,10 @@ class FrequencyError(Estimator):
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
 
-def _diagonal(S: np.ndarray) -> np.ndarray:
-    """Spectra (K, p, p) without what outputs share."""
-    return S * np.eye(S.shape[1])
-
-
-def _whitening(spectra: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
-    # Lower triangles: S = L L^H, and L^-1 e is white.
-    return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)
-
-
 @eqx.filter_jit
 def _errors(layout: Layout, data: Data, noise: Noise, z: Array) -> list[Array]:
     """By record the errors (K, p), its ends taken off, not whitened."""
-    return [v.error for v in _all_lines(layout, data, noise, unpack(layout, data, z))]
-
-
-def smoothed(errors: Sequence[Complex[np.ndarray, "K p"]]) -> list[np.ndarray]:
-    """By record the spectrum (K, p, p) of the errors of all records, smoothed over frequency.
-
-    Args:
-        errors: by record at its own lines, those of N samples K = (N - 1) // 2.
-    """
-    powers = [np.einsum("ki,kj->kij", v, np.conj(v)) for v in errors]
-    # In parts of the rate, which all records have in common.
-    at = [np.arange(1, len(v) + 1) / (2 * len(v) + 1) for v in errors]
-    out = []
-    for f in at:
-        total, weight = np.zeros((f.size, *powers[0].shape[1:]), complex), np.zeros(f.size)
-        for g, power in zip(at, powers, strict=True):
-            width = np.maximum(_LEAST * g[0], _PART * f)
-            # Few lines carry weight for each: by sums over the lines themselves.
-            kernel = np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
-            total += np.einsum("fg,gij->fij", kernel, power)
-            weight += np.sum(kernel, axis=1)
-        S = total / weight[:, None, None]
-        floor = _ROUNDING * np.mean(np.real(np.einsum("kii->ki", S)), axis=0)
-        out.append(S + np.diag(floor)[None])
-    return out
-
-
-def _rows(lines: _Lines, whitening: Complex[Array, "K p p"]) -> Float[Array, " r"]:
-    e = jnp.einsum("kij,kj->ki", whitening, lines.error)
-    stacked = _real(e.reshape(-1, 1))[:, 0]
-    # What the ends of the record can explain is taken off: as good as searching for them (Kaufman).
-    Q = jnp.linalg.qr(_real(lines.basis.reshape(-1, lines.basis.shape[2])))[0]
-    Q = jax.lax.stop_gradient(Q)
-    # Of a complex normal error each part has half of the variance.
-    return 2.0**0.5 * (stacked - Q @ (Q.T @ stacked))
-
-
-def _real(v: Complex[Array, "r n"]) -> Float[Array, "s n"]:
-    return jnp.concatenate([jnp.real(v), jnp.imag(v)])
-
-
-def _all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[_Lines]:
-    """Of every record."""
-    # Once for all parts of a flight.
-    machines = [machine_of(layout, data, u, i) for i in range(len(data.flights))]
-    out = []
-    for record, whitening in zip(records_of(layout), noise.whitening, strict=True):
-        outputs = data.flights[record.flight].outputs
-        y = jnp.stack([outputs[n] for n in layout.outputs[record.flight]], axis=1)
-        out.append(_lines(machines[record.flight], y, record, whitening))
-    return out
-
-
-def _lines(machine: Machine, y: Array, record: Record, whitening: Array) -> _Lines:
-    Ad, B, C, D, *_ = machine
-    part = slice(record.first, record.last)
-    # Cut behind the inputs' delays: what acted in a part was logged before it.
-    y, U, acting = y[part], machine.U[part], machine.acting[part]
-    N = record.samples
-    k = np.arange(1, record.lines + 1)
-    z = jnp.asarray(np.exp(2j * np.pi * k / N))
-
-    def lines(v: Array) -> Array:
-        # Without a mean: the zero line is not used, and rounding would carry it to the others.
-        return jnp.fft.rfft(v - jnp.mean(v, axis=0, keepdims=True), axis=0)[k] * float(N) ** -0.5
-
-    identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
-    still = jax.lax.stop_gradient(Ad).astype(z.dtype)
-    P = jnp.linalg.inv(z[:, None, None] * identity[None] - still[None])
-    X = _states(P, Ad, lines(U) @ B.T.astype(z.dtype))
-    error = lines(y) - X @ C.T.astype(z.dtype) - lines(acting) @ D.T.astype(z.dtype)
-    ends = z[:, None, None] * jnp.einsum("pn,knm->kpm", jax.lax.stop_gradient(C).astype(z.dtype), P)
-    basis = jnp.einsum("kij,kjn->kin", whitening, ends)
-    white = jnp.einsum("kij,kj->ki", whitening, jax.lax.stop_gradient(error))
-    d = jnp.linalg.lstsq(
-        _real(basis.reshape(-1, basis.shape[2])), _real(white.reshape(-1, 1))[:, 0]
-    )[0]
-    d = jax.lax.stop_gradient(d)
-    X = _states(P, Ad, z[:, None] * d.astype(z.dtype)[None, :])
-    return _Lines(z, error - X @ C.T.astype(z.dtype), basis)
-
-
-@jax.custom_jvp
-def _states(P: Array, Ad: Array, b: Array) -> Array:
-    """(zI - Ad)^-1 b at every line (K, n); P is that inverse."""
-    return jnp.einsum("kij,kj->ki", P, b)
-
-
-@_states.defjvp
-def _states_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    P, Ad, b = primals
-    _, dA, db = tangents
-    X = _states(P, Ad, b)
-    # One product for each line in place of a solution: the inverse is the same for all unknowns.
-    return X, jnp.einsum("kij,kj->ki", P, X @ dA.T.astype(X.dtype) + db)
+    return [one.error for one in all_lines(layout, data, noise, unpack(layout, data, z))]
 
 
 ESTIMATOR = FrequencyError()

@@ -8,18 +8,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
 
-from heli_jax import naming
 from heli_jax.analysis.trim import Condition
-from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import FEWEST, SHORTEST, spans
-from heli_jax.identification.estimation.linearised_flights import linear_drive
-from heli_jax.identification.estimation.simulated_flights import driven
-from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns
-from heli_jax.simulation.hold import linear_inputs
-from heli_jax.simulation.stepping import held_columns
+from heli_jax.identification.unknowns.layout import Data, Layout
 
 
 class FlightFacts(NamedTuple):
@@ -73,37 +66,6 @@ def records_of(layout: Layout) -> list[Record]:
         layout: of a problem for frequency error.
     """
     return [Record(i, a, b) for i, facts in enumerate(layout.of_flights) for a, b in facts.parts]
-
-
-class Machine(NamedTuple):
-    """What a flight's states and outputs follow, sample by sample."""
-
-    Ad: Float[Array, "n n"]
-    B: Float[Array, "n r"]
-    C: Float[Array, "p n"]
-    D: Float[Array, "p m"]
-    U: Float[Array, "N r"]
-    """what B multiplies"""
-    acting: Float[Array, "N m"]
-    """the inputs that act at the samples"""
-
-
-def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:
-    """The discrete machine of a flight.
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        u: the unknowns.
-        i: the flight's number.
-    """
-    condition = layout.of_flights[i].condition
-    model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return Machine(Ad, B, C[rows], D[rows], U, acting)
 
 
 def without_parts(flights: Sequence[Flight]) -> str | None:

@@ -53,6 +53,8 @@ class FlightData(NamedTuple):
     """sd of the weak prior on the bias"""
     offset_scale: dict[str, Any]
     """sd of the weak prior on the offset of each input"""
+    by_instrument: Any = None
+    """the model's Inputs, arrays (N,): what of the inputs follows the instruments; None without"""
 
 
 class Data(NamedTuple):
@@ -178,6 +180,9 @@ class Noise(NamedTuple):
     mean over all lines of log det(spectrum)"""
     whitening: Any = ()
     """frequency error: by record (K, p, p) what makes white noise of that at its lines; () else"""
+    by_instrument: Any = ()
+    """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
+    as it does until the search by instrument has somewhere to begin"""
 
 
 class Solution(NamedTuple):

@@ -1,0 +1,87 @@
+r"""The rows that frequency error makes small: as many as unknowns, and one for what is left.
+
+With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
+solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
+covariance, and their derivative $R^{-T} Z^T J$ the information of the estimate,
+$M^T (Z^T Z)^{-1} M$ with $M = Z^T J$. Directly $Z = J$, and with the row $|e - J J^+ e|$ beside
+them the sum of squares is that of all errors: maximum likelihood, in a few rows. By instrument $Z$
+are the derivatives of the response to what of the inputs follows the instruments.
+
+Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon and
+Schoukens (2012), chapter 9.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.frequency_lines import all_lines
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+
+_NOTHING = 100.0
+"""times the machine's precision: what of the information, of columns of one size, is rounding"""
+
+
+def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
+    """Those rows, with the derivative that a step of Gauss and Newton needs.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: with the whitening of each record, and whether instruments are used.
+        u: the unknowns, in the units of the model.
+    """
+    v = _vector(u)
+    at, rest = jax.lax.stop_gradient((v, u))
+
+    def rows(v: Array) -> tuple[Array, Array]:
+        lines = all_lines(layout, data, noise, _with(rest, v))
+        return (
+            jnp.concatenate([one.rows for one in lines]),
+            jnp.concatenate([one.by for one in lines]),
+        )
+
+    def along(direction: Array) -> Any:
+        return jax.jvp(rows, (at,), (direction,))
+
+    (e, _), (J, Z) = jax.vmap(along, out_axes=(None, 0))(jnp.eye(v.size, dtype=v.dtype))
+    # One program for both: the direct estimate is where the search by instrument begins.
+    Z = jnp.where(noise.by_instrument > 0.5, Z, J) if Z.shape[1] else J
+    r, M = _weighed(e, J, Z)
+    rest_of = jnp.sqrt(jnp.maximum(jnp.sum(e**2) - jnp.sum(r**2), 0.0))
+    rest_of = jnp.where(noise.by_instrument > 0.5, 0.0, rest_of)
+    r, M = jax.lax.stop_gradient((r, M))
+    # The derivative is exactly M, whatever else moves with the unknowns.
+    return jnp.append(r + M @ (v - at), jax.lax.stop_gradient(rest_of))
+
+
+def _weighed(
+    e: Float[Array, " n"], J: Float[Array, "q n"], Z: Float[Array, "q n"]
+) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
+    sizes = jnp.linalg.norm(Z, axis=1)
+    # Of one size: units do not decide what is rounding.
+    Z = Z / jnp.where(sizes > 0, sizes, 1.0)[:, None]
+    values, vectors = jnp.linalg.eigh(Z @ Z.T)
+    kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    along = root[:, None] * vectors.T
+    return along @ (Z @ e), along @ (Z @ J.T)
+
+
+def _vector(u: Unknowns) -> Float[Array, " q"]:
+    """The unknowns that lines depend on: all but initial states, biases and offsets."""
+    shift = () if u.shift is None else (u.shift,)
+    return jnp.stack([jnp.asarray(v) for v in (*u.params.values(), *u.gains.values(), *shift)])
+
+
+def _with(u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
+    """The unknowns with those of a vector in place."""
+    p, g = len(u.params), len(u.gains)
+    return u._replace(
+        params={n: v[i] for i, n in enumerate(u.params)},
+        gains={n: v[p + i] for i, n in enumerate(u.gains)},
+        shift=None if u.shift is None else v[p + g],
+    )
