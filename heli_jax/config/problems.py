@@ -13,7 +13,7 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
-from heli_jax.config.starts import first_guesses, started_in_frequency
+from heli_jax.config.starts import first_guesses, instrument_for, started_in_frequency
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
@@ -68,7 +68,7 @@ def problem(experiment: Experiment) -> Problem:
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
-            instrument=config.fit.instrument,
+            instrument=instrument_for(config.fit, config.fit.method),
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:
@@ -129,6 +129,7 @@ def _by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
         fixed_noise=fixed,
         window=None if shooting is None else shooting.window,
         continuity=None if shooting is None else shooting.continuity,
+        instrument=instrument_for(config.fit, method),
     )
 
 
