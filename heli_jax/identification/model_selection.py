@@ -110,6 +110,7 @@ def _disturbed(problem: Problem, model: Model, axis: str, poles: int) -> Problem
         model=disturbed,
         vehicle=disturbed.Params(**known),
         method="filter-error",
+        instrument=None,
         fixed_noise=fixed,
     )
 

@@ -71,6 +71,8 @@ class Estimator(abc.ABC):
     rows_are_samples: ClassVar[bool] = True
     """whether the first rows are the samples in time of every signal, flight after flight and
     output after output: then their autocorrelation can be allowed for"""
+    rows_by_flight: ClassVar[bool] = True
+    """whether each row of the measurements is of one flight"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
@@ -138,6 +140,16 @@ class Estimator(abc.ABC):
         Args:
             noise: standard deviations by flight and output.
             flights: those fitted.
+        """
+        return noise
+
+    def as_it_ends(self, data: Data, noise: Noise) -> Noise:
+        """The noise to ask at the start values what a fit may determine, where a search begins by
+        other equations than it ends with.
+
+        Args:
+            data: the numbers of the problem.
+            noise: to begin with.
         """
         return noise
 

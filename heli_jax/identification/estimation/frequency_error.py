@@ -65,6 +65,7 @@ class FrequencyError(Estimator):
     """The model's response to the inputs against the measured outputs, at each frequency."""
 
     rows_are_samples = False
+    rows_by_flight = False
     least_squares = False
     errors = "residuals"
     by_instrument = True
@@ -132,6 +133,17 @@ class FrequencyError(Estimator):
         whitening = whitening_of(without_shared(s) for s in smoothed(measured))
         # Directly at first: near that estimate the equations by instrument have one solution.
         return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
+
+    def as_it_ends(self, data: Data, noise: Noise) -> Noise:
+        """By instrument, where there is one.
+
+        Args:
+            data: the numbers of the problem.
+            noise: to begin with.
+        """
+        if data.flights[0].by_instrument is None:
+            return noise
+        return noise._replace(by_instrument=np.ones(()))
 
     def relax(
         self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]

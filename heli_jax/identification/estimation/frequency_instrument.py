@@ -17,7 +17,7 @@ from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
-from heli_jax.identification.estimation.frequency_spectrum import averaged, smoothed
+from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
@@ -152,22 +152,12 @@ def strengths(at: Solution) -> dict[str, Strength]:
 
     with np.errstate(all="ignore"):
         shares = np.clip(np.nan_to_num((sds(0.0) / sds(1.0)) ** 2), 0.0, 1.0)
-    n = averages(data)
+    # Each instrument takes its part of them.
+    n = AVERAGES * len(data.flights) / max(len(_by_instrument(data)), 1)
     return {
         name: Strength(float(share), float(n * share / max(1.0 - share, 1e-12)))
         for name, share in zip(layout.of_interest, shares, strict=True)
     }
-
-
-def averages(data: Data) -> float:
-    """Independent averages in the inputs' spectra at the lowest frequencies, for each instrument.
-
-    Args:
-        data: of a fit by instrument.
-    """
-    counts = [next(iter(f.outputs.values())).shape[0] for f in data.flights]
-    total = sum(float(averaged((N - 1) // 2, PART).min()) for N in counts)
-    return total / max(len(_by_instrument(data)), 1)
 
 
 def _by_instrument(data: Data) -> tuple[str, ...]:

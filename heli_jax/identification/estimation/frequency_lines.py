@@ -44,21 +44,55 @@ def all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[Lin
         noise: with the whitening of each record.
         u: the unknowns, in the units of the model.
     """
-    # Once for all parts of a flight.
-    flights = range(len(data.flights))
-    machines = [_machine(layout, data, u, i) for i in flights]
-    by: list[_Machine | None] = [None for _ in flights]
-    if data.flights[0].by_instrument is not None:
-        alike = data._replace(
-            flights=tuple(f._replace(inputs=f.by_instrument) for f in data.flights)
+    by_flight: dict[int, list[Lines]] = {}
+    for members in _alike(layout, data):
+        # Flights that are alike side by side: one of them is compiled, not each.
+        flights = jax.tree.map(lambda *v: jnp.stack(v), *(data.flights[i] for i in members))
+        whitening = jax.tree.map(
+            lambda *v: jnp.stack([jnp.asarray(w) for w in v]),
+            *(_of_flight(layout, noise.whitening, i) for i in members),
         )
-        by = [_machine(layout, alike, u, i) for i in flights]
-    out = []
-    for record, whitening in zip(records_of(layout), noise.whitening, strict=True):
-        i = record.flight
-        y = jnp.stack([data.flights[i].outputs[n] for n in layout.outputs[i]], axis=1)
-        out.append(_lines(machines[i], by[i], y, record, whitening))
-    return out
+        first = members[0]
+
+        def of_one(flight: Any, whitening: list[Array], i: int = first) -> list[Lines]:
+            own = (*data.flights[:i], flight, *data.flights[i + 1 :])
+            return _of_records(layout, data._replace(flights=own), u, i, whitening)
+
+        made = jax.vmap(of_one)(flights, whitening)
+        for k, i in enumerate(members):
+            by_flight[i] = jax.tree.map(lambda v, k=k: v[k], made)
+    return [one for i in range(len(data.flights)) for one in by_flight[i]]
+
+
+def _alike(layout: Layout, data: Data) -> list[list[int]]:
+    """The flights in groups that differ in numbers alone."""
+    groups: dict[Any, list[int]] = {}
+    for i, flight in enumerate(data.flights):
+        n = next(iter(flight.outputs.values())).shape[0]
+        key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())
+
+
+def _of_flight(layout: Layout, whitening: Any, i: int) -> list[Array]:
+    pairs = zip(records_of(layout), whitening, strict=True)
+    return [w for record, w in pairs if record.flight == i]
+
+
+def _of_records(
+    layout: Layout, data: Data, u: Unknowns, i: int, whitening: list[Array]
+) -> list[Lines]:
+    """The records of one flight, each with its whitening."""
+    # Once for all parts of a flight.
+    flight = data.flights[i]
+    machine, by = _machine(layout, data, u, i), None
+    if flight.by_instrument is not None:
+        alike = flight._replace(inputs=flight.by_instrument)
+        flights = (*data.flights[:i], alike, *data.flights[i + 1 :])
+        by = _machine(layout, data._replace(flights=flights), u, i)
+    y = jnp.stack([flight.outputs[n] for n in layout.outputs[i]], axis=1)
+    records = [r for r in records_of(layout) if r.flight == i]
+    return [_lines(machine, by, y, r, w) for r, w in zip(records, whitening, strict=True)]
 
 
 class _Machine(NamedTuple):

@@ -33,11 +33,11 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
         noise: with the whitening of each record, and whether instruments are used.
         u: the unknowns, in the units of the model.
     """
-    v = _vector(u)
+    v = _vector(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
 
     def rows(v: Array) -> tuple[Array, Array]:
-        lines = all_lines(layout, data, noise, _with(rest, v))
+        lines = all_lines(layout, data, noise, _with(layout, rest, v))
         return (
             jnp.concatenate([one.rows for one in lines]),
             jnp.concatenate([one.by for one in lines]),
@@ -71,17 +71,19 @@ def _weighed(
     return along @ (Z @ e), along @ (Z @ J.T)
 
 
-def _vector(u: Unknowns) -> Float[Array, " q"]:
+def _vector(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
     """The unknowns that lines depend on: all but initial states, biases and offsets."""
-    shift = () if u.shift is None else (u.shift,)
-    return jnp.stack([jnp.asarray(v) for v in (*u.params.values(), *u.gains.values(), *shift)])
+    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
+    shift = [] if u.shift is None else [u.shift]
+    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
 
 
-def _with(u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
+def _with(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
     """The unknowns with those of a vector in place."""
-    p, g = len(u.params), len(u.gains)
+    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
+    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
     return u._replace(
-        params={n: v[i] for i, n in enumerate(u.params)},
-        gains={n: v[p + i] for i, n in enumerate(u.gains)},
-        shift=None if u.shift is None else v[p + g],
+        params={n: values[n] for n in layout.free},
+        gains={n: values[n] for n in layout.gains},
+        shift=None if u.shift is None else v[-1],
     )

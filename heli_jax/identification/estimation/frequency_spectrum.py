@@ -12,6 +12,8 @@ from jaxtyping import Complex, Float
 LEAST, PART = 6.0, 0.08
 """sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
 part of the frequency. Narrower ones follow the noise itself: intervals are then too narrow"""
+AVERAGES = 2.0 * np.pi**0.5 * LEAST
+"""independent lines of one record in a smoothed spectrum, at least: (sum w)^2 / sum w^2"""
 _ROUNDING = 1e-10
 """of the mean over all frequencies, below which a spectrum is not taken to fall"""
 _KNOTS = 4.0
@@ -49,19 +51,6 @@ def smoothed(
         floor = _ROUNDING * np.mean(np.real(np.einsum("kii->ki", S)), axis=0)
         spectra[K] = S + np.diag(floor)[None]
     return [spectra[len(v)] for v in lines]
-
-
-def averaged(K: int, part: float) -> Float[np.ndarray, " K"]:
-    """How many lines of one record of K lines a smoothed spectrum is an independent mean of.
-
-    Args:
-        K: lines of the record.
-        part: sd of the Gaussian as a part of the frequency.
-    """
-    # Of a Gaussian: (sum w)^2 / sum w^2 = 2 sqrt(pi) sd; at the ends there is half of it.
-    kernel = _kernel(K, K, part)
-    numbers = kernel.sum(axis=1) ** 2 / (kernel**2).sum(axis=1)
-    return np.interp(np.arange(K), _knots(K, part)[0], numbers)
 
 
 @functools.lru_cache(maxsize=16)
