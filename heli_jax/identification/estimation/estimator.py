@@ -73,6 +73,8 @@ class Estimator(abc.ABC):
     output after output: then their autocorrelation can be allowed for"""
     rows_by_flight: ClassVar[bool] = True
     """whether each row of the measurements is of one flight"""
+    flights_in_rows: ClassVar[bool] = True
+    """whether the rows know of initial states, biases and offsets"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True

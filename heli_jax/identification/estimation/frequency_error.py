@@ -65,6 +65,7 @@ class FrequencyError(Estimator):
     """The model's response to the inputs against the measured outputs, at each frequency."""
 
     rows_are_samples = False
+    flights_in_rows = False
     rows_by_flight = False
     least_squares = False
     errors = "residuals"
