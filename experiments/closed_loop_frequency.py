@@ -29,7 +29,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.onboard.delays import with_delays
 
 jax.config.update("jax_enable_x64", True)
-DT, SECONDS, SWEEP, BAND = 0.02, 90.0, 0.08, (0.05, 4.0)
+DT, SECONDS, SWEEP, BAND = 0.02, 90.0, 0.15, (0.05, 4.0)
 ATTITUDE = ("Lb", "Ma", "tau_f", "Ab", "Ac", "Alat", "Alon", "Ba", "Bd", "Blat", "Blon")
 ATTITUDE = (*ATTITUDE, "tau_s", "Clon", "Dlat")
 SPEED = ("Xu", "Yv", "Lu", "Lv", "Mu", "Mv")
@@ -195,7 +195,7 @@ def one_fit(seed: int, method: str) -> dict[str, Any]:
         "all_seconds": time.perf_counter() - begin,
         "tic": doublet_tic(values),
         "untrusted": list(found.untrusted),
-        "moved": {n: [m.by, m.uncertain] for n, m in found.moved_by_feedback.items()},
+        "moved": dict(found.moved_by_feedback),
         "error": {n: values[n] - t for n, t in truths().items()},
         "z": {n: (values[n] - t) / (found.estimates[n].sd or np.nan) for n, t in truths().items()},
     }

@@ -45,7 +45,10 @@ from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
-from heli_jax.identification.validation.closed_loop_trust import moved_by_feedback, trust_notes
+from heli_jax.identification.validation.closed_loop_trust import (
+    feedback_trust_notes,
+    moved_by_feedback,
+)
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -172,7 +175,7 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    moved = moved_by_feedback(problem, solution, found) if bool(best.converged) else {}
+    moved = moved_by_feedback(solution, found) if bool(best.converged) else {}
     by_instrument = data.flights[0].by_instrument is not None
     adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
@@ -206,7 +209,7 @@ def assemble(
         notes=(
             *notes,
             *closed_loop,
-            *trust_notes(moved),
+            *feedback_trust_notes(moved),
             *adequacy.sentences,
             *missing,
             *held.notes,

@@ -13,7 +13,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
-from heli_jax.identification.validation.closed_loop_trust import Moved
+from heli_jax.identification.validation.closed_loop_trust import TRUSTED
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
@@ -142,9 +142,9 @@ class Fit:
     """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
     feedback: tuple[Feedback, ...] = ()
     """by flight and input, whether it follows the response"""
-    moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
-    """frequency error in a closed loop without an instrument: by parameter how far feedback may
-    have moved it"""
+    moved_by_feedback: Mapping[str, float] = field(default_factory=dict)
+    """frequency error in a closed loop without an instrument: by parameter the standard deviations
+    by which feedback may have moved it"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0
@@ -159,8 +159,8 @@ class Fit:
 
     @property
     def untrusted(self) -> tuple[str, ...]:
-        """The parameters that feedback may have moved by more than their intervals allow."""
-        return tuple(n for n, m in self.moved_by_feedback.items() if not m.trusted)
+        """The parameters that feedback may have biased."""
+        return tuple(n for n, v in self.moved_by_feedback.items() if v > TRUSTED)
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:

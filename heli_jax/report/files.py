@@ -109,10 +109,8 @@ def _residuals(fit: Fit) -> dict[str, Any]:
     return {
         "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
-        "moved_by_feedback": {
-            n: {"standard_deviations": m.by, "sd": m.uncertain, "trusted": m.trusted}
-            for n, m in fit.moved_by_feedback.items()
-        },
+        "moved_by_feedback": dict(fit.moved_by_feedback),
+        "untrusted": list(fit.untrusted),
     }
 
 

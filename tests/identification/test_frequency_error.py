@@ -12,7 +12,7 @@ import scipy.linalg
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models, naming, simulate
 from heli_jax.dynamics.linearised import point
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.frequency_error import _errors
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import cut_notes
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
@@ -172,7 +172,7 @@ def test_a_flight_is_cut_at_its_missing_samples():
     assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
     data, noise = data_of(problem, problem.training, layout), first_noise(problem, [exact])
     at_truth = start_vector(layout, data, problem)
-    lines = _errors(layout, data, noise, at_truth)
+    lines = errors_of_lines(layout, data, noise, at_truth)
     assert [len(one) for one in lines] == [349, 249]
     np.testing.assert_allclose(np.concatenate(lines), 0.0, atol=1e-10)
     [note] = cut_notes(layout, data)

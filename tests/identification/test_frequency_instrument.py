@@ -7,7 +7,7 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.identification.estimation.frequency_instrument import following
-from heli_jax.identification.estimation.frequency_rows import _weighed
+from heli_jax.identification.estimation.frequency_rows import _Rows, _weighed
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
 
 DT = 0.04
@@ -61,16 +61,23 @@ def problem(leaning, flights, **more):
 def test_the_rows_solve_the_equations_and_have_their_covariance():
     rng = np.random.default_rng(0)
     J, Z = rng.standard_normal((2, 3, 50)) * np.array([1.0, 1e6, 1e-4])[None, :, None]
-    e = rng.standard_normal(50)
-    r, M = (np.asarray(v) for v in _weighed(*(jnp.asarray(v) for v in (e, J, Z))))
-    np.testing.assert_allclose(np.linalg.solve(M, r), np.linalg.solve(Z @ J.T, Z @ e), rtol=1e-8)
-    inverse = np.linalg.inv(Z @ J.T)
-    covariance = inverse @ (Z @ Z.T) @ inverse.T
+    e, Q = rng.standard_normal(50), np.linalg.qr(rng.standard_normal((50, 4)))[0]
+
+    def weighed(Z):
+        parts = [jnp.asarray(v) for v in (e, e @ Q, Z, Z @ Q, J, J @ Q)]
+        return [np.asarray(v) for v in _weighed(_Rows(*parts[:4]), _Rows(*parts[4:], *parts[2:4]))]
+
+    r, M = weighed(Z)
+    # The same with the ends projected out of everything by hand.
+    e, J, F = (v - v @ Q @ Q.T for v in (e, J, Z))
+    np.testing.assert_allclose(np.linalg.solve(M, r), np.linalg.solve(F @ J.T, F @ e), rtol=1e-8)
+    inverse = np.linalg.inv(F @ J.T)
+    covariance = inverse @ (F @ F.T) @ inverse.T
     np.testing.assert_allclose(np.linalg.inv(M.T @ M), covariance, rtol=1e-8)
     # An instrument that says what another says already makes no row, and not one of rounding.
-    r, M = _weighed(*(jnp.asarray(v) for v in (e, J, np.stack([Z[0], Z[1], 2.0 * Z[0]]))))
-    assert np.linalg.matrix_rank(np.asarray(M)) == 2
-    assert np.count_nonzero(np.asarray(r)) == 2
+    r, M = weighed(np.stack([Z[0], Z[1], 2.0 * Z[0]]))
+    assert np.linalg.matrix_rank(M) == 2
+    assert np.count_nonzero(r) == 2
 
 
 def test_a_smoothed_spectrum_is_the_mean_under_a_gaussian():

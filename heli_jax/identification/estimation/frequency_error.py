@@ -19,7 +19,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,7 +30,7 @@ from heli_jax.identification.estimation.frequency_instrument import (
     instrument_notes,
     instrumented_inputs,
 )
-from heli_jax.identification.estimation.frequency_lines import all_lines
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import (
     FlightFacts,
     Record,
@@ -57,7 +56,6 @@ from heli_jax.identification.unknowns.layout import (
     Noise,
     Solution,
     Unknowns,
-    unpack,
 )
 
 
@@ -66,6 +64,7 @@ class FrequencyError(Estimator):
 
     rows_are_samples = False
     flights_in_rows = False
+    noise_spectrum = True
     rows_by_flight = False
     least_squares = False
     errors = "residuals"
@@ -98,7 +97,9 @@ class FrequencyError(Estimator):
             problem: what is fitted.
             flights: those of a layout, in its order.
         """
-        return tuple(FlightFacts(parts_of(f), condition_of(problem.model, f)) for f in flights)
+        return tuple(
+            FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
+        )
 
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
@@ -158,7 +159,7 @@ class FrequencyError(Estimator):
             noise: so far.
             z: the unknowns.
         """
-        errors = [np.asarray(v) for v in _errors(layout, data, noise, z)]
+        errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
@@ -236,12 +237,6 @@ class FrequencyError(Estimator):
             seed: of nothing here, since nothing is drawn.
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
-
-
-@eqx.filter_jit
-def _errors(layout: Layout, data: Data, noise: Noise, z: Array) -> list[Array]:
-    """By record the errors (K, p), its ends taken off, not whitened."""
-    return [one.error for one in all_lines(layout, data, noise, unpack(layout, data, z))]
 
 
 ESTIMATOR = FrequencyError()

@@ -6,6 +6,7 @@ Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (19
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.frequency_records import Record, records_of
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.simulated_flights import driven
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.simulation.hold import linear_inputs
 from heli_jax.simulation.stepping import held_columns
 
@@ -31,8 +32,13 @@ class Lines(NamedTuple):
     """measured less simulated, the ends of the record taken off"""
     rows: Float[Array, " s"]
     """the same whitened, real parts and then imaginary ones; of white noise of variance 1"""
+    ends: Float[Array, " n"]
+    """the components of `rows` along what the ends of the record may add: zero but for their
+    derivatives"""
     by: Float[Array, " s"]
     """minus the response to the inputs by instrument, whitened likewise; () without"""
+    by_ends: Float[Array, " n"]
+    """its components along what the ends may add; () without"""
 
 
 def all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[Lines]:
@@ -47,21 +53,36 @@ def all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[Lin
     by_flight: dict[int, list[Lines]] = {}
     for members in _alike(layout, data):
         # Flights that are alike side by side: one of them is compiled, not each.
-        flights = jax.tree.map(lambda *v: jnp.stack(v), *(data.flights[i] for i in members))
-        whitening = jax.tree.map(
-            lambda *v: jnp.stack([jnp.asarray(w) for w in v]),
-            *(_of_flight(layout, noise.whitening, i) for i in members),
-        )
-        first = members[0]
+        first, flights = members[0], [data.flights[i] for i in members]
+        stacked = jax.tree.map(lambda *v: jnp.stack(v), *flights)
+        # Records of one length have one spectrum (`smoothed`), and with one sample time all that
+        # does not hang on the signals is computed once.
+        whitening = _of_flight(layout, noise.whitening, first)
 
-        def of_one(flight: Any, whitening: list[Array], i: int = first) -> list[Lines]:
+        def of_one(flight: Any, i: int = first, whitening: Any = whitening) -> list[Lines]:
+            flight = flight._replace(dt=data.flights[i].dt)
             own = (*data.flights[:i], flight, *data.flights[i + 1 :])
             return _of_records(layout, data._replace(flights=own), u, i, whitening)
 
-        made = jax.vmap(of_one)(flights, whitening)
+        made = jax.vmap(of_one)(stacked)
         for k, i in enumerate(members):
             by_flight[i] = jax.tree.map(lambda v, k=k: v[k], made)
     return [one for i in range(len(data.flights)) for one in by_flight[i]]
+
+
+@eqx.filter_jit
+def errors_of_lines(
+    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
+) -> list[Complex[Array, "K p"]]:
+    """By record the errors, its ends taken off, not whitened.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: with the whitening of each record.
+        z: the unknowns.
+    """
+    return [one.error for one in all_lines(layout, data, noise, unpack(layout, data, z))]
 
 
 def _alike(layout: Layout, data: Data) -> list[list[int]]:
@@ -70,6 +91,8 @@ def _alike(layout: Layout, data: Data) -> list[list[int]]:
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
         key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
+        # An offset of its own moves the point about which a flight is linearised.
+        key = key if layout.model.linear else (i, *key)
         groups.setdefault(key, []).append(i)
     return list(groups.values())
 
@@ -159,12 +182,13 @@ def _lines(
     d = jax.lax.stop_gradient(basis.solution @ (basis.Q.T @ white))
     driving = driving + z[:, None] * d.astype(z.dtype)[None, :]
     white = Y - passing - _response(fixed, Ad, C, driving)
-    error = jnp.linalg.solve(whitening, white[:, :, None])[:, :, 0]
+    error, rows = jnp.linalg.solve(whitening, white[:, :, None])[:, :, 0], _stacked(white)
+    nothing = jnp.zeros(0, rows.dtype)
     if by is None:
-        return Lines(error, basis.off(_stacked(white)), jnp.zeros(0, error.real.dtype))
+        return Lines(error, rows, basis.Q.T @ rows, nothing, nothing)
     driving, passing = answered(by)
-    response = passing + _response(fixed, by.Ad, by.C, driving)
-    return Lines(error, basis.off(_stacked(white)), -basis.off(_stacked(response)))
+    response = -_stacked(passing + _response(fixed, by.Ad, by.C, driving))
+    return Lines(error, rows, basis.Q.T @ rows, response, basis.Q.T @ response)
 
 
 class _Span(NamedTuple):
@@ -174,10 +198,6 @@ class _Span(NamedTuple):
     """orthonormal; zero where a state leaves no trace"""
     solution: Float[Array, "n n"]
     """from the components along Q to the ends' states"""
-
-    def off(self, rows: Float[Array, " s"]) -> Float[Array, " s"]:
-        """The rows without it: as good as searching for the ends' states (Kaufman)."""
-        return rows - self.Q @ (self.Q.T @ rows)
 
 
 def _span(basis: Float[Array, "s n"]) -> _Span:
@@ -214,11 +234,10 @@ def _response_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     X = jnp.einsum("kij,kj->ki", fixed.P, b)
     y = jnp.einsum("kij,kj->ki", fixed.W, X @ C.T.astype(X.dtype))
     # One product for each line in place of a solution: H is the same for all unknowns.
-    moved = jnp.zeros_like(b)
-    if not _is_zero(db):
-        moved = moved + db
+    moved = jnp.zeros_like(b) if _is_zero(db) else db
     if not _is_zero(dA):
-        moved = moved + X @ dA.T.astype(X.dtype)
+        # Real matrices: half of a complex product.
+        moved = moved + jax.lax.complex(jnp.real(X) @ dA.T, jnp.imag(X) @ dA.T)
     dy = jnp.einsum("kij,kj->ki", fixed.H, moved)
     if not _is_zero(dC):
         dy = dy + jnp.einsum("kij,kj->ki", fixed.W, X @ dC.T.astype(X.dtype))

@@ -20,6 +20,8 @@ class FlightFacts(NamedTuple):
 
     parts: tuple[tuple[int, int], ...]
     """first sample, and that behind the last, of each part that is a record of its own"""
+    dt: float
+    """[s]: flights of one sample time share much of their program"""
     condition: Condition | None = None
     """the steady flight about which a whole helicopter is linearised"""
 

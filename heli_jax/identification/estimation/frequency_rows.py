@@ -11,7 +11,7 @@ Sources: Söderström and Stoica (1983) for estimates by instrument and their co
 Schoukens (2012), chapter 9.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,39 +36,56 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     v = _vector(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
 
-    def rows(v: Array) -> tuple[Array, Array]:
+    def rows(v: Array) -> _Rows:
         lines = all_lines(layout, data, noise, _with(layout, rest, v))
-        return (
-            jnp.concatenate([one.rows for one in lines]),
-            jnp.concatenate([one.by for one in lines]),
-        )
+        return _Rows(*(jnp.concatenate([one[i] for one in lines]) for i in range(1, 5)))
 
     def along(direction: Array) -> Any:
         return jax.jvp(rows, (at,), (direction,))
 
-    (e, _), (J, Z) = jax.vmap(along, out_axes=(None, 0))(jnp.eye(v.size, dtype=v.dtype))
-    # One program for both: the direct estimate is where the search by instrument begins.
-    Z = jnp.where(noise.by_instrument > 0.5, Z, J) if Z.shape[1] else J
-    r, M = _weighed(e, J, Z)
-    rest_of = jnp.sqrt(jnp.maximum(jnp.sum(e**2) - jnp.sum(r**2), 0.0))
-    rest_of = jnp.where(noise.by_instrument > 0.5, 0.0, rest_of)
-    r, M = jax.lax.stop_gradient((r, M))
+    e, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(v.size, dtype=v.dtype))
+    Z, Z_ends = slopes.errors, slopes.ends
+    if slopes.by.shape[1]:
+        # One program for both: the direct estimate is where the search by instrument begins.
+        by = noise.by_instrument > 0.5
+        Z, Z_ends = jnp.where(by, slopes.by, Z), jnp.where(by, slopes.by_ends, Z_ends)
+    r, M = _weighed(_Rows(e.errors, e.ends, Z, Z_ends), slopes)
+    left = jnp.sum(e.errors**2) - jnp.sum(e.ends**2) - jnp.sum(r**2)
+    left = jnp.where(noise.by_instrument > 0.5, 0.0, jnp.sqrt(jnp.maximum(left, 0.0)))
+    r, M, left = jax.lax.stop_gradient((r, M, left))
     # The derivative is exactly M, whatever else moves with the unknowns.
-    return jnp.append(r + M @ (v - at), jax.lax.stop_gradient(rest_of))
+    return jnp.append(r + M @ (v - at), left)
 
 
-def _weighed(
-    e: Float[Array, " n"], J: Float[Array, "q n"], Z: Float[Array, "q n"]
-) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
-    sizes = jnp.linalg.norm(Z, axis=1)
+class _Rows(NamedTuple):
+    """Whitened errors and instruments with their components along what the ends of the records may
+    add, or the derivatives of all of them, an unknown a row."""
+
+    errors: Float[Array, "... n"]
+    ends: Float[Array, "... m"]
+    by: Float[Array, "... n"]
+    by_ends: Float[Array, "... m"]
+
+
+def _weighed(e: _Rows, J: _Rows) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T, all without what the ends may add; zero along
+    what is no direction of Z.
+
+    Args:
+        e: the errors (n,), and Z (q, n).
+        J: their derivatives (q, n).
+    """
+    # Z P e and Z P J^T with the projection P: only the small products change (Kaufman).
+    information = e.by @ e.by.T - e.by_ends @ e.by_ends.T
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 0.0))
     # Of one size: units do not decide what is rounding.
-    Z = Z / jnp.where(sizes > 0, sizes, 1.0)[:, None]
-    values, vectors = jnp.linalg.eigh(Z @ Z.T)
+    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(information * over[:, None] * over[None, :])
     kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
     root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
-    along = root[:, None] * vectors.T
-    return along @ (Z @ e), along @ (Z @ J.T)
+    along = root[:, None] * vectors.T * over[None, :]
+    r = e.by @ e.errors - e.by_ends @ e.ends
+    return along @ r, along @ (e.by @ J.errors.T - e.by_ends @ J.ends.T)
 
 
 def _vector(layout: Layout, u: Unknowns) -> Float[Array, " q"]:

@@ -42,7 +42,7 @@ def smoothed(
         total, weight = 0.0, 0.0
         for other, power in powers.items():
             kernel = _kernel(K, other, part)
-            flat = power.reshape(other, -1)
+            flat = np.ascontiguousarray(power.reshape(other, -1))
             total = total + (kernel @ flat.view(float)).view(complex)
             weight = weight + counts[other] * kernel.sum(axis=1)
         at_knots = (total / np.asarray(weight)[:, None]).reshape(len(knots), *power.shape[1:])

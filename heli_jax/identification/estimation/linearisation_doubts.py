@@ -159,7 +159,7 @@ def _flight(layout: Layout, data: Data, z: Array, i: int) -> _LeftOut:
 
 def _growth(A: np.ndarray) -> float:
     """Of the fastest mode that grows [1/s]; 0 where none does."""
-    return max(float(np.max(np.linalg.eigvals(A).real)), 0.0) if np.isfinite(A).all() else 0.0
+    return max(float(np.max(np.real(np.linalg.eigvals(A)))), 0.0) if np.isfinite(A).all() else 0.0
 
 
 def _moved(
@@ -172,7 +172,8 @@ def _moved(
         outputs = {n: y + out.signal[names.index(n)] for n, y in flight.outputs.items()}
         flights.append(flight._replace(outputs=outputs))
     # The rows are linear in what was measured: their change is that of an error of the model.
-    rows = np.asarray(_rows(layout, data._replace(flights=tuple(flights)), noise, e.z))
+    changed = data._replace(flights=tuple(flights))
+    rows = np.asarray(_rows(layout, changed, noise, jnp.asarray(e.z)))
     change, J = rows - np.asarray(e.r), np.asarray(e.J)
     if not (np.isfinite(change).all() and np.isfinite(J).all()):
         return None
@@ -182,7 +183,7 @@ def _moved(
 
 @eqx.filter_jit
 def _rows(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
-    return rows_of(layout, data, noise, jnp.asarray(z))
+    return rows_of(layout, data, noise, z)
 
 
 def _note(layout: Layout, data: Data, i: int, left: _LeftOut) -> str:
