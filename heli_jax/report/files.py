@@ -241,12 +241,13 @@ def whiteness_note(fit: Fit) -> str:
         return ""
     # By the correlation at one sample, which is the number that the sentence gives.
     worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    what = estimator_of(fit.method).errors
+    estimator = estimator_of(fit.method)
+    what, better = estimator.errors, fit.disturbable and not estimator.noise_spectrum
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
             "residuals' autocorrelation"
-            + (", which filter-error would use for a better estimate." if fit.disturbable else ".")
+            + (", which filter-error would use for a better estimate." if better else ".")
         )
     else:
         # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
