@@ -182,6 +182,7 @@ def main(runs: int) -> None:
                 found = estimates(folder, measured)
                 errors[measured].append([found[n][0] - x for n, x in TRUTH.items()])
                 sds[measured].append([found[n][1] for n in TRUTH])
+            print(f"{seed + 1} of {runs}", end="\r", file=sys.stderr)
     print(f"{runs} runs")
     for measured, title in ((True, "filter and delays modelled"), (False, "ignored")):
         print(

@@ -101,6 +101,10 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    new = command("new", _new, "a configuration that begins with what a log holds")
+    cli_options.add_new_options(new)
+    listing = command("keys", _keys, "what may stand in a configuration")
+    cli_options.add_keys_options(listing)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -239,7 +243,7 @@ def _simulate(options: argparse.Namespace) -> int:
             run_directory.require_place(place, f"{option} {place}")
     _prepare_jax()
     from heli_jax import config as configuration
-    from heli_jax import generate, output
+    from heli_jax import generate, simulation_output
 
     experiment = configuration.load(options.config, options.set)
     if experiment.config.simulate is not None:
@@ -248,11 +252,11 @@ def _simulate(options: argparse.Namespace) -> int:
         simulated = generate.follow(experiment)
     for note in simulated.notes:
         _say(f"{options.config}: {note}")
-    output.write_table(out, simulated.columns)
+    simulation_output.write_table(out, simulated.columns)
     if out is not None:
         _say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
-        output.write_view(view, experiment, simulated)
+        simulation_output.write_view(view, experiment, simulated)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         _say(f"wrote {view}{whole}")
     return DONE
@@ -274,7 +278,7 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import output, workflow
+    from heli_jax import simulation_output, workflow
 
     experiment = workflow.load_config(config, options.set)
 
@@ -285,7 +289,7 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.words = interrupted
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with output.sweep_progress() as progress, _client(options, config) as client:
+    with simulation_output.sweep_progress() as progress, _client(options, config) as client:
         workflow.run_sweep(
             experiment,
             out,
@@ -298,7 +302,7 @@ def _sweep(options: argparse.Namespace) -> int:
             progress=progress,
             say=_say,
         )
-    output.print_sweep(out)
+    simulation_output.print_sweep(out)
     return DONE
 
 
@@ -351,6 +355,32 @@ def _convert(options: argparse.Namespace) -> int:
         _say(f"{options.log}: {note}")
     columns = converted.columns
     _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
+    return DONE
+
+
+def _new(options: argparse.Namespace) -> int:
+    from heli_jax.new_config import write_config
+
+    log = Path(options.log)
+    out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
+    written = write_config(log, out, options.model, options.vehicle, options.flight)
+    for note in written.notes:
+        _say(note)
+    return DONE
+
+
+def _keys(options: argparse.Namespace) -> int:
+    from heli_jax import reference
+
+    if options.schema is not None:
+        place = Path(options.schema)
+        run_directory.require_place(place, f"--schema {place}")
+        reference.write_schema(place)
+        _say(f"wrote {place}")
+    elif options.json:
+        print(reference.as_json(options.pattern))
+    else:
+        reference.print_keys(options.pattern)
     return DONE
 
 

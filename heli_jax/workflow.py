@@ -17,6 +17,7 @@ from heli_jax.config import Experiment
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import check, findings, fit, rates
+from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
@@ -260,7 +261,27 @@ def _supplementary(
         raise InputError(f"{config.path}: fit: {e}") from e
     if options.compare:
         choice = compare_models(config, problem, progress=progress)
-    return SupplementaryAnalyses(choice, further)
+    return SupplementaryAnalyses(
+        choice, further, methods=_by_methods(config, problem, fitted, progress)
+    )
+
+
+def _by_methods(
+    config: Experiment, problem: Problem, fitted: Fit, progress: Say
+) -> MethodComparison | None:
+    """The same problem by the methods of `fit.also`; None where there are none."""
+    options = config.config.fit
+    assert options is not None
+    if not options.also:
+        return None
+    return compare_methods(
+        fitted,
+        configuration.by_other_methods(config, problem),
+        starts=options.starts,
+        seed=options.seed,
+        max_steps=options.max_steps,
+        progress=progress,
+    )
 
 
 def compare_models(

@@ -51,7 +51,7 @@ ALLOWED = {
 ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
-    "compatibility",
+    "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
     "__init__",
     "__main__",
 }  # fmt: skip
@@ -117,7 +117,7 @@ def test_imports_point_one_way(name):
 ROOMS = (
     "methods", "free", "push_scale", "problem", "unknowns", "estimation", "identifiability",
     "validation", "equation_error", "result", "uncertainty", "agreement", "assemble", "fit",
-    "frequency_start", "model_selection", "disturbed_sets",
+    "frequency_start", "method_comparison", "model_selection", "disturbed_sets",
 )  # fmt: skip
 
 

@@ -13,12 +13,13 @@ from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
-from heli_jax.config.starts import first_guesses, started_in_frequency
+from heli_jax.config.starts import first_guesses, instrument_for, started_in_frequency
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
@@ -47,12 +48,7 @@ def problem(experiment: Experiment) -> Problem:
     # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if config.fit.method == "filter-error":
-        # A model with process noise of its own needs none beside it.
-        if config.disturbance is None and model.noise_intensity is None:
-            raise InputError(
-                f"{path}: fit.method: filter-error needs a disturbance, expected "
-                "disturbance: {axis: roll, poles: 1}"
-            )
+        _require_disturbance(experiment, "fit.method")
         model, params = disturbed(experiment)
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
@@ -72,7 +68,7 @@ def problem(experiment: Experiment) -> Problem:
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
-            instrument=config.fit.instrument,
+            instrument=instrument_for(config.fit, config.fit.method),
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:
@@ -81,6 +77,60 @@ def problem(experiment: Experiment) -> Problem:
         raise InputError(f"{place}: {e}") from e
     # Of the flights that are fitted: by now their windows are chosen.
     return started_in_frequency(experiment, whole)
+
+
+def _require_disturbance(experiment: Experiment, place: str) -> None:
+    # A model with process noise of its own needs none beside it.
+    if experiment.config.disturbance is None and experiment.model.noise_intensity is None:
+        raise InputError(
+            f"{experiment.path}: {place}: filter-error needs a disturbance, expected "
+            "disturbance: {axis: roll, poles: 1}"
+        )
+
+
+def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Problem | str]:
+    """By method of `fit.also` the same problem for it, or why the method refuses it.
+
+    Args:
+        experiment: the configuration.
+        fitted: the problem by its own method.
+
+    Raises:
+        InputError: filter error is asked for without a disturbance.
+    """
+    assert experiment.config.fit is not None
+    if "filter-error" in experiment.config.fit.also:
+        _require_disturbance(experiment, "fit.also")
+    problems: dict[str, Problem | str] = {}
+    for method in experiment.config.fit.also:
+        try:
+            problems[method] = _by_method(experiment, fitted, method)
+        except ValueError as e:
+            problems[method] = str(e)
+    return problems
+
+
+def _by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
+    config = experiment.config
+    assert config.fit is not None
+    model, params, fixed = experiment.model, experiment.vehicle.params, ()
+    free = {n: fitted.free[n] for n in config.fit.free}
+    if method == "filter-error":
+        model, params = disturbed(experiment)
+        free = {**free_noise(model, params, fitted.flights), **free}
+        fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
+    shooting = config.fit.shooting if estimator_of(method).windows else None
+    return dataclasses.replace(
+        fitted,
+        model=model,
+        vehicle=params,
+        free=free,
+        method=method,
+        fixed_noise=fixed,
+        window=None if shooting is None else shooting.window,
+        continuity=None if shooting is None else shooting.continuity,
+        instrument=instrument_for(config.fit, method),
+    )
 
 
 def with_chosen_windows(problem: Problem) -> Problem:

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from heli_jax import naming
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free
+from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.problem import Problem
 
 if TYPE_CHECKING:
@@ -68,6 +70,19 @@ def first_guesses(
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
 
 
+def instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
+    """The inputs that a method takes by their instrument, as `Problem.instrument` has them.
+
+    Args:
+        config: whose `instrument` may be meant for the start, or for a method of `also`.
+        method: that the problem is for.
+    """
+    others = [m for m in (config.start.method, *config.also) if m in METHODS]
+    if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
+        return config.instrument
+    return None
+
+
 def started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
     """The problem with the starts that `fit.start: frequency-error` finds; else as it is.
 
@@ -90,6 +105,7 @@ def started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
         "vehicle": experiment.vehicle.params,
         "free": {n: f for n, f in problem.free.items() if n in known},
         "method": "frequency-error",
+        "instrument": config.instrument,
     }
     whole = {"fixed_noise": (), "window": None, "continuity": None}
     try:

@@ -16,6 +16,7 @@ from heli_jax.identification.equation_error.first_guess import EquationErrorStar
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
@@ -35,6 +36,8 @@ class SupplementaryAnalyses(NamedTuple):
     intervals: Intervals | None = None
     findings: tuple[Finding, ...] = ()
     """whether the log is enough, as it was before the fit"""
+    methods: MethodComparison | None = None
+    """further methods beside the fit's own"""
 
 
 def fit_json(
@@ -75,6 +78,7 @@ def fit_json(
             **_metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
+            "methods": _methods(supplementary.methods),
             "intervals": _intervals(supplementary.intervals),
             "record": [f._asdict() for f in supplementary.findings],
             "log_likelihood": fit.log_likelihood,
@@ -189,6 +193,25 @@ def _choice(choice: Choice | None) -> dict[str, Any] | None:
     }
 
 
+def _methods(comparison: MethodComparison | None) -> dict[str, Any] | None:
+    """By method its estimates, and how far they are from those of the first."""
+    if comparison is None:
+        return None
+    results = {}
+    for r in comparison.results:
+        estimates = {} if r.fit is None or r.reason else r.fit.estimates
+        results[r.method] = {
+            "status": "refused" if r.fit is None else r.fit.status,
+            "verdict": r.word,
+            "reason": r.reason or None,
+            "seconds": r.seconds,
+            "parameters": {n: _parameter(e) for n, e in estimates.items()},
+            "difference_joint_sd": {n: comparison.difference(r, n) for n in estimates},
+            "notes": [] if r.fit is None else list(r.fit.notes),
+        }
+    return {"results": results, "sentences": list(comparison.sentences)}
+
+
 def _intervals(comparison: Intervals | None) -> dict[str, Any] | None:
     if comparison is None:
         return None
@@ -218,12 +241,13 @@ def whiteness_note(fit: Fit) -> str:
         return ""
     # By the correlation at one sample, which is the number that the sentence gives.
     worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    what = estimator_of(fit.method).errors
+    estimator = estimator_of(fit.method)
+    what, better = estimator.errors, fit.disturbable and not estimator.noise_spectrum
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
             "residuals' autocorrelation"
-            + (", which filter-error would use for a better estimate." if fit.disturbable else ".")
+            + (", which filter-error would use for a better estimate." if better else ".")
         )
     else:
         # Autocorrelated samples repeat one another, so that there are fewer pieces of news than

@@ -196,6 +196,7 @@ def render(
         intervals=tables.intervals(supplementary.intervals, fit)
         if supplementary.intervals
         else None,
+        methods=tables.methods(supplementary.methods) if supplementary.methods else None,
         acceptance=tables.acceptance(lines),
         summary=card.summary(lines),
         residuals=tables.residuals(fit, problem),

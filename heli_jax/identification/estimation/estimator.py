@@ -73,6 +73,11 @@ class Estimator(abc.ABC):
     output after output: then their autocorrelation can be allowed for"""
     rows_by_flight: ClassVar[bool] = True
     """whether each row of the measurements is of one flight"""
+    noise_spectrum: ClassVar[bool] = False
+    """whether the noise's spectrum is estimated, so that intervals allow for noise that is not
+    white"""
+    flights_in_rows: ClassVar[bool] = True
+    """whether the rows know of initial states, biases and offsets"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True

@@ -8,7 +8,8 @@ $$X = (zI - A_d)^{-1}\,[B_d U + z\,(x_0 - x_N)]$$
 is exact, for unstable machines too: nothing is simulated, and the ends of the record are n numbers
 that are found by linear least squares and projected out. The noise's spectrum, a matrix over the
 outputs, is estimated from the residual and weighs the frequencies; maximum likelihood then holds
-where gusts disturb the machine as well, as long as no feedback brings them into the inputs.
+where gusts disturb the machine as well, as long as no feedback brings them into the inputs. Models
+that are not linear are linearised where they fly.
 
 Where flights hold an excitation that was added to an input and that no feedback reaches, the errors
 are weighed by the response to what of the input follows it: then feedback does no harm either.
@@ -18,8 +19,6 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 
 from collections.abc import Sequence
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -46,6 +45,9 @@ from heli_jax.identification.estimation.frequency_spectrum import (
     whitening_of,
     without_shared,
 )
+from heli_jax.identification.estimation.in_time import nearest_in_time
+from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
+from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
@@ -54,7 +56,6 @@ from heli_jax.identification.unknowns.layout import (
     Noise,
     Solution,
     Unknowns,
-    unpack,
 )
 
 
@@ -62,6 +63,8 @@ class FrequencyError(Estimator):
     """The model's response to the inputs against the measured outputs, at each frequency."""
 
     rows_are_samples = False
+    flights_in_rows = False
+    noise_spectrum = True
     rows_by_flight = False
     least_squares = False
     errors = "residuals"
@@ -79,25 +82,24 @@ class FrequencyError(Estimator):
         return Residuals(rows_of_lines(layout, data, noise, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
-        """Other than linear models, and flights without a part in which every output is there.
+        """Flights without a part in which every output is there, and without a trim.
 
         Args:
             problem: what is to be fitted.
         """
-        if not problem.model.linear:
-            return (
-                f"model {problem.model.name} is not linear; expected output-error or filter-error"
-            )
-        return without_parts(problem.training) or absent_instrument(problem)
+        refused = without_parts(problem.training) or absent_instrument(problem)
+        return refused or cannot_linearise(problem)
 
     def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[FlightFacts, ...]:
-        """Where all outputs are there.
+        """Where all outputs are there, and about what the model is linearised.
 
         Args:
             problem: what is fitted.
             flights: those of a layout, in its order.
         """
-        return tuple(FlightFacts(parts_of(flight), flight.dt) for flight in flights)
+        return tuple(
+            FlightFacts(parts_of(f), f.dt, condition_of(problem.model, f)) for f in flights
+        )
 
     def instrumented(
         self, problem: Problem, flights: Sequence[Flight]
@@ -162,7 +164,7 @@ class FrequencyError(Estimator):
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
         # Biases and initial states are in none of these rows: the simulation in time has them.
-        z = _in_time(layout, data, noise, z)
+        z = nearest_in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
@@ -209,7 +211,8 @@ class FrequencyError(Estimator):
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
     ) -> list[str]:
-        """How much of flights with missing samples is used, and which instruments are weak.
+        """How much of flights with missing samples is used, where models were linearised, and which
+        instruments are weak.
 
         Args:
             layout: what the unknowns are.
@@ -218,7 +221,11 @@ class FrequencyError(Estimator):
             e: at the optimum.
             ill: whether it is ill-conditioned.
         """
-        return [*cut_notes(layout, data), *instrument_notes(layout, data, noise, e.z)]
+        return [
+            *cut_notes(layout, data),
+            *linearisation_notes(layout, data, noise, e),
+            *instrument_notes(layout, data, noise, e.z),
+        ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: what disturbs them is in the noise.
@@ -230,24 +237,6 @@ class FrequencyError(Estimator):
             seed: of nothing here, since nothing is drawn.
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
-
-
-@eqx.filter_jit
-def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
-    """z with the biases, offsets and initial states by which the simulation is nearest in time."""
-    first = layout.first_nuisance
-    if first == z.shape[0]:
-        return z
-
-    def rows(part: Array) -> Array:
-        u = unpack(layout, data, z.at[first:].set(part))
-        return jnp.concatenate([OUTPUT_ERROR.residuals(layout, data, noise, u).rows, part])
-
-    # Linear in them: one step is enough.
-    r, J = rows(z[first:]), jax.jacfwd(rows)(z[first:])
-    step = jnp.linalg.lstsq(J, -r)[0]
-    # The simulation of an unstable machine over a whole record is no number: left as it is.
-    return z.at[first:].add(jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0))
 
 
 ESTIMATOR = FrequencyError()

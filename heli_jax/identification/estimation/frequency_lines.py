@@ -15,6 +15,7 @@ from jaxtyping import Array, Complex, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.frequency_records import Record, records_of
+from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns, unpack
 from heli_jax.simulation.hold import linear_inputs
@@ -90,6 +91,8 @@ def _alike(layout: Layout, data: Data) -> list[list[int]]:
     for i, flight in enumerate(data.flights):
         n = next(iter(flight.outputs.values())).shape[0]
         key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
+        # An offset of its own moves the point about which a flight is linearised.
+        key = key if layout.model.linear else (i, *key)
         groups.setdefault(key, []).append(i)
     return list(groups.values())
 
@@ -129,7 +132,8 @@ class _Machine(NamedTuple):
 
 
 def _machine(layout: Layout, data: Data, u: Unknowns, i: int) -> _Machine:
-    drive, model = driven(layout, data, u, i), layout.model
+    condition = layout.of_flights[i].condition
+    model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
     linear = linear_inputs(model, drive.inputs, layout.hold(i))
     Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
     _, _, C, D = jacobians(model, drive.params)

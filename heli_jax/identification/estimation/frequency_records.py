@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.trim import Condition
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.parts import FEWEST, SHORTEST, spans
 from heli_jax.identification.unknowns.layout import Data, Layout
@@ -21,6 +22,8 @@ class FlightFacts(NamedTuple):
     """first sample, and that behind the last, of each part that is a record of its own"""
     dt: float
     """[s]: flights of one sample time share much of their program"""
+    condition: Condition | None = None
+    """the steady flight about which a whole helicopter is linearised"""
 
 
 class Record(NamedTuple):

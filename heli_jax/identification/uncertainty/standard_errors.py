@@ -63,7 +63,9 @@ def standard_errors(
     # Rows that are dependent under white noise too say nothing by the residuals' whiteness.
     white = white and estimator.rows_are_white
     if white or not (usable and estimator.rows_are_samples):
-        return StandardErrors(verdict, np.ones(layout.size), quantiles, False)
+        # Weighed by the noise's own spectrum, the bound allows for it as it stands.
+        allowed = usable and not white and estimator.noise_spectrum
+        return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
     errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)

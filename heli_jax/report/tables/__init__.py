@@ -22,6 +22,7 @@ from heli_jax.report.tables.headline import (
     warnings,
 )
 from heli_jax.report.tables.meanings import meanings
+from heli_jax.report.tables.methods import methods
 from heli_jax.report.tables.provenance import Origin, constants, origins
 from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
 
@@ -44,6 +45,7 @@ __all__ = [
     "headline",
     "intervals",
     "meanings",
+    "methods",
     "model_remark",
     "nuisances",
     "origins",
