@@ -199,13 +199,11 @@ class NuisanceConfig(_Strict):
 
 
 def _instrument_choice(value: object) -> object:
-    # By hand, as above: a name, a list of names, or the word none.
-    if value is None or isinstance(value, tuple):
+    # By hand, as above: a name (of which `none` is one that no input has), or a list of them.
+    if value is None or isinstance(value, str):
         return value
-    if isinstance(value, str):
-        return () if value == "none" else (value,)
     if isinstance(value, list) and value and all(isinstance(v, str) for v in value):
-        return tuple(value)
+        return value
     raise ValueError(
         f"expected an input, a list of inputs such as [lat, lon], or none, got {value!r:.60}"
     )
@@ -278,7 +276,9 @@ class FitConfig(_Strict):
     ] = StartMethodConfig()
     """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
     # Any, since the validator before it has said what it may be.
-    instrument: Annotated[Any, BeforeValidator(_instrument_choice)] = None
+    instrument: Annotated[
+        Any, BeforeValidator(_instrument_choice, json_schema_input_type=str | list[str] | None)
+    ] = None
     """frequency-error: inputs that are taken by their instrument, or none; unless given, all of
     which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
@@ -293,6 +293,14 @@ class FitConfig(_Strict):
     """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
     several axes may be disturbed, all of them and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
+
+    @property
+    def by_instrument(self) -> tuple[str, ...] | None:
+        """`instrument` as a `Problem` has it: () for none, None where nothing is stated."""
+        if self.instrument == "none":
+            return ()
+        names = self.instrument
+        return (names,) if isinstance(names, str) else names and tuple(names)
 
     @model_validator(mode="after")
     def _another_start(self) -> "FitConfig":

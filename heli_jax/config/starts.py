@@ -79,7 +79,7 @@ def instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
     """
     others = [m for m in (config.start.method, *config.also) if m in METHODS]
     if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
-        return config.instrument
+        return config.by_instrument
     return None
 
 
@@ -105,7 +105,7 @@ def started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
         "vehicle": experiment.vehicle.params,
         "free": {n: f for n, f in problem.free.items() if n in known},
         "method": "frequency-error",
-        "instrument": config.instrument,
+        "instrument": config.by_instrument,
     }
     whole = {"fixed_noise": (), "window": None, "continuity": None}
     try:
