@@ -33,7 +33,7 @@ def flown(seed: int, n: int = 3000) -> Flight:
     M = np.zeros((4, 4))
     M[0], M[1, 0] = [TRUTH["Lp"], TRUTH["Lphi"], TRUTH["Llat"], 1.0], 1.0
     E, keeps = scipy.linalg.expm(M * DT), np.exp(-DT / 0.7)
-    steps = np.repeat(rng.choice([-0.06, 0.06], n // 20), 20)
+    steps = np.repeat(rng.choice([-0.12, 0.12], n // 20), 20)
     x, gust, y, u = np.zeros(2), 0.0, np.zeros((n, 2)), np.zeros(n)
     for k in range(n):
         y[k] = x + rng.standard_normal(2) * [2e-3, 1e-3]
