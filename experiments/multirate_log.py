@@ -200,5 +200,6 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    numbers = [int(a) for a in sys.argv[1:]]
-    main(numbers[0] if numbers else 100)
+    from script import Size, asked
+
+    main(asked(__doc__, "half an hour", Size("runs", 100, 2, "logs")).runs)

@@ -9,7 +9,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import cli_options, interrupts, reading_progress, run_directory
+from heli_jax import (
+    cli_options,
+    file_commands,
+    interrupts,
+    reading_progress,
+    run_commands,
+    run_directory,
+)
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +32,15 @@ class _Parser(argparse.ArgumentParser):
         # One line as all other errors; argparse would print the usage of the command before it.
         print(f"heli-jax: {message} (heli-jax --help lists the commands)", file=sys.stderr)
         raise SystemExit(WRONG_INPUT)
+
+
+class _Version(argparse.Action):
+    # Any: what argparse passes.
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from heli_jax.versions import version
+
+        print(version())
+        raise SystemExit(DONE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Physical parameters of small helicopters from logged runs, with honest "
         "uncertainties.",
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     # Each command's function becomes `options.run`, so that `main` needs no table of them.
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -101,6 +118,10 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    listing = command("runs", run_commands.runs, "the fits that a folder holds")
+    cli_options.add_runs_options(listing)
+    compare = command("compare", _compare, "fits side by side: estimates, verdicts, agreement")
+    cli_options.add_compare_options(compare)
     new = command("new", _new, "a configuration that begins with what a log holds")
     cli_options.add_new_options(new)
     listing = command("keys", _keys, "what may stand in a configuration")
@@ -358,42 +379,20 @@ def _convert(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _new(options: argparse.Namespace) -> int:
-    from heli_jax.new_config import write_config
+def _compare(options: argparse.Namespace) -> int:
+    return run_commands.compare(options, _say)
 
-    log = Path(options.log)
-    out = Path(options.out) if options.out else Path(log.stem).with_suffix(".yaml")
-    written = write_config(log, out, options.model, options.vehicle, options.flight)
-    for note in written.notes:
-        _say(note)
-    return DONE
+
+def _new(options: argparse.Namespace) -> int:
+    return file_commands.new(options, _say)
 
 
 def _keys(options: argparse.Namespace) -> int:
-    from heli_jax import reference
-
-    if options.schema is not None:
-        place = Path(options.schema)
-        run_directory.require_place(place, f"--schema {place}")
-        reference.write_schema(place)
-        _say(f"wrote {place}")
-    elif options.json:
-        print(reference.as_json(options.pattern))
-    else:
-        reference.print_keys(options.pattern)
-    return DONE
+    return file_commands.keys(options, _say)
 
 
 def _new_model(options: argparse.Namespace) -> int:
-    from heli_jax.new_model import write_skeleton
-
-    written = write_skeleton(options.name, options.out)
-    print(*written, sep="\n")
-    _say(
-        f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
-        f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"
-    )
-    return DONE
+    return file_commands.new_model(options, _say)
 
 
 if __name__ == "__main__":

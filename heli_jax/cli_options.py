@@ -119,6 +119,22 @@ def add_frf_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 
 
+def add_runs_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax runs`."""
+    command.add_argument(
+        "directory", nargs="?", default="runs", metavar="DIR", help="default: runs"
+    )
+    command.add_argument("--json", action="store_true", help="for other programs")
+
+
+def add_compare_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax compare`."""
+    command.add_argument("runs", nargs="+", metavar="RUN", help="directories of heli-jax fit")
+    command.add_argument(
+        "--out", metavar="FILE", help="page (.html), estimates as .csv or as LaTeX (.tex)"
+    )
+
+
 def add_new_options(command: argparse.ArgumentParser) -> None:
     """Of `heli-jax new`."""
     command.add_argument("log", metavar="LOG", help="of any format")

@@ -12,7 +12,7 @@ def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, name in enumerate(head):
-        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+        table.add_column(_escaped(name), justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(_escaped(cell) for cell in row))
     # In a pipe rich assumes 80 columns and cuts off what is wider.

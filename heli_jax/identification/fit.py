@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
@@ -90,11 +90,20 @@ def _first_guess(problem: Problem) -> _FirstGuess:
     return _FirstGuess(layout, data, noise, z, e)
 
 
+def _require_problem(problem: Any) -> None:
+    if not isinstance(problem, Problem):
+        raise TypeError(
+            f"problem: expected a heli_jax.Problem, got {type(problem).__name__}; of a "
+            "configuration heli_jax.config.problem(heli_jax.load_config(path)) makes it"
+        )
+
+
 def check(problem: Problem) -> Check:
     """What the flights can determine at the start values, before any fit.
 
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
+    _require_problem(problem)
     guess = _first_guess(problem)
     noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
     if noise is not guess.noise:
@@ -202,6 +211,7 @@ def fit(
         ValueError: the simulation is not finite at the start values.
     """
     began = time.perf_counter()
+    _require_problem(problem)
     report = progress or (lambda _: None)
     guess = _first_guess(problem)
     layout, data, noise = guess.layout, guess.data, guess.noise

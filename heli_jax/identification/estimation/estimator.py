@@ -76,7 +76,7 @@ class Estimator(abc.ABC):
     noise_spectrum: ClassVar[bool] = False
     """whether the noise's spectrum is estimated, so that intervals allow for noise that is not
     white"""
-    flights_in_rows: ClassVar[bool] = True
+    nuisances_in_rows: ClassVar[bool] = True
     """whether the rows know of initial states, biases and offsets"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""

@@ -45,7 +45,7 @@ from heli_jax.identification.estimation.frequency_spectrum import (
     whitening_of,
     without_shared,
 )
-from heli_jax.identification.estimation.in_time import nearest_in_time
+from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
@@ -63,7 +63,7 @@ class FrequencyError(Estimator):
     """The model's response to the inputs against the measured outputs, at each frequency."""
 
     rows_are_samples = False
-    flights_in_rows = False
+    nuisances_in_rows = False
     noise_spectrum = True
     rows_by_flight = False
     least_squares = False
@@ -164,7 +164,7 @@ class FrequencyError(Estimator):
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
         # Biases and initial states are in none of these rows: the simulation in time has them.
-        z = nearest_in_time(layout, data, noise, z)
+        z = in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []

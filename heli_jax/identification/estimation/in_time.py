@@ -16,9 +16,7 @@ _ENOUGH = 1e-4
 """part of the cost that a step has to gain for another one to be made"""
 
 
-def nearest_in_time(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]
-) -> Float[Array, " q"]:
+def in_time(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) -> Float[Array, " q"]:
     """z with the biases, offsets and initial states by which the simulation is nearest in time.
 
     Args:

@@ -233,7 +233,7 @@ class Search:
         layout = self.layout
         # Their weak priors alone would lead the initial states to zero: for a machine that is not
         # linear, with a rotor that stands still, a place from which no search in time comes back.
-        if layout.model.linear or layout.estimator.flights_in_rows:
+        if layout.model.linear or layout.estimator.nuisances_in_rows:
             return None
         return np.arange(layout.size) >= layout.first_nuisance
 
