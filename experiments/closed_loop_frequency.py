@@ -1,18 +1,16 @@
 """The R-50 in closed loop in the frequency domain: by instrument, direct, and by filter error.
 
-    .venv/bin/python experiments/closed_loop_frequency.py [RUNS] [FOLDER] [METHODS]
+    .venv/bin/python experiments/closed_loop_frequency.py [RUNS] [METHODS]
 
 Each of RUNS (40) runs has four records of 90 s: a pilot who only just keeps the hover, a sweep of
 0.05 to 4 Hz that is added to one cyclic stick and logged, gusts on six axes. 14 derivatives of the
 attitude, 6 of the speed and the delays of both sticks are free and start up to a factor of 1.5 off.
-The records are made with SciPy's matrix exponentials. FOLDER (runs/closed-loop-frequency) keeps a
-line a fit, so that a run that was stopped goes on where it was. METHODS, with commas between, are
-some of `by instrument`, `direct`, `filter error`; all unless given.
+The records are made with SciPy's matrix exponentials. The folder of --out keeps a line a fit, so
+that a run that was stopped goes on where it was.
 """
 
 import functools
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -228,8 +226,7 @@ def table(fits: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main(runs: int, folder: str, methods: list[str]) -> None:
-    out = Path(folder)
+def main(runs: int, out: Path, methods: list[str]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     lines = out / "fits.jsonl"
     done = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
@@ -246,9 +243,13 @@ def main(runs: int, folder: str, methods: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(
-        int(given[0]) if given else 40,
-        given[1] if len(given) > 1 else "runs/closed-loop-frequency",
-        given[2].split(",") if len(given) > 2 else list(METHODS),
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "an hour",
+        Size("runs", 40, 2, "of four records each"),
+        Size("methods", ",".join(METHODS), "by instrument,direct", "with commas between"),
+        out="runs/closed-loop-frequency",
     )
+    main(options.runs, options.out, options.methods.split(","))
