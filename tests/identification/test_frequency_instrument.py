@@ -9,6 +9,7 @@ from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.identification.estimation.frequency_instrument import following
 from heli_jax.identification.estimation.frequency_rows import _Rows, _weighed
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
+from heli_jax.identification.model_selection import choose
 
 DT = 0.04
 LEANING = """
@@ -137,3 +138,8 @@ def test_an_instrument_that_is_not_there_is_refused(leaning):
         problem(leaning, [flight], instrument=("lot",))
     with pytest.raises(ValueError, match="takes no input by an instrument"):
         problem(leaning, [flight], instrument=("lat",), method="output-error")
+
+
+def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
+    with pytest.raises(ValueError, match="no likelihood to be compared by"):
+        choose({"one": problem(leaning, [flown(1, 400)])})
