@@ -103,6 +103,9 @@ class Problem:
         check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
         warn_of_degrees(self.model.Outputs, self.flights)
         object.__setattr__(self, "flights", tuple(self.flights))
+        if self.instrument is not None:
+            names = (self.instrument,) if isinstance(self.instrument, str) else self.instrument
+            object.__setattr__(self, "instrument", tuple(names))
         # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
         # So is what the model says is positive; delays and gains of devices around it are not.
         positive = set(self.model.positive)
