@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import CrossSpectra, Responses, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
@@ -274,7 +275,7 @@ def _fits(
         pair = output.pairs[wanted.input]
         hz = omega / (2.0 * np.pi)
         low, high = wanted.band or (0.0, np.inf)
-        used = (_smooth(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+        used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
         H = np.where(used, pair.H, np.nan)
         # With its hold, which is half a sample late, so that the delay is the machine's own.
         hold = holds[wanted.input]
@@ -285,16 +286,3 @@ def _fits(
             raise ValueError(f"{place}: {e}") from e
         fits.append((wanted, fitted))
     return tuple(fits)
-
-
-def _smooth(omega: np.ndarray, coherence: np.ndarray) -> np.ndarray:
-    """Its mean (k,) over an octave; zero where there is none.
-
-    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
-    """
-    octaves = np.log2(omega)
-    near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
-    seen = np.isfinite(coherence)
-    count = near @ seen.astype(float)
-    mean = near @ np.where(seen, coherence, 0.0) / np.maximum(count, 1.0)
-    return np.where(seen, mean, 0.0)
