@@ -38,14 +38,18 @@ UNITS = {
     "gain_margin": "dB",
 }
 """of every number by its name"""
+NUMBERS: dict[str, tuple[str, ...]] = {
+    "rate": tuple(UNITS)[:6],
+    "attitude-command": tuple(UNITS)[:6],
+    "open-loop": ("crossover", "w180", "phase_margin", "gain_margin"),
+}
+"""by kind of response what may be known of it"""
 _DB = 20.0 / np.log(10.0)
 _Z95 = 1.959963984540054
 _POINTS = 500
 """of the grid on which crossings are looked for"""
 _LINE = 60
 """frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
-_LOW = 0.7
-"""logarithm of how far the lower end of the band reaches, where sign and branch are told"""
 _VAGUE = np.log(2.0)
 """logarithm of the factor by which a frequency's interval may reach to either side"""
 
@@ -89,7 +93,7 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
     Args:
         curve: the response of an attitude to a stick, or an open loop's that is closed by negative
             unity feedback. Its sign does not matter: it is taken for that of a machine whose lag
-            grows from 0 or 90 deg on (gain and phase at the lower end of the band go together).
+            grows from 0 or 90 deg on, as its gain falls.
         kind: rate, attitude-command or open-loop.
     """
     grid = np.geomspace(*curve.band, _POINTS)
@@ -108,13 +112,14 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
 def _branch(grid: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
     """The sign of the response, and its phase (k,) [rad] unwrapped, on the branch of its slope."""
     phase = np.unwrap(points.phase)
-    low = grid <= grid[0] * np.exp(_LOW)
     # Bode's relation: a gain that falls with the n-th power of the frequency goes with n right
-    # angles of lag, whatever the stick's sign.
-    expected = 0.5 * np.pi * float(np.mean(points.gain_slope[low]))
-    off = float(np.mean(phase[low])) - expected
-    turns = round(off / np.pi)
-    return (-1 if turns % 2 else 1), phase - np.pi * turns
+    # angles of lag, whatever the stick's sign. It fails near a mode that grows, and delays add to
+    # the lag towards higher frequencies: what most of the lower half of the band says.
+    low = slice(0, grid.size // 2)
+    turns = np.round((phase - 0.5 * np.pi * points.gain_slope)[low] / np.pi)
+    values, counts = np.unique(turns, return_counts=True)
+    turn = int(values[np.argmax(counts)])
+    return (-1 if turn % 2 else 1), phase - np.pi * turn
 
 
 class _Response:

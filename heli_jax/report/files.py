@@ -23,6 +23,8 @@ from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEA
 from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report.card import card
+from heli_jax.report.fitted_responses import FittedResponses
+from heli_jax.report.handling_json import handling_json
 from heli_jax.versions import versions
 
 
@@ -33,6 +35,8 @@ class SupplementaryAnalyses(NamedTuple):
     intervals: Intervals | None = None
     findings: tuple[Finding, ...] = ()
     """whether the log is enough, as it was before the fit"""
+    responses: FittedResponses | None = None
+    """of the model and of the flights, with their handling qualities"""
 
 
 def fit_json(
@@ -82,6 +86,9 @@ def fit_json(
             "covariance": "coloured residuals" if fit.coloured else "white",
             **_residuals(fit),
             "baseline_rls": _baseline(baseline),
+            "handling_qualities": handling_json(
+                supplementary.responses.handling if supplementary.responses else ()
+            ),
             "equation_error_start": _first_guess(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
