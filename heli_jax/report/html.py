@@ -120,8 +120,9 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     model, drawings = problem.model, {}
     if supplementary.intervals is not None:
         drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
-    shown = fit.signals[:MOST_FLIGHTS]
-    for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
+    parts = _parts([s.flight for s in fit.signals])
+    for i in _drawn([s.hold_out for s in fit.signals]):
+        s, part = fit.signals[i], parts[i]
         for output in s.measured:
             drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
             # The fit did nothing to make the residuals of a flight held out white.
@@ -139,6 +140,15 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     if baseline is not None:
         drawings["rls"] = _drawing(figures.rls_history, baseline)
     return drawings
+
+
+def _drawn(hold_out: list[bool]) -> list[int]:
+    """Which flights get figures: where there are too many, not only the fitted ones, which come
+    first, but half of them held out."""
+    held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
+    fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
+    rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
+    return sorted([*fitted, *held, *rest[: MOST_FLIGHTS - len(held) - len(fitted)]])
 
 
 def _parts(flights: list[str]) -> list[str]:
