@@ -18,7 +18,7 @@ from heli_jax.analysis.attitude_responses import (
     prepared,
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, flight_responses
-from heli_jax.analysis.handling_qualities import handling_qualities
+from heli_jax.analysis.handling_qualities import HandlingQualities, handling_qualities
 from heli_jax.analysis.response_curves import (
     Acting,
     Curve,
@@ -183,5 +183,5 @@ def _pairs(found: FlightResponses, curves: _Curves) -> list[FittedPair]:
     return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
 
 
-def _of_model(curves: _Curves, pair: HandlingPair):
+def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
     return handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
