@@ -10,8 +10,9 @@ Of the response of an attitude to a stick, as ADS-33E-PRF (2000), Figure 2, defi
 - phase delay: (lag at 2 w180 - 180) / (57.3 * 2 w180), angles in degrees; where the phase is not
   straight between w180 and 2 w180 the lag is that of the line fitted to it by least squares.
 
-Intervals are those of the delta method: each number's derivative by all that the response rests
-on, be it the parameters of a fit or the random errors of a measured response.
+Intervals rest on each number's derivative by all that the response hangs on (the delta method), be
+it the parameters of a fit or the random errors of a measured response; those of frequencies are
+where the response's own interval holds the level that defines them.
 
 See also Ham, Gardner and Tischler (1993), Flight testing and frequency domain analysis for
 rotorcraft handling qualities characteristics, of whom the least-squares line is too.
@@ -50,8 +51,8 @@ _POINTS = 500
 """of the grid on which crossings are looked for"""
 _LINE = 60
 """frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
-_VAGUE = np.log(2.0)
-"""logarithm of the factor by which a frequency's interval may reach to either side"""
+_VAGUE = 2.0
+"""the factor by which a frequency's interval may reach to either side"""
 
 
 class Number(NamedTuple):
@@ -85,6 +86,8 @@ class _Place(NamedTuple):
     """one frequency"""
     by: np.ndarray
     """(q,) derivative of its logarithm"""
+    ends: tuple[float, float]
+    """[rad/s] of its 95 % interval; beyond the band infinitely far away, NaN where not known"""
 
 
 def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
@@ -127,7 +130,7 @@ class _Response:
 
     def __init__(self, curve: Curve, grid: np.ndarray, points: Point, phase: np.ndarray) -> None:
         self.curve, self.grid, self.x = curve, grid, np.log(grid)
-        self.gain, self.phase = points.log_gain, phase
+        self.gain, self.phase, self.points = points.log_gain, phase, points
 
     def at(self, omega: float) -> Point:
         """One frequency, on the branch."""
@@ -173,9 +176,44 @@ class _Response:
     def place(self, omega: float, quantity: str, by_level: np.ndarray | float = 0.0) -> _Place:
         """A frequency where a quantity has a level, which itself may have a derivative (q,)."""
         at = self.at(omega)
-        gradient = at.gain_gradient if quantity == "log_gain" else at.phase_gradient
-        slope = at.gain_slope if quantity == "log_gain" else at.phase_slope
-        return _Place(omega, at, (by_level - gradient[0]) / slope[0])
+        gain = quantity == "log_gain"
+        gradient = (at.gain_gradient if gain else at.phase_gradient)[0] - by_level
+        slope = at.gain_slope if gain else at.phase_slope
+        every = (self.points.gain_gradient if gain else self.points.phase_gradient) - by_level
+        off = (self.gain - at.log_gain[0]) if gain else (self.phase - at.phase[0])
+        reach = _Z95 * np.linalg.norm(every, axis=1)
+        start = _Z95 * float(np.linalg.norm(gradient))
+        return _Place(omega, at, -gradient / slope[0], self._ends(omega, off, reach, start))
+
+    def _ends(
+        self, omega: float, off: np.ndarray, reach: np.ndarray, start: float
+    ) -> tuple[float, float]:
+        """Frequencies next to omega past which the curve's band (Fieller) leaves out the level.
+
+        Not the error over the slope: of a noisy curve the slope is known worse than the value.
+
+        Args:
+            omega: where the curve has the level [rad/s].
+            off: (k,) of the curve from the level, on the grid.
+            reach: (k,) of the curve's interval.
+            start: the same at omega.
+        """
+        if not np.isfinite(reach).all():
+            return np.nan, np.nan
+        i, x0, ends = int(np.searchsorted(self.grid, omega)), np.log(omega), []
+        for where, beyond, missing in (
+            (np.arange(i)[::-1], reach - off, 0.0),
+            (np.arange(i, self.grid.size), reach + off, np.inf),
+        ):
+            left = where[beyond[where] <= 0]
+            if not left.size:
+                ends.append(missing)
+                continue
+            k = np.flatnonzero(where == left[0])[0]
+            x1, f1 = (x0, start) if k == 0 else (self.x[where[k - 1]], beyond[where[k - 1]])
+            x2, f2 = self.x[where[k]], beyond[where[k]]
+            ends.append(float(np.exp(x1 + (x2 - x1) * f1 / (f1 - f2) if f1 > f2 else x1)))
+        return ends[0], ends[1]
 
 
 def _attitude(
@@ -227,15 +265,12 @@ def _gain_bandwidth(response: _Response, neutral: _Place) -> _Place | None:
 def _put_frequency(
     name: str, place: _Place, numbers: dict[str, Number], sentences: list[str]
 ) -> None:
-    sd = float(np.linalg.norm(place.by))
-    # Of a positive number, whose interval cannot reach below zero.
-    reach = _Z95 * sd
-    if reach > _VAGUE:
-        words = f"its interval reaches by a factor of {min(np.exp(reach), 1e3):.2g} to either side"
+    sd, (low, high) = float(np.linalg.norm(place.by)), place.ends
+    if low < place.omega / _VAGUE or high > place.omega * _VAGUE or sd > 1.0:
+        words = "its interval reaches past half or twice its value, or out of the band"
         sentences.append(_missing(name.replace("_", " "), words))
         return
-    low, high = place.omega * np.exp(-reach), place.omega * np.exp(reach)
-    numbers[name] = Number(place.omega, place.omega * sd, float(low), float(high))
+    numbers[name] = Number(place.omega, place.omega * sd, low, high)
 
 
 def _put_bandwidth(kind: Kind, numbers: dict[str, Number], sentences: list[str]) -> None:

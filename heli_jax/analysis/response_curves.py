@@ -19,6 +19,9 @@ from heli_jax.dynamics.model import Model
 
 _HALF_OCTAVE = 0.5 * np.log(2.0)
 """logarithm of how far a local fit to a measured response reaches to either side"""
+_PRECISE = 0.03
+"""relative random error of bins up to which it is so; with larger ones it reaches further, to an
+octave"""
 _LEAST_BINS = 7
 """in a local fit, which reaches further where there are fewer"""
 _COHERENT = 0.6
@@ -126,7 +129,8 @@ def measured_curve(
 ) -> Curve | str:
     """A measured response by local quadratics in logarithms, or why there is none in words.
 
-    Gain and phase are fitted over half an octave to either side, each bin by its random error.
+    Gain and phase are fitted over half an octave to either side, up to an octave where errors are
+    large, each bin by its random error.
     Errors of bins that one window hardly tells apart are correlated: independent ones are 1.95
     lines of the window apart. The band is the widest one of coherence 0.6 in the mean over an
     octave.
@@ -186,7 +190,10 @@ def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> tuple[np.n
     """Rows (l, k) that make of values at x those of local quadratics at the queries, and their
     slopes."""
     d = x[None, :] - query[:, None]
-    reach = np.maximum(_HALF_OCTAVE, 1.01 * np.sort(np.abs(d), axis=1)[:, _LEAST_BINS - 1])
+    # Further where errors are larger, as the least mean squared error of local quadratics asks.
+    size = np.interp(query, x, octave_mean(np.exp(x), relative))
+    reach = _HALF_OCTAVE * np.clip((size / _PRECISE) ** (2.0 / 7.0), 1.0, 2.0)
+    reach = np.maximum(reach, 1.01 * np.sort(np.abs(d), axis=1)[:, _LEAST_BINS - 1])
     d = d / reach[:, None]
     # By the errors too, but not so that one bin has it all.
     precise = 1.0 / (relative**2 + np.median(relative) ** 2)
