@@ -233,10 +233,11 @@ def _outputs(
     u, y = list(range(m)), list(range(first, first + len(outputs)))
     z = [m + instruments.index(n) if n in instruments else u[i] for i, n in enumerate(inputs)]
     by = z if instruments else None
-    found = responses(cross_spectra(records, dt, omega, window), u, y, by)
+    spectra = cross_spectra(records, dt, omega, window)
+    found = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
     driven = np.all(own[:first], axis=0)
-    several = _several(records, dt, omega, window, m)
+    several = _several(records, dt, spectra, window, m)
     result = {}
     for i, name in enumerate(outputs):
         seen = (driven & own[y[i]])[:, None]
@@ -268,16 +269,17 @@ def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float)
 
 
 def _several(
-    records: list[np.ndarray], dt: float, omega: np.ndarray, window: float, m: int
+    records: list[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
 ) -> list[CrossSpectra]:
-    """Spectra of several windows, as far as the records have three of each."""
+    """Spectra of several windows beside those of one, as far as the records have three of each."""
     longest = max(r.shape[1] for r in records) * dt
     several: list[CrossSpectra] = []
     for length in _LENGTHS:
         # Three windows are the least that a coherence can be taken from.
         if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
             continue
-        spectra = cross_spectra(records, dt, omega, length * window)
+        own = length == 1.0
+        spectra = one if own else cross_spectra(records, dt, one.omega, length * window)
         if np.min(spectra.averages) >= m + 1:
             several.append(spectra)
     return several
