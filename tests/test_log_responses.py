@@ -91,7 +91,7 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert len(rows) == 120
     assert float(rows[7]["gain"]) == pytest.approx(abs(H[7]), rel=1e-12)
     # The angle is not logged: that of the rate's response. The loop has no delay but the hold.
-    assert "lat to p, integrated: bandwidth data" in printed.out
+    assert "lat to p, integrated: bandwidth [rad/s] data" in printed.out
     (handling,) = json.loads((out / "handling_qualities.json").read_text())
     assert handling["integrated"]
     bandwidth = handling["data"]["numbers"]["phase_bandwidth"]

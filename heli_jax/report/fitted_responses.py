@@ -184,4 +184,14 @@ def _pairs(found: FlightResponses, curves: _Curves) -> list[FittedPair]:
 
 
 def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
-    return handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
+    found = handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
+    last, w180 = curves.band[1] / _BEYOND, found.numbers.get("w180")
+    needed = last if pair.kind == "open-loop" else 0.5 * last
+    if w180 is None or w180.value <= needed:
+        return found
+    beyond = "w180" if w180.value > last else "2 w180"
+    words = (
+        f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
+        "what hangs on it is the model's word alone"
+    )
+    return found._replace(sentences=(*found.sentences, words))

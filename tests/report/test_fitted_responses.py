@@ -65,7 +65,7 @@ def test_they_are_drawn_told_and_written(sound, shown):
     page = render(analysis, "title", {}, [])
     assert "Handling qualities" in page
     (line,) = handling_lines(shown.handling)
-    assert line.startswith("x_roll to roll: bandwidth model")
+    assert line.startswith("x_roll to roll: bandwidth [rad/s] model")
     (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]
     model, data = (content[s]["numbers"]["phase_bandwidth"] for s in ("model", "data"))
     assert data["lower95"] < model["value"] < data["upper95"]

@@ -64,7 +64,7 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
 
 
 def handling_lines(entries: Sequence[Handling]) -> list[str]:
-    """One line each: `lat to phi: bandwidth model 5.1 (5.0 to 5.3), data 5.2 (5 to 5.4) rad/s`
+    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5.0 to 5.3), data 5.2 (5 to 5.4)`
 
     Args:
         entries: what model and data say.
@@ -76,6 +76,6 @@ def handling_lines(entries: Sequence[Handling]) -> list[str]:
         for name in _HEADLINES:
             if name in NUMBERS[entry.pair.kind]:
                 cells = ", ".join(f"{s} {_cell(getattr(entry, s), name)}" for s in sources)
-                parts.append(f"{_WORDS[name]} {cells} {UNITS[name]}")
+                parts.append(f"{_WORDS[name]} [{UNITS[name]}] {cells}")
         lines.append(f"{entry.pair.words}: {'; '.join(parts)}")
     return lines
