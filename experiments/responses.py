@@ -12,7 +12,7 @@ the scatter of the runs leaves of it; negative squares count as zero.
 """
 
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from heli_jax.analysis.flight_responses import Settings, flight_responses
 from heli_jax.analysis.spectral import cross_spectra, responses
 
 jax.config.update("jax_enable_x64", True)
+signal: Any = scipy.signal
 SECONDS, RECORDS, GUSTS = 90.0, 4, 2.0
 FEEDBACK = (0.12, 0.3)
 """[Hz] where the loop bites"""
@@ -118,29 +119,25 @@ def three_sticks(runs: int) -> None:
         np.array([[4.0, 0.6, -0.4], [0.5, 6.0, 0.8], [-0.6, 0.4, 8.0]]),
     )
     omega = 2.0 * np.pi * np.geomspace(0.15, 3.0, 40)
-    lags = [scipy.signal.cont2discrete(([1.0], [1.0, p]), STEP) for p in poles]
-    true = np.stack([scipy.signal.freqz(b.ravel(), a, omega * STEP)[1] for b, a, _ in lags])
+    lags = [signal.cont2discrete(([1.0], [1.0, p]), STEP) for p in poles]
+    true = np.stack([signal.freqz(b.ravel(), a, omega * STEP)[1] for b, a, _ in lags])
     true = np.moveaxis(true[:, None] * gains[:, :, None], 2, 0)
     both: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"conditioned": [], "one at a time": []}
-    slow = scipy.signal.butter(2, 3.0, fs=1.0 / STEP)
+    slow = signal.butter(2, 3.0, fs=1.0 / STEP)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        u = scipy.signal.lfilter(*slow, rng.standard_normal((3, N)))
+        u = signal.lfilter(*slow, rng.standard_normal((3, N)))
         u = u + CROSS * np.roll(u, 1, axis=0)
         clean = np.stack(
-            [
-                scipy.signal.lfilter(b.ravel(), a, g @ u)
-                for (b, a, _), g in zip(lags, gains, strict=True)
-            ]
+            [signal.lfilter(b.ravel(), a, g @ u) for (b, a, _), g in zip(lags, gains, strict=True)]
         )
         noise = NOISE * clean.std(axis=1)[:, None] * rng.standard_normal((3, N))
         spectra = cross_spectra([np.concatenate([u, clean + noise])], STEP, omega, 20.0)
         joint = responses(spectra, [0, 1, 2], [3, 4, 5])
         alone = [responses(spectra, [j], [3, 4, 5]) for j in range(3)]
         both["conditioned"].append((joint.H, joint.sd))
-        both["one at a time"].append(
-            tuple(np.concatenate([getattr(a, n) for a in alone], axis=2) for n in ("H", "sd"))
-        )
+        H, sd = (np.concatenate([getattr(a, n) for a in alone], axis=2) for n in ("H", "sd"))
+        both["one at a time"].append((H, sd))
     print(f"\nThree inputs with a cross-feed of {CROSS:g}, {runs} runs\n")
     print("| | diagonal: inside | bias | off it: inside | bias |\n|---|---|---|---|---|")
     diagonal = np.eye(3, dtype=bool)

@@ -26,6 +26,7 @@ from heli_jax import Flight
 from heli_jax.analysis.flight_responses import Settings, flight_responses
 
 jax.config.update("jax_enable_x64", True)
+signal: Any = scipy.signal
 RATE, INPUTS, OUTPUTS, WINDOW, RUNS = 100.0, 4, 9, 20.0, 5
 LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
 
@@ -35,9 +36,9 @@ def flight(minutes: float) -> Flight:
     N = round(60.0 * minutes * RATE)
     u = rng.standard_normal((INPUTS, N))
     u[1:] += 0.4 * u[:-1]
-    b, a = scipy.signal.butter(2, 5.0, fs=RATE)
+    b, a = signal.butter(2, 5.0, fs=RATE)
     mixed = rng.standard_normal((OUTPUTS, INPUTS)) @ u
-    y = scipy.signal.lfilter(b, a, mixed) + 0.1 * rng.standard_normal((OUTPUTS, N))
+    y = signal.lfilter(b, a, mixed) + 0.1 * rng.standard_normal((OUTPUTS, N))
     inputs = {f"u{i}": v for i, v in enumerate(u)}
     return Flight(dt=1.0 / RATE, inputs=inputs, outputs={f"y{i}": v for i, v in enumerate(y)})
 
@@ -50,7 +51,7 @@ def by_scipy(record: Flight, omega: np.ndarray, lean: bool) -> np.ndarray:
         n = round(length * WINDOW * RATE)
 
         def csd(a: np.ndarray, b: np.ndarray, n: int = n) -> np.ndarray:
-            hz, S = scipy.signal.csd(a, b, fs=RATE, nperseg=n, noverlap=n // 2, detrend="constant")
+            hz, S = signal.csd(a, b, fs=RATE, nperseg=n, noverlap=n // 2, detrend="constant")
             w = 2.0 * np.pi * hz
             return np.interp(omega, w, S.real) + 1j * np.interp(omega, w, S.imag)
 
