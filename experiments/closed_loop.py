@@ -10,7 +10,6 @@ fits have that delay free as well, from the five starts that a free delay has. (
 belongs beside them once it is there.)
 """
 
-import sys
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -154,4 +153,12 @@ def main(runs: int, *, delay: bool) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 6, delay="delay" in sys.argv[2:])
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "ten minutes",
+        Size("runs", 6, 1, "records of each gain and gust"),
+        Size("delay", "", "", "the word delay: the aileron acts late"),
+    )
+    main(options.runs, delay=options.delay == "delay")

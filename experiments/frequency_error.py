@@ -6,8 +6,6 @@ Records of 120 s made with SciPy alone, with gusts as large as the stick's respo
 Ixx, If and kappa start 1.3 times off. METHOD (frequency-error) may be output-error as well.
 """
 
-import sys
-
 import jax
 import numpy as np
 from coverage_cases.disturbed import response
@@ -61,5 +59,12 @@ def main(runs: int, method: str) -> None:
 
 
 if __name__ == "__main__":
-    arguments = dict(enumerate(sys.argv[1:]))
-    main(int(arguments.get(0, 60)), arguments.get(1, "frequency-error"))
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "three minutes",
+        Size("runs", 60, 3, "records with gusts, and without"),
+        Size("method", "frequency-error", "frequency-error", "of the fit"),
+    )
+    main(options.runs, options.method)

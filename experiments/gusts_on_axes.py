@@ -1,6 +1,6 @@
 """Gusts on four axes: do the intervals cover, and does the model table find the one left out?
 
-    .venv/bin/python experiments/gusts_on_axes.py [RUNS] [SAMPLES] [FOLDER]
+    .venv/bin/python experiments/gusts_on_axes.py [RUNS] [SAMPLES] [--out FOLDER]
 
 A hovering machine's rates and heave (p, q, r, w) with coupled damping, each disturbed by an
 Ornstein-Uhlenbeck push with a size and a time constant of its own, simulated with SciPy alone.
@@ -176,10 +176,14 @@ def main(count: int, n: int, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    from script import Size, asked
+
     jax.config.update("jax_enable_x64", True)
-    arguments = dict(enumerate(sys.argv[1:]))
-    main(
-        int(arguments.get(0, 100)),
-        int(arguments.get(1, 3000)),
-        Path(arguments.get(2, "runs/gusts-on-axes")),
+    options = asked(
+        __doc__,
+        "hours",
+        Size("runs", 100, 1, "records"),
+        Size("samples", 3000, 1500, "of each"),
+        out="runs/gusts-on-axes",
     )
+    main(options.runs, options.samples, options.out)

@@ -1,6 +1,6 @@
 """What separates the lift slope a from the inertias: thrust carries a known mass.
 
-    .venv/bin/python experiments/heave_separates_a.py [FOLDER]
+    .venv/bin/python experiments/heave_separates_a.py [--out FOLDER]
 
 Six two-second records of the X-Cell 60 about hover, all sticks moving, with position, attitude and
 rotor speed measured to 2 mm, 2 mrad and 0.5 rad/s. The roll angle alone determines none of the
@@ -12,7 +12,6 @@ FOLDER (runs/heave) gets results.json and page.md.
 """
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -156,8 +155,7 @@ CASES: dict[str, Callable[[], Fit]] = {
 }
 
 
-def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("runs/heave")
+def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     page, results = ["# What separates a from the inertias", ""], {}
     for title, identified in CASES.items():
@@ -177,4 +175,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from script import asked
+
+    main(asked(__doc__, "ten minutes", out="runs/heave").out)

@@ -13,7 +13,6 @@ may be from zero by chance, and the mean shift.
 
 import dataclasses
 import math
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -132,4 +131,6 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    from script import Size, asked
+
+    main(asked(__doc__, "ten minutes", Size("runs", 20, 2, "logs of each kind")).runs)

@@ -1,6 +1,6 @@
 """Section 3 of Kim & Tilbury (1997) in kind, as a page to lay beside the paper.
 
-    .venv/bin/python experiments/kim_tilbury_1997.py [FOLDER]
+    .venv/bin/python experiments/kim_tilbury_1997.py [--out FOLDER]
 
 A stand run with a disturbance, made with the numbers of eq. 36, so that its truth is known; RLS of
 order 4 (eqs 25-33) with Figures 5 and 6; eqs 34 and 35 into each other, both ways; and what such a
@@ -464,4 +464,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "runs/kim-tilbury-1997"))
+    from script import asked
+
+    main(asked(__doc__, "three minutes", out="runs/kim-tilbury-1997").out)

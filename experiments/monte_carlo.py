@@ -1,6 +1,6 @@
 """Filter error, output error and RLS on many disturbed bench runs: which numbers can be believed?
 
-    .venv/bin/python experiments/monte_carlo.py [RUNS] [FOLDER]
+    .venv/bin/python experiments/monte_carlo.py [RUNS] [--out FOLDER]
 
 The disturbed bench: the 30-class machine on its stand (kappa free, zeta known), 6000 samples at
 50 Hz, 2 mrad of measurement noise, random steps, and a disturbance whose response is as large as
@@ -208,7 +208,7 @@ def main(count: int, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(
-        int(sys.argv[1]) if len(sys.argv) > 1 else 200,
-        Path(sys.argv[2] if len(sys.argv) > 2 else "runs/monte-carlo"),
-    )
+    from script import Size, asked
+
+    options = asked(__doc__, "hours", Size("runs", 200, 2, "records"), out="runs/monte-carlo")
+    main(options.runs, options.out)

@@ -182,6 +182,7 @@ def main(runs: int) -> None:
                 found = estimates(folder, measured)
                 errors[measured].append([found[n][0] - x for n, x in TRUTH.items()])
                 sds[measured].append([found[n][1] for n in TRUTH])
+            print(f"{seed + 1} of {runs}", end="\r", file=sys.stderr)
     print(f"{runs} runs")
     for measured, title in ((True, "filter and delays modelled"), (False, "ignored")):
         print(
@@ -199,5 +200,6 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    numbers = [int(a) for a in sys.argv[1:]]
-    main(numbers[0] if numbers else 100)
+    from script import Size, asked
+
+    main(asked(__doc__, "half an hour", Size("runs", 100, 2, "logs")).runs)

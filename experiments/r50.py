@@ -1,6 +1,6 @@
 """Filter error on a whole helicopter: the R-50 in closed loop, in turbulence on six axes.
 
-    .venv/bin/python experiments/r50.py [FITS] [RECORDS] [SECONDS] [FOLDER]
+    .venv/bin/python experiments/r50.py [FITS] [RECORDS] [SECONDS] [--out FOLDER]
 
 FITS (3) sets of RECORDS (1) flights of SECONDS (60) each are fitted from starts that are a factor
 of 0.6 to 1.6 off; the full size is `40 4`. 33 derivatives, six intensities and correlation times of
@@ -11,7 +11,6 @@ the identifiability analysis says with Kr free as well.
 """
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -128,8 +127,7 @@ def identifiability(records: int, seconds: float) -> str:
     return "\n".join(f"- {sentence}" for sentence in verdict.sentences)
 
 
-def main(fits: int, records: int, seconds: float, folder: str) -> None:
-    out = Path(folder)
+def main(fits: int, records: int, seconds: float, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     lines = out / f"fits-{records}x{seconds:g}.jsonl"
     done = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
@@ -145,5 +143,14 @@ def main(fits: int, records: int, seconds: float, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:] + ["3", "1", "60", "runs/r50"][len(sys.argv) - 1 :]
-    main(int(given[0]), int(given[1]), float(given[2]), given[3])
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "ten minutes",
+        Size("fits", 3, 1, "sets of records"),
+        Size("records", 1, 1, "flights of each set"),
+        Size("seconds", 60.0, 60.0, "of each flight"),
+        out="runs/r50",
+    )
+    main(options.fits, options.records, options.seconds, options.out)

@@ -161,8 +161,7 @@ def workers_of(pid: int) -> list[int]:
     return sorted(pids)
 
 
-def main() -> None:
-    times = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+def main(times: int) -> None:
     folder = Path(tempfile.mkdtemp(prefix="heli_jax-survives-"))
     try:
         config = configuration(folder)
@@ -183,4 +182,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from script import Size, asked
+
+    main(asked(__doc__, "two minutes", Size("kills", 20, 2, "of the sweep")).kills)

@@ -8,7 +8,7 @@ T-Rex 550, 67 s near hover at 100 Hz, with columns t, lat, p and others. Both mo
 the lateral doublets (18 to 32 s) and then fly the whole record.
 """
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -126,4 +126,8 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("log", metavar="LOG")
+    main(parser.parse_args().log)

@@ -1,6 +1,6 @@
 """A disturbance with two lags: does the model table see it, and does If's interval cover again?
 
-    .venv/bin/python experiments/two_poles.py [RUNS] [FOLDER]
+    .venv/bin/python experiments/two_poles.py [RUNS] [--out FOLDER]
 
 The disturbed bench of monte_carlo.py, but the disturbance passes a second lag of the same time
 constant. Every record is fitted with one pole and with two. FOLDER (runs/two-poles) keeps one line
@@ -112,7 +112,7 @@ def main(count: int, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(
-        int(sys.argv[1]) if len(sys.argv) > 1 else 100,
-        Path(sys.argv[2] if len(sys.argv) > 2 else "runs/two-poles"),
-    )
+    from script import Size, asked
+
+    options = asked(__doc__, "an hour", Size("runs", 100, 2, "records"), out="runs/two-poles")
+    main(options.runs, options.out)

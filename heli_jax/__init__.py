@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from heli_jax.identification.uncertainty.comparison import intervals as intervals
     from heli_jax.linear_models.read import LinearModel as LinearModel
     from heli_jax.linear_models.read import linear_model as linear_model
+    from heli_jax.report.compared_runs import compare_runs as compare_runs
     from heli_jax.report.saved_fit import SavedFit as SavedFit
     from heli_jax.report.saved_fit import load_fit as load_fit
     from heli_jax.simulation.accumulate import accumulate as accumulate
@@ -78,6 +79,7 @@ _HOMES = {
     "intervals": "identification.uncertainty.comparison",
     "SavedFit": "report.saved_fit",
     "load_fit": "report.saved_fit",
+    "compare_runs": "report.compared_runs",
     "FitRun": "workflow",
     "compare_models": "workflow",
     "load_config": "workflow",
@@ -88,7 +90,14 @@ _HOMES = {
 }
 
 
+__all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
 def __getattr__(name: str) -> Any:  # any of them
+    if name == "__version__":
+        from heli_jax.versions import version
+
+        return version()
     if name not in _HOMES:
         raise AttributeError(f"module 'heli_jax' has no attribute {name!r}")
     # A module itself: `heli_jax.models` has no attribute `models` to ask for.
@@ -99,4 +108,4 @@ def __getattr__(name: str) -> Any:  # any of them
 
 def __dir__() -> list[str]:
     # For completion in a session: without it only the names used so far would be offered.
-    return sorted(_HOMES)
+    return sorted([*_HOMES, "__version__"])

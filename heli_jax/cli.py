@@ -9,7 +9,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from heli_jax import cli_options, interrupts, reading_progress, run_directory
+from heli_jax import (
+    cli_options,
+    file_commands,
+    interrupts,
+    reading_progress,
+    run_commands,
+    run_directory,
+)
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +32,15 @@ class _Parser(argparse.ArgumentParser):
         # One line as all other errors; argparse would print the usage of the command before it.
         print(f"heli-jax: {message} (heli-jax --help lists the commands)", file=sys.stderr)
         raise SystemExit(WRONG_INPUT)
+
+
+class _Version(argparse.Action):
+    # Any: what argparse passes.
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from heli_jax.versions import version
+
+        print(version())
+        raise SystemExit(DONE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Physical parameters of small helicopters from logged runs, with honest "
         "uncertainties.",
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     # Each command's function becomes `options.run`, so that `main` needs no table of them.
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -101,6 +118,14 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_info_options(info)
     convert = command("convert", _convert, "signals of a log on one clock, as a table")
     cli_options.add_convert_options(convert)
+    listing = command("runs", run_commands.runs, "the fits that a folder holds")
+    cli_options.add_runs_options(listing)
+    compare = command("compare", _compare, "fits side by side: estimates, verdicts, agreement")
+    cli_options.add_compare_options(compare)
+    new = command("new", _new, "a configuration that begins with what a log holds")
+    cli_options.add_new_options(new)
+    listing = command("keys", _keys, "what may stand in a configuration")
+    cli_options.add_keys_options(listing)
     new_model = command("new-model", _new_model, "write the files that a model of one's own needs")
     new_model.add_argument("name", metavar="NAME", help="of the model and its module")
     new_model.add_argument("--out", metavar="DIR", help="new folder (default: NAME)")
@@ -239,7 +264,7 @@ def _simulate(options: argparse.Namespace) -> int:
             run_directory.require_place(place, f"{option} {place}")
     _prepare_jax()
     from heli_jax import config as configuration
-    from heli_jax import generate, output
+    from heli_jax import generate, simulation_output
 
     experiment = configuration.load(options.config, options.set)
     if experiment.config.simulate is not None:
@@ -248,11 +273,11 @@ def _simulate(options: argparse.Namespace) -> int:
         simulated = generate.follow(experiment)
     for note in simulated.notes:
         _say(f"{options.config}: {note}")
-    output.write_table(out, simulated.columns)
+    simulation_output.write_table(out, simulated.columns)
     if out is not None:
         _say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
-        output.write_view(view, experiment, simulated)
+        simulation_output.write_view(view, experiment, simulated)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         _say(f"wrote {view}{whole}")
     return DONE
@@ -274,7 +299,7 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import output, workflow
+    from heli_jax import simulation_output, workflow
 
     experiment = workflow.load_config(config, options.set)
 
@@ -285,7 +310,7 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.words = interrupted
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with output.sweep_progress() as progress, _client(options, config) as client:
+    with simulation_output.sweep_progress() as progress, _client(options, config) as client:
         workflow.run_sweep(
             experiment,
             out,
@@ -298,7 +323,7 @@ def _sweep(options: argparse.Namespace) -> int:
             progress=progress,
             say=_say,
         )
-    output.print_sweep(out)
+    simulation_output.print_sweep(out)
     return DONE
 
 
@@ -354,16 +379,20 @@ def _convert(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _new_model(options: argparse.Namespace) -> int:
-    from heli_jax.new_model import write_skeleton
+def _compare(options: argparse.Namespace) -> int:
+    return run_commands.compare(options, _say)
 
-    written = write_skeleton(options.name, options.out)
-    print(*written, sep="\n")
-    _say(
-        f"wrote {len(written)} files; next: heli-jax simulate {written[2]} --out "
-        f"{written[2].with_suffix('.csv')}, then heli-jax fit {written[2]}"
-    )
-    return DONE
+
+def _new(options: argparse.Namespace) -> int:
+    return file_commands.new(options, _say)
+
+
+def _keys(options: argparse.Namespace) -> int:
+    return file_commands.keys(options, _say)
+
+
+def _new_model(options: argparse.Namespace) -> int:
+    return file_commands.new_model(options, _say)
 
 
 if __name__ == "__main__":

@@ -119,6 +119,47 @@ def add_frf_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
 
 
+def add_runs_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax runs`."""
+    command.add_argument(
+        "directory", nargs="?", default="runs", metavar="DIR", help="default: runs"
+    )
+    command.add_argument("--json", action="store_true", help="for other programs")
+
+
+def add_compare_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax compare`."""
+    command.add_argument("runs", nargs="+", metavar="RUN", help="directories of heli-jax fit")
+    command.add_argument(
+        "--out", metavar="FILE", help="page (.html), estimates as .csv or as LaTeX (.tex)"
+    )
+
+
+def add_new_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax new`."""
+    command.add_argument("log", metavar="LOG", help="of any format")
+    command.add_argument(
+        "--model",
+        metavar="NAME",
+        help="as a configuration names it, such as roll-on-stand or attitude-flybarless "
+        "(default: the linear model of the axis whose stick moves most)",
+    )
+    command.add_argument("--vehicle", metavar="FILE", help="a vehicle file that is there already")
+    command.add_argument("--flight", type=count, metavar="N", help="of a log that holds several")
+    command.add_argument("--out", metavar="FILE", help="configuration (default: the log's name)")
+
+
+def add_keys_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax keys`."""
+    command.add_argument(
+        "pattern", nargs="?", metavar="TEXT", help="of keys or their meaning (default: all keys)"
+    )
+    command.add_argument("--json", action="store_true", help="for other programs")
+    command.add_argument(
+        "--schema", metavar="FILE", help="write the JSON schema, by which editors complete YAML"
+    )
+
+
 def count(text: str) -> int:
     """An option's value that is a number from 1."""
     if not text.isdigit() or int(text) < 1:

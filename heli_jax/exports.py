@@ -35,6 +35,22 @@ def estimates_frame(estimates: Mapping[str, Any]) -> "pd.DataFrame":
     return frame.rename_axis("parameter")
 
 
+def runs_frame(runs: Mapping[str, Mapping[str, Any]]) -> "pd.DataFrame":
+    """The estimates of several runs as a long data frame: a row for each run and parameter.
+
+    What the data do not determine has no number.
+
+    Args:
+        runs: estimates by name, by run.
+    """
+    import pandas as pd
+
+    frames = {run: estimates_frame(estimates) for run, estimates in runs.items()}
+    frame = pd.concat(frames, names=["run"]).reset_index()
+    frame.loc[frame["sd"].isna(), ["value", "lower95", "upper95"]] = np.nan
+    return frame
+
+
 def trajectory_dataset(run: Any) -> "xr.Dataset":
     """A run as a Dataset over `time` [s], each signal with its unit and its role (state, output or
     input) in the attributes.

@@ -97,8 +97,8 @@ def run_responses(
 
 def print_responses(found: FlightResponses) -> None:
     """What each response is good for, and the transfer functions, on standard output."""
-    from heli_jax.output import print_table
     from heli_jax.report.responses import FIT_HEAD, fit_row, useful_band
+    from heli_jax.terminal_table import print_table
 
     rows = []
     for name, output in found.outputs.items():

@@ -122,7 +122,7 @@ def _ranked(problem: Problem, stated: Sequence[_Window], length: float | None) -
 
 def print_ranking(ranking: Ranking) -> None:
     """The windows, best first, and those that are enough together, on standard output."""
-    from heli_jax.output import print_table
+    from heli_jax.terminal_table import print_table
 
     taken = [choice.window for choice in ranking.taken]
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]

@@ -17,6 +17,8 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Real
 
+from heli_jax.pickled import by_value
+
 type Scalar = Float[Array, ""] | float
 """One number: a traced or concrete array of shape (), or a Python float."""
 
@@ -125,4 +127,5 @@ def extended(record: type, title: str, more: Mapping[str, tuple[Any, Any]]) -> t
     # The functional form of NamedTuple takes no defaults: they are set where the other form does.
     made.__new__.__defaults__ = tuple(with_default[n] for n in ordered if n in with_default)
     made._field_defaults = {n: with_default[n] for n in ordered if n in with_default}
+    made.__reduce__ = by_value
     return made

@@ -6,6 +6,11 @@ import platform
 _PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
 
 
+def version() -> str:
+    """That of heli_jax, as installed."""
+    return importlib.metadata.version("heli_jax")
+
+
 def versions() -> dict[str, str]:
     """The versions of Python and of the packages that numbers depend on."""
     # Of the installed distributions: not every package has a __version__, and none is imported.

@@ -44,6 +44,11 @@ def _on_choice(value: Any) -> Any:
     return tuple(names)
 
 
+_Size = Annotated[
+    Any, BeforeValidator(_size_choice, json_schema_input_type=float | dict[str, Any] | None)
+]
+
+
 class DisturbanceConfig(BaseModel):
     """Random pushes on derivatives of states: simulation draws them, filter error estimates them.
 
@@ -57,15 +62,15 @@ class DisturbanceConfig(BaseModel):
     axis: str | None = None
     """one of the model's axes: roll, pitch, yaw, heave, ..."""
     # Any, since the validators before it have said what it may be, here and below.
-    on: Annotated[Any, BeforeValidator(_on_choice)] = None
+    on: Annotated[Any, BeforeValidator(_on_choice, json_schema_input_type=str | list[str])] = None
     """states or axes, each with a disturbance of its own"""
     # Two poles for a push that is smoother than a lag of white noise; both have the same time
     # constant.
     poles: Literal[1, 2] = 1
-    sigma_w: Annotated[Any, BeforeValidator(_size_choice)] = None
+    sigma_w: _Size = None
     """standard deviation, in the state's unit per second (SI) or as {value, unit}, of several by
     name: needed to simulate, an initial guess for filter error"""
-    tau_w: Annotated[Any, BeforeValidator(_size_choice)] = None
+    tau_w: _Size = None
     """correlation time [s], of several by name or one number for all: as sigma_w"""
     fixed: list[str] = []
     """what filter error takes as it stands here: sigma_w, tau_w (of several disturbances sigma_w_p,

@@ -22,7 +22,6 @@ from heli_jax.dynamics.kinematics import (
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight, Signal
-from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.free import Free, Prior
 from heli_jax.naming import Record
 
@@ -225,6 +224,9 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
     for parameter, names in NOISES.items():
         if parameter in known:
             # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
+            # Imported here: a second, of which models without sensors' errors have no need.
+            from heli_jax.identification.estimation.noise_covariance import noise_guess
+
             walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
             # One intensity for three axes, as the model has it: their rms.
             found[parameter] = float(np.sqrt(np.mean(np.square(walks))))

@@ -45,8 +45,12 @@ def _one_or_several(value: object) -> object:
 
 
 # Any, since the validator before it has said what it may be.
-Names = Annotated[Any, BeforeValidator(_names)]
-NamesOrPairs = Annotated[Any, BeforeValidator(_names_or_pairs)]
+# What an editor is told of it is the type beside the validator.
+Names = Annotated[Any, BeforeValidator(_names, json_schema_input_type=list[str])]
+NamesOrPairs = Annotated[
+    Any,
+    BeforeValidator(_names_or_pairs, json_schema_input_type=list[str] | dict[str, str] | None),
+]
 # The most states that `with_delays` takes: refused here, where the key has a place.
 Order = Annotated[int, Field(ge=1, le=8)]
 
@@ -161,7 +165,12 @@ def _seconds(value: object) -> object:
     return value
 
 
-Filters = Annotated[list[FilterConfig], BeforeValidator(_filters)]
+Filters = Annotated[
+    list[FilterConfig],
+    BeforeValidator(
+        _filters, json_schema_input_type=Literal["from log"] | FilterConfig | list[FilterConfig]
+    ),
+]
 Delay = Annotated[float, BeforeValidator(_seconds)]
 
 
@@ -190,7 +199,10 @@ class VibrationConfig(_Strict):
 class OnboardConfig(_Strict):
     """What stands between stick and blade, motion and log; each on what stands before it."""
 
-    servos: Annotated[list[ServosConfig], BeforeValidator(_one_or_several)] = []
+    servos: Annotated[
+        list[ServosConfig],
+        BeforeValidator(_one_or_several, json_schema_input_type=ServosConfig | list[ServosConfig]),
+    ] = []
     rate_loop: RateLoopConfig | None = None
     gyro: GyroConfig | None = None
     sensors: SensorsConfig | None = None

@@ -12,7 +12,7 @@ from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, Vibr
 from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
 from heli_jax.config.simulate_section import SimulateConfig, StartConfig
 from heli_jax.errors import nearest
-from heli_jax.identification.equation_error.stepwise import F_ENTER
+from heli_jax.identification.equation_error.limits import F_ENTER
 from heli_jax.identification.methods import METHODS
 from heli_jax.identification.problem import Sign
 
@@ -191,7 +191,9 @@ class NuisanceConfig(_Strict):
     time_shift: bool = False
     input_gain: bool = False
     # Any, since the validator before it has said what it may be.
-    input_offset: Annotated[Any, BeforeValidator(_offset_choice)] = None
+    input_offset: Annotated[
+        Any, BeforeValidator(_offset_choice, json_schema_input_type=bool | list[str] | None)
+    ] = None
     """a constant added to the logged inputs, each flight its own: all, or those named; null: on for
     the sticks of a machine in free flight"""
 
@@ -252,7 +254,10 @@ class FitConfig(_Strict):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
     free: dict[str, FreeConfig]
-    start: Annotated[StartMethodConfig, BeforeValidator(_start_method)] = StartMethodConfig()
+    start: Annotated[
+        StartMethodConfig,
+        BeforeValidator(_start_method, json_schema_input_type=str | StartMethodConfig),
+    ] = StartMethodConfig()
     """given, equation-error, or {method: equation-error, stepwise: true}"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None

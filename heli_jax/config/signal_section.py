@@ -71,8 +71,9 @@ def _booleans(value: object) -> object:
 
 
 # Any, since the validator before it has said what it may be.
-_Numbers = Annotated[Any, BeforeValidator(_numbers)]
-_Booleans = Annotated[Any, BeforeValidator(_booleans)]
+# What an editor is told of it is the type beside the validator.
+_Numbers = Annotated[Any, BeforeValidator(_numbers, json_schema_input_type=float | list[float])]
+_Booleans = Annotated[Any, BeforeValidator(_booleans, json_schema_input_type=bool | list[bool])]
 
 
 class CcpmConfig(_Strict):

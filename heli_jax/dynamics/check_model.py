@@ -38,6 +38,12 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
         TypeError: it is no Model.
         ValueError: naming the function, what was expected, what it did, and the remedy.
     """
+    if isinstance(model, str):
+        raise TypeError(
+            f"model: expected a heli_jax.Model, got its name {model!r:.60}; "
+            f"heli_jax.models.by_name({model!r:.60}) is the shipped one, "
+            f"heli_jax.linear_model({model!r:.60}).model one from a file"
+        )
     if not isinstance(model, Model):
         raise TypeError(
             f"model: expected a heli_jax.Model, as Model(name, vector_field, output, Params, "

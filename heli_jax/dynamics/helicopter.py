@@ -51,6 +51,7 @@ from heli_jax.dynamics.model import PITCH, ROLL, YAW, Axis, Model, SteadyFlight
 from heli_jax.dynamics.tail_rotor import tail_rotor
 from heli_jax.dynamics.tip_path_plane import Tilt, hub_loads
 from heli_jax.naming import Record, Scalar
+from heli_jax.pickled import by_value
 from heli_jax.vehicle import Helicopter
 
 _BEYOND = ("flapping", "speed_stability", "tip_loss", "tail_force", "tail_power", "windmill")
@@ -177,7 +178,9 @@ def _inputs_class(corrections: Corrections, wind: bool) -> type:
     # in another class would be another program.
     if tuple(sticks) == HelicopterInputs._fields:
         return HelicopterInputs
-    return NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
+    made: Any = NamedTuple("HelicopterInputs", list(sticks.items()))  # type: ignore[misc]
+    made.__reduce__ = by_value
+    return made
 
 
 def _state_class(corrections: Corrections) -> type:
@@ -197,7 +200,9 @@ def _state_class(corrections: Corrections) -> type:
         hints["vi"] = INFLOW
     if tuple(hints) == HelicopterState._fields:
         return HelicopterState
-    return NamedTuple("HelicopterState", list(hints.items()))  # type: ignore[misc]
+    made: Any = NamedTuple("HelicopterState", list(hints.items()))  # type: ignore[misc]
+    made.__reduce__ = by_value
+    return made
 
 
 def _start(State: type, p: Helicopter) -> Record:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.naming import Record
+from heli_jax.pickled import by_value
 
 _LINEAR = 1e-6
 """relative misfit above which a model is not linear: rounding leaves less"""
@@ -147,6 +148,9 @@ class Model(eqx.Module):
                 )
                 setattr(self, new, function)
                 setattr(self, old, None)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return by_value(self)
 
     @property
     def delay_parameters(self) -> tuple[str, ...]:

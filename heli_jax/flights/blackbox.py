@@ -102,8 +102,21 @@ def _columns(values: np.ndarray, layout: FrameLayout) -> dict[str, np.ndarray]:
     for i, (name, signed) in enumerate(zip(layout.names, layout.signed, strict=True)):
         # Kept as 32 bits, of which an unsigned field uses the top one for its size.
         column = np.ascontiguousarray(values[:, i].astype(np.int32, copy=False))
-        columns[name] = column if signed else column.view(np.uint32)
+        columns[name] = _narrowed(column if signed else column.view(np.uint32))
     return columns
+
+
+def _narrowed(column: np.ndarray) -> np.ndarray:
+    """The numbers in the fewest bits that hold them: most need half of 32, and a file's flights
+    are all kept."""
+    if not column.size:
+        return column
+    low, high = int(column.min()), int(column.max())
+    kinds = (np.int8, np.int16) if column.dtype.kind == "i" else (np.uint8, np.uint16)
+    for kind in kinds:
+        if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max:
+            return column.astype(kind)
+    return column
 
 
 def _units(layout: FrameLayout, head: Header) -> dict[str, str]:

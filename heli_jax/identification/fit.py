@@ -1,7 +1,7 @@
 """fit and check: parameters with intervals and a verdict, from a Problem."""
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
@@ -88,11 +88,20 @@ def _first_guess(problem: Problem) -> _FirstGuess:
     return _FirstGuess(layout, data, noise, z, e)
 
 
+def _require_problem(problem: Any) -> None:
+    if not isinstance(problem, Problem):
+        raise TypeError(
+            f"problem: expected a heli_jax.Problem, got {type(problem).__name__}; of a "
+            "configuration heli_jax.config.problem(heli_jax.load_config(path)) makes it"
+        )
+
+
 def check(problem: Problem) -> Check:
     """What the flights can determine at the start values, before any fit.
 
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
+    _require_problem(problem)
     guess = _first_guess(problem)
     # At the start values, since nothing else is known yet: where these are far off, what is
     # determined there may differ from what is at the optimum, for which the fit asks again.
@@ -194,6 +203,7 @@ def fit(
         ValueError: the simulation is not finite at the start values.
     """
     began = time.perf_counter()
+    _require_problem(problem)
     report = progress or (lambda _: None)
     guess = _first_guess(problem)
     layout, data, noise = guess.layout, guess.data, guess.noise

@@ -16,6 +16,7 @@ from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
 from heli_jax.dynamics.start import cannot_start
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.arguments import check_arguments, warn_of_degrees
 from heli_jax.identification.free import Free, Prior, Sign, check_free
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.push_scale import push_scales
@@ -96,6 +97,8 @@ class Problem:
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.
         check_model(self.model)
+        check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
+        warn_of_degrees(self.model.Outputs, self.flights)
         object.__setattr__(self, "flights", tuple(self.flights))
         # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
         # So is what the model says is positive; delays and gains of devices around it are not.

@@ -11,6 +11,7 @@ from heli_jax.linear_models.content import Content, Signal
 from heli_jax.linear_models.expression import evaluate
 from heli_jax.linear_models.matrices import Entry
 from heli_jax.naming import Scalar
+from heli_jax.pickled import by_value
 
 
 def model_of(content: Content, matrices: Mapping[str, tuple[Entry, ...]]) -> Model:
@@ -46,6 +47,7 @@ def _record(title: str, signals: Mapping[str, Signal]) -> type:
     fields = [(n, Annotated[Scalar, one.si, one.meaning]) for n, one in signals.items()]
     # At run time, since what the states are stands in the file; a type checker cannot know them.
     made: Any = NamedTuple(title, fields)  # type: ignore[misc]
+    made.__reduce__ = by_value
     return made
 
 

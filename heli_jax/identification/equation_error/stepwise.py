@@ -14,9 +14,6 @@ from jaxtyping import Float
 from heli_jax.identification.equation_error.errors import basis_of, partial_f
 from heli_jax.identification.equation_error.regression import Rows
 
-F_ENTER = 20.0
-"""five times the 5 % point of F (Klein and Morelli): terms below it hardly help to predict"""
-
 
 class Step(NamedTuple):
     """One step of the selection. The names of the fields are keys of fit.json."""

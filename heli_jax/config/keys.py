@@ -1,0 +1,218 @@
+"""The keys of a configuration, from the classes that check them: for editors and readers."""
+
+import ast
+import inspect
+import itertools
+import math
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from heli_jax.config.schema import Config
+
+_URL = "https://json-schema.org/draft/2020-12/schema"
+# Of a mapping the name is the user's: of a signal, a parameter, a state.
+_NAME = "NAME"
+_MOST_CHOICES = 20
+
+
+class Key(NamedTuple):
+    """One key of a configuration."""
+
+    path: str
+    """in full: `flights[].signals.inputs.NAME.unit`"""
+    kind: str
+    """what may stand there, in words"""
+    default: str | None
+    """as it would stand in the file; None where the key has to be there"""
+    meaning: str
+    """empty where the name says it all"""
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of a configuration, by which editors complete and check YAML."""
+    schema = Config.model_json_schema()
+    for name, section in _sections(Config).items():
+        place = schema if section is Config else schema["$defs"].get(name)
+        if place is None:
+            continue
+        for field, words in _meanings(section).items():
+            if field in place["properties"]:
+                place["properties"][field]["description"] = words
+    return {"$schema": _URL, **_finite(schema), "title": "heli_jax configuration"}
+
+
+def keys() -> list[Key]:
+    """All keys, sections before what stands in them."""
+    schema = json_schema()
+    return list(_walk(schema, schema, "", ()))
+
+
+def matching(pattern: str) -> list[Key]:
+    """The keys whose path holds a text, in any case; else those whose meaning does.
+
+    Args:
+        pattern: the text, blanks at its ends left out.
+    """
+    wanted, every = pattern.strip().lower(), keys()
+    found = [k for k in every if wanted in k.path.lower()]
+    # A word of the meaning finds a key whose name the reader does not know.
+    return found or [k for k in every if wanted in k.meaning.lower()]
+
+
+def _walk(
+    schema: Mapping[str, Any], at: Mapping[str, Any], path: str, above: tuple[str, ...]
+) -> Iterator[Key]:
+    required = at.get("required", [])
+    for name, field in at.get("properties", {}).items():
+        place = f"{path}.{name}" if path else name
+        default = None if name in required else _written(field.get("default"))
+        yield Key(place, _kind(schema, field), default, field.get("description", ""))
+        for part, suffix in _within(schema, field):
+            # A section may stand within itself, as an axis in a list of axes: told once.
+            title = part.get("title", "")
+            if title not in above:
+                yield from _walk(schema, part, place + suffix, (*above, title))
+
+
+def _within(
+    schema: Mapping[str, Any], field: Mapping[str, Any]
+) -> Iterator[tuple[Mapping[str, Any], str]]:
+    """The sections within a field, and what stands between its path and their keys."""
+    seen: set[str] = set()
+    for option in _options(field):
+        if "$ref" in option:
+            name = option["$ref"].rsplit("/", 1)[1]
+            # A field may take one section or a list of it, whose keys are the same.
+            if name not in seen:
+                seen.add(name)
+                yield schema["$defs"][name], ""
+        elif isinstance(option.get("items"), dict):
+            for part, suffix in _within(schema, option["items"]):
+                if part.get("title") not in seen:
+                    yield part, "[]" + suffix
+        elif isinstance(option.get("additionalProperties"), dict):
+            for part, suffix in _within(schema, option["additionalProperties"]):
+                yield part, f".{_NAME}" + suffix
+
+
+def _options(field: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    return list(field.get("anyOf", [field]))
+
+
+def _kind(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
+    words = (_one_kind(schema, option) for option in _options(field))
+    # Null is a default that can be written, and says nothing of what else can.
+    return " or ".join(dict.fromkeys(w for w in words if w != "null")) or "null"
+
+
+def _one_kind(schema: Mapping[str, Any], option: Mapping[str, Any]) -> str:
+    if "$ref" in option:
+        return "section"
+    if "const" in option:
+        return str(option["const"])
+    if "enum" in option:
+        return " | ".join(map(str, option["enum"][:_MOST_CHOICES]))
+    match option.get("type"):
+        case "array":
+            return _list_kind(schema, option)
+        case "object":
+            inner = option.get("additionalProperties")
+            return f"{_kind(schema, inner) if isinstance(inner, dict) else 'any'} by name"
+        case "boolean":
+            return "true | false"
+        case "string":
+            return "text"
+        case "integer" | "number" as kind:
+            return kind + _bounds(option)
+        case None:
+            return "any"
+        case kind:
+            return str(kind)
+
+
+def _list_kind(schema: Mapping[str, Any], option: Mapping[str, Any]) -> str:
+    if "prefixItems" in option:
+        return f"[{', '.join(_kind(schema, item) for item in option['prefixItems'])}]"
+    return f"list of {_kind(schema, option.get('items', {}))}"
+
+
+def _bounds(option: Mapping[str, Any]) -> str:
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    stated = [f"{sign} {option[key]:g}" for key, sign in signs.items() if key in option]
+    return f" {' and '.join(stated)}" if stated else ""
+
+
+def _written(default: Any) -> str:
+    match default:
+        case None:
+            return "null"
+        case bool():
+            return str(default).lower()
+        case dict() if default:
+            return "{" + ", ".join(f"{k}: {_written(v)}" for k, v in default.items()) + "}"
+        case list():
+            return "[" + ", ".join(map(_written, default)) + "]"
+        case float():
+            return f"{default:g}"
+    return str(default)
+
+
+def _finite(value: Any) -> Any:
+    """The schema without NaN, of which JSON knows nothing: such a default is none."""
+    if isinstance(value, dict):
+        kept = ((k, v) for k, v in value.items() if not (k == "default" and _is_nan(v)))
+        return {k: _finite(v) for k, v in kept}
+    return [_finite(v) for v in value] if isinstance(value, list) else value
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _sections(of: type[BaseModel]) -> dict[str, type[BaseModel]]:
+    """The classes of all sections by their names."""
+    found: dict[str, type[BaseModel]] = {}
+    todo = [of]
+    while todo:
+        section = todo.pop()
+        if section.__name__ not in found:
+            found[section.__name__] = section
+            fields = section.model_fields.values()
+            todo += itertools.chain.from_iterable(_classes(f.annotation) for f in fields)
+            todo += itertools.chain.from_iterable(_classes(m) for f in fields for m in f.metadata)
+    return found
+
+
+def _classes(kind: Any) -> Iterator[type[BaseModel]]:
+    # A validator that takes other forms than the field's type says them beside itself.
+    kind = getattr(kind, "json_schema_input_type", kind)
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        yield kind
+    for inner in typing.get_args(kind):
+        yield from _classes(inner)
+
+
+def _meanings(section: type[BaseModel]) -> dict[str, str]:
+    """What stands below each field in the source, by field; own fields over inherited ones."""
+    # Read from the source when it is asked for: pydantic would do so at every import.
+    found: dict[str, str] = {}
+    for each in reversed(section.__mro__):
+        if issubclass(each, BaseModel) and each is not BaseModel:
+            found |= _stated(each)
+    aliases = {n: f.alias for n, f in section.model_fields.items() if f.alias}
+    return {aliases.get(name, name): words for name, words in found.items()}
+
+
+def _stated(section: type[BaseModel]) -> dict[str, str]:
+    body = ast.parse(inspect.cleandoc("\n" + inspect.getsource(section))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    stated = {}
+    for field, below in itertools.pairwise(body.body):
+        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+            words = below.value.value  # pyright: ignore[reportAttributeAccessIssue]
+            stated[field.target.id] = " ".join(str(words).split())
+    return stated

@@ -1,0 +1,83 @@
+"""What a script may pass for a Problem, said in words where it passed something else."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.free import Free
+
+_HEADINGS = {"psi", "yaw"}
+"""angles that may go on for more than a turn"""
+_FURTHEST = 6 * math.pi
+"""rad: linear models of an axis roll over in long records, with no pilot to hold them"""
+
+
+def check_arguments(params: type, vehicle: Any, flights: Any, free: Any) -> None:
+    """Refuse what is of another kind than it has to be.
+
+    Args:
+        params: the model's class of parameters.
+        vehicle: should be one of these.
+        flights: should be a sequence of Flights.
+        free: should be Free by name.
+
+    Raises:
+        TypeError: naming the argument, what was expected and what was found.
+    """
+    if isinstance(vehicle, str | bytes) or hasattr(vehicle, "__fspath__"):
+        raise TypeError(
+            f"vehicle: expected {params.__name__}, got a path; "
+            "heli_jax.load_vehicle(path, model.Params) reads the file"
+        )
+    if not all(hasattr(vehicle, name) for name in naming.names(params)):
+        raise TypeError(
+            f"vehicle: expected the model's {params.__name__}, got {type(vehicle).__name__}"
+        )
+    if isinstance(flights, Flight):
+        raise TypeError("flights: expected a list of Flights, got one; pass [flight]")
+    if not isinstance(flights, Sequence) or not all(isinstance(f, Flight) for f in flights):
+        raise TypeError(f"flights: expected a list of Flights, got {_kinds(flights)}")
+    if not isinstance(free, Mapping):
+        raise TypeError(
+            "free: expected Free by the parameter's name, as {'Ixx': Free(0.02)}, got "
+            f"{type(free).__name__}"
+        )
+    for name, each in free.items():
+        if not isinstance(each, Free):
+            got = f"the number {each:g}" if isinstance(each, int | float) else type(each).__name__
+            example = f"Free({each:g})" if isinstance(each, int | float) else "Free(start)"
+            raise TypeError(f"free: {name}: expected {example}, got {got}")
+
+
+def _kinds(flights: Any) -> str:
+    if isinstance(flights, str | bytes) or not isinstance(flights, Sequence):
+        return type(flights).__name__
+    other = next(f for f in flights if not isinstance(f, Flight))
+    return f"{type(other).__name__} among them; heli_jax.read_flight(path, ...) reads a log"
+
+
+def warn_of_degrees(outputs: type, flights: Sequence[Flight]) -> None:
+    """Warn of angles that turn further than a helicopter does, as angles in degrees would.
+
+    Args:
+        outputs: the model's class, which has the units.
+        flights: those made in Python; of a log its unit is stated and checked.
+    """
+    for flight in flights:
+        for name, values in flight.outputs.items():
+            of_angle = name in naming.names(outputs) and naming.unit(outputs, name) == "rad"
+            if flight.source is not None or not of_angle or name in _HEADINGS:
+                continue
+            largest = float(np.nanmax(np.abs(np.asarray(values)), initial=0.0))
+            if largest > _FURTHEST:
+                warnings.warn(
+                    f"{flight.name or 'a flight'}: {name} reaches {largest:.4g} rad, more than "
+                    "three turns; angles are in radians here: np.radians(degrees)",
+                    UserWarning,
+                    stacklevel=4,
+                )

@@ -1,0 +1,291 @@
+"""`heli-jax new LOG`: a configuration that begins with what a log holds, its guesses marked."""
+
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax import models, naming
+from heli_jax.errors import InputError
+from heli_jax.flights.describe import LogInfo, describe_table
+from heli_jax.flights.log import as_floats
+from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.preset import fitting_presets, model_inputs, model_outputs
+from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.linear_models import read as linear_models
+from heli_jax.new_config import guess, text
+from heli_jax.new_config.guess import Guess, Series
+from heli_jax.run_directory import require_place
+from heli_jax.vehicle import read_vehicle
+from heli_jax.yaml_file import parse_mapping
+
+_AXES = {
+    "roll": ("roll-flybarless", ("roll_rate", "roll")),
+    "pitch": ("pitch-flybarless", ("pitch_rate", "pitch")),
+    "yaw": ("yaw", ("yaw_rate",)),
+    "collective": ("heave", ("down_speed",)),
+}
+"""by stick the linear model of its axis, and what has to be logged for it"""
+_FEWEST = 8
+"""samples of a signal"""
+
+
+class Written(NamedTuple):
+    """The files, the configuration first, and what the user has to know."""
+
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+class _Log(NamedTuple):
+    """A flight as `new` looks at it."""
+
+    path: str
+    format: str
+    series: Mapping[str, Series]
+    time: Any
+    """`TimeInfo` of a table; None where topics have clocks of their own"""
+    flight: int | None
+    several: bool
+
+
+def write_config(
+    log: str | Path,
+    out: Path,
+    model: str | None = None,
+    vehicle: str | None = None,
+    flight: int | None = None,
+) -> Written:
+    """Write a configuration, and for models of a machine's geometry a vehicle file to fill in.
+
+    Args:
+        log: of any format that is read.
+        out: the configuration's place; what stands there is not replaced.
+        model: as a configuration names it, a linear one by its file's name too; chosen by what
+            moves unless given.
+        vehicle: a vehicle file.
+        flight: of a log that holds several, from 1.
+
+    Raises:
+        InputError: the log cannot be read, holds nothing of the model, or a file is in the way.
+    """
+    if out.exists():
+        raise InputError(f"{out}: is there already; expected another place, --out FILE")
+    require_place(out, str(out))
+    read = _read(Path(log), flight)
+    chosen = text.Chosen(*_model(model, read, str(log)))
+    preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
+    signals = None if preset else _signals(chosen.model, read)
+    found = {} if signals is None else signals.known
+    paths, constants, place = _vehicle(chosen, out, vehicle, found)
+    if paths and signals is not None:
+        # The vehicle file has them.
+        signals = signals._replace(known={})
+    content = text.configuration(
+        chosen=chosen,
+        log=_relative(Path(log), out),
+        time=read.time,
+        flight=read.flight if read.several else None,
+        preset=preset,
+        signals=signals,
+        vehicle=place,
+        free=_free(chosen, constants),
+    )
+    for path, words in {out: content, **paths}.items():
+        path.write_text(words, encoding="utf-8")
+    todo = sum(words.count(guess.EDIT) for words in (content, *paths.values()))
+    notes = [f"wrote {', '.join(map(str, (out, *paths)))}"]
+    if todo:
+        notes.append(f"{todo} numbers are yours to give, where {guess.EDIT} stands")
+    notes.append(f"look over what is marked GUESS; next: heli-jax check {out}")
+    return Written((out, *paths), tuple(notes))
+
+
+def _relative(log: Path, out: Path) -> str:
+    """The log as a configuration in `out` names it."""
+    # Logs beside or below the configuration move with it.
+    folder, path = out.absolute().parent.resolve(), log.absolute().resolve()
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+
+
+def _read(path: Path, number: int | None) -> _Log:
+    opened = chosen_flights(path, open_flights(path), number)
+    if not isinstance(opened, tuple):
+        return _read_table(opened)
+    first, *others = opened
+    series = {
+        name: Series(topic.times, as_floats(values), topic.units.get(name, ""))
+        for topic in first.topics
+        if topic.clock and topic.times.size >= _FEWEST
+        for name, values in topic.columns.items()
+        if np.asarray(values).dtype.kind in "biuf"
+    }
+    flight = first.flight[0] if others or first.flight[1] > 1 else None
+    return _Log(str(path), first.format, series, None, flight, flight is not None)
+
+
+def _read_table(table: Table) -> _Log:
+    info: LogInfo = describe_table(table, None, None)
+    if info.time is None or info.time.problem:
+        why = info.time.problem if info.time is not None else "none of its columns is a time"
+        raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
+    clock = info.time.column
+    names = [c.name for c in info.columns if c.kind == "number" and c.count >= _FEWEST]
+    # Of two columns of one name neither can be asked for.
+    names = [n for n in names if table.names.count(n) == 1]
+    values = table.numbers([clock, *(n for n in names if n != clock)])
+    # Seconds from the first stamp: their count does not matter to a guess.
+    times = np.linspace(0.0, info.time.duration, values[clock].size)
+    series = {n: Series(times, values[n], table.units.get(n, "")) for n in names if n != clock}
+    return _Log(table.path, table.format, series, info.time, None, False)
+
+
+def _model(name: str | None, log: _Log, path: str) -> tuple[Any, str | dict[str, str], bool]:
+    """The model, what a configuration calls it, and whether it is linear from a file."""
+    if name is None:
+        name = _by_what_moves(log, path)
+    # Of roll and pitch there are the paper's model and a linear one: the latter by {linear: roll}.
+    stated = name.strip().removeprefix("{").removesuffix("}")
+    linear = stated.startswith("linear:")
+    stated = stated.removeprefix("linear:").strip()
+    if (
+        not linear
+        and not linear_models.is_shipped(stated)
+        and not stated.endswith((".yaml", "yml"))
+    ):
+        return models.by_name(stated, "--model"), stated, False
+    if not linear and stated in ("roll", "pitch"):
+        return models.by_name(stated, "--model"), stated, False
+    return linear_models.linear_model(stated).model, {"linear": stated}, True
+
+
+def _by_what_moves(log: _Log, path: str) -> str:
+    """The linear model of the axis whose stick moves most, of those whose motion is logged."""
+    names, called = tuple(log.series), _names()
+    moving = {}
+    for stick, (model, measured) in _AXES.items():
+        sticks = _moving(log, guess.by_name(called["inputs"][stick], names))
+        outputs = [n for m in measured for n in guess.by_name(called["outputs"][m], names)]
+        if sticks and _moving(log, outputs):
+            size = np.nanstd(log.series[sticks[0]].values)
+            moving[model] = float(size / (np.nanmax(np.abs(log.series[sticks[0]].values)) or 1.0))
+    if fitting_presets(log.format, names):
+        return "roll-flybarless"
+    if not moving:
+        listed = ", ".join(map(shown, names[:12]))
+        problem = "found no stick beside a rate or an angle of its axis by their names, expected"
+        raise wrong(path, f"{problem} --model and then the signals by hand; it holds {listed}")
+    return max(moving, key=lambda m: moving[m])
+
+
+def _moving(log: _Log, names: Sequence[str]) -> list[str]:
+    return [n for n in names if np.nanstd(log.series[n].values) > 0]
+
+
+def _names() -> dict[str, Any]:
+    return _file("names.yaml")
+
+
+def _file(name: str) -> dict[str, Any]:
+    file = resources.files(__name__).joinpath(name)
+    return parse_mapping(file.read_text(encoding="utf-8"), name)
+
+
+def _signals(model: Any, log: _Log) -> text.Signals:
+    """Channels for inputs and outputs of the model, and which of the log's are left."""
+    called, taken = _names(), []
+    inputs: dict[str, Guess | None] = {}
+    for name in naming.names(model.Inputs):
+        own = model_inputs().get(name)
+        known = called["rotor_speed"] if name == "Omega" else []
+        if own is not None and name != "Omega":
+            known = called["inputs"][own.command.removeprefix("cyclic_").replace("tail", "yaw")]
+        inputs[name] = _found(log, name, known, naming.unit(model.Inputs, name) or "1", taken)
+    outputs: dict[str, Guess | None] = {}
+    for name in naming.names(model.Outputs):
+        signal = model_outputs().get(name, name)
+        known = called["outputs"].get(signal, [])
+        found = _found(log, name, known, naming.unit(model.Outputs, name) or "1", taken)
+        if found is not None:
+            outputs[name] = found
+    _by_correlation(model, log, inputs, outputs, taken)
+    speed = guess.by_name(called["rotor_speed"], tuple(log.series))
+    known = {}
+    if speed and "Omega" in naming.names(model.Params):
+        known = {"Omega": (speed[0], guess.rotor_speed(speed[0], log.series[speed[0]]))}
+        taken.append(speed[0])
+    rest = tuple(n for n in log.series if n not in taken)
+    return text.Signals(inputs, outputs, known, rest)
+
+
+def _found(log: _Log, name: str, known: Sequence[str], si: str, taken: list[str]) -> Guess | None:
+    own = " ".join(guess.words_of(name))
+    candidates = [n for n in guess.by_name([own, *known], tuple(log.series)) if n not in taken]
+    # What never moves is a trim, or a channel that is not connected; better than none.
+    candidates = _moving(log, candidates) or candidates
+    if not candidates:
+        return None
+    taken.append(candidates[0])
+    found = guess.scaled(candidates[0], log.series[candidates[0]], si)
+    if len(candidates) == 1:
+        return found
+    others = f"could be {', '.join(candidates[1:4])} as well"
+    return found._replace(remarks=(*found.remarks, others))
+
+
+def _by_correlation(
+    model: Any,
+    log: _Log,
+    inputs: dict[str, Guess | None],
+    outputs: Mapping[str, Guess | None],
+    taken: list[str],
+) -> None:
+    """Inputs whose names tell nothing, by what an output follows."""
+    known = [g.channel for g in outputs.values() if g is not None]
+    for name, found in inputs.items():
+        if found is not None or not known:
+            continue
+        left = {n: s for n, s in log.series.items() if n not in taken and np.nanstd(s.values) > 0}
+        best = guess.by_motion(log.series[known[-1]], left)
+        if best is None:
+            continue
+        channel, related = best
+        made = guess.scaled(channel, log.series[channel], naming.unit(model.Inputs, name) or "1")
+        why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
+        inputs[name] = made._replace(remarks=(why, *made.remarks))
+        taken.append(channel)
+
+
+def _vehicle(
+    chosen: text.Chosen,
+    out: Path,
+    vehicle: str | None,
+    found: Mapping[str, tuple[str, float]],
+) -> tuple[dict[Path, str], Mapping[str, float], str | None]:
+    """Further files, the constants that are known, and the vehicle's place in the configuration."""
+    if chosen.linear and vehicle is None:
+        return {}, {}, None
+    if vehicle is not None:
+        read = read_vehicle(vehicle, chosen.model.Params, naming.names(chosen.model.Params))
+        values = {n: c.value for n, c in read.constants.items()}
+        return {}, values, _relative(Path(vehicle), out)
+    place = out.with_name(f"{out.stem}-vehicle.yaml")
+    if place.exists():
+        raise InputError(f"{place}: is there already; expected --vehicle with it, or another --out")
+    return {place: text.vehicle(chosen.model, found)}, {}, place.name
+
+
+def _free(chosen: text.Chosen, constants: Mapping[str, float]) -> dict[str, float | str]:
+    """What is free and where it begins."""
+    listed = _file("models.yaml")
+    known = naming.names(chosen.model.Params)
+    if not chosen.linear:
+        names = [n for n in listed["of the paper"] if n in known] or list(known)
+        return {n: constants.get(n, guess.EDIT) for n in names}
+    assert isinstance(chosen.name, dict)
+    file = chosen.name["linear"]
+    own = linear_models.linear_model(file).vehicle().constants
+    values = {n: c.value for n, c in own.items()} | dict(constants)
+    return {n: values.get(n, guess.EDIT) for n in listed.get(file, known)}

@@ -1,0 +1,236 @@
+"""Which channel of a log is which signal, in which unit: guesses, each with its reason."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax import units
+
+EDIT = "EDIT"
+"""stands where only the user knows the number: no configuration with it is accepted"""
+# Longest first, so that deg/s is not read as deg.
+_UNIT_WORDS = {
+    "deg/s": "deg/s", "deg per s": "deg/s", "degs": "deg/s", "dps": "deg/s", "rad/s": "rad/s",
+    "rads": "rad/s", "radps": "rad/s", "deg": "deg", "degree": "deg", "degrees": "deg",
+    "rad": "rad", "mrad": "mrad", "rpm": "rpm", "percent": "%", "pct": "%", "mps": "m/s",
+    "m/s": "m/s", "cm": "cm", "mm": "mm",
+}  # fmt: skip
+_BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
+_COMMANDS = {"cmd", "command", "des", "desired", "sp", "setpoint", "ref", "target", "err", "error"}
+# What may stand behind a name and change nothing; roll_rate is no roll.
+_FILLERS = {
+    "pwm",
+    "us",
+    "raw",
+    "filt",
+    "filtered",
+    "meas",
+    "measured",
+    "value",
+    "norm",
+    "in",
+    "input",
+}
+_PULSES = (700.0, 2300.0)
+"""us: what receivers and servos are sent"""
+_FULL_PULSE = 500.0
+"""us from the middle to the end"""
+_FASTEST_TURN = 8.0
+"""rad/s, which a small helicopter hardly exceeds in a log for identification"""
+_LAGS = 0.5
+"""s by which an output may follow an input"""
+_RELATED = 0.4
+"""correlation from which on two signals are taken to have to do with each other"""
+
+
+class Series(NamedTuple):
+    """One channel: times and values (N,), and the unit that the log states, empty without one."""
+
+    times: np.ndarray
+    values: np.ndarray
+    unit: str = ""
+
+
+class Guess(NamedTuple):
+    """A channel for a signal of the model.
+
+    Attributes:
+        channel: its name in the log.
+        unit: of the scaled numbers.
+        scale: of the log's numbers; `EDIT` where nobody but the user knows it.
+        offset: in the log's own numbers.
+        remarks: what was guessed, in words for a comment.
+    """
+
+    channel: str
+    unit: str
+    scale: float | str = 1.0
+    offset: float = 0.0
+    remarks: tuple[str, ...] = ()
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """The words of a channel's name in lower case, without its unit.
+
+    Args:
+        name: such as `gyro.x`, `rollRate_deg/s`, `Roll (deg)`.
+    """
+    stem = without_unit(name)[0]
+    stem = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", stem)
+    return tuple(w for w in re.split(r"[^a-z0-9]+", stem.lower()) if w)
+
+
+def without_unit(name: str) -> tuple[str, str]:
+    """A name without the unit at its end, and this unit, empty where there is none."""
+    match = _BRACKETS.fullmatch(name)
+    if match and (unit := _UNIT_WORDS.get(match[2].strip().lower())):
+        return match[1], unit
+    if match and units.is_unit(match[2].strip()):
+        return match[1], match[2].strip()
+    for word, unit in _UNIT_WORDS.items():
+        for mark in ("_", " ", "."):
+            if name.lower().endswith(mark + word):
+                return name[: -len(word) - 1], unit
+    return name, ""
+
+
+def by_name(called: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The channels that may be a signal, the likeliest first.
+
+    Args:
+        called: what people call it, words by blanks.
+        names: of the log's channels.
+    """
+    forms = [tuple(c.split()) for c in called]
+    scored = []
+    for place, name in enumerate(names):
+        words = words_of(name)
+        if not words or _COMMANDS & set(words):
+            continue
+        # The whole name, before a name that ends so, as of a path: log.roll.
+        if words in forms:
+            scored.append((0, forms.index(words), place, name))
+        elif any(len(f) < len(words) and words[-len(f) :] == f for f in forms):
+            scored.append((1, 0, place, name))
+        elif any(f == words[: len(f)] and set(words[len(f) :]) <= _FILLERS for f in forms):
+            scored.append((2, 0, place, name))
+    return [name for *_, name in sorted(scored)]
+
+
+def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:
+    """The channel that an output follows, with the correlation; None where it follows none.
+
+    Args:
+        output: what moves.
+        channels: those that may move it.
+    """
+    best: tuple[str, float] | None = None
+    for name, series in channels.items():
+        related = _largest_correlation(series, output)
+        if related > max(_RELATED, best[1] if best else 0.0):
+            best = name, related
+    return best
+
+
+def _largest_correlation(first: Series, second: Series) -> float:
+    """Over the lags by which the second may follow the first."""
+    begin = max(first.times[0], second.times[0])
+    end = min(first.times[-1], second.times[-1])
+    step = float(np.median(np.diff(second.times)))
+    if not (end > begin and step > 0):
+        return 0.0
+    t = np.arange(begin, end, step)
+    if t.size < 3 or np.ptp(first.values) == 0:
+        return 0.0
+    x, y = np.interp(t, *_finite(first)), np.interp(t, *_finite(second))
+    x, y = x - np.mean(x), y - np.mean(y)
+    most = min(int(_LAGS / step) + 1, t.size // 4)
+    scale = float(np.linalg.norm(x) * np.linalg.norm(y))
+    if not scale:
+        return 0.0
+    return max(abs(float(np.dot(x[: t.size - k], y[k:]))) for k in range(most)) / scale
+
+
+def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
+    good = np.isfinite(series.values)
+    return series.times[good], series.values[good]
+
+
+def scaled(channel: str, series: Series, si: str) -> Guess:
+    """A channel with the unit and the scale that its name, the log or its numbers tell.
+
+    Args:
+        channel: its name.
+        series: its samples.
+        si: the unit that the model has.
+    """
+    values = series.values[np.isfinite(series.values)]
+    low, high = float(np.min(values)), float(np.max(values))
+    stated, source = series.unit, "the log"
+    if not stated:
+        stated, source = without_unit(channel)[1], "its name"
+    if stated and _fits(stated, si):
+        return Guess(channel, stated, remarks=(f"unit by {source}",))
+    if _PULSES[0] < low and high < _PULSES[1] and high - low > 20:
+        return _of_pulses(channel, values, si)
+    if si == "rad":
+        # A heading may count from 0 to a turn; a pitch angle ends at a quarter of it.
+        most = np.pi / 2 if {"pitch", "theta"} & set(words_of(channel)) else 2 * np.pi
+        unit = "deg" if max(-low, high) > most else "rad"
+    elif si == "rad/s":
+        # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.
+        unit = "deg/s" if max(-low, high) > _FASTEST_TURN else "rad/s"
+    elif si == "1":
+        return _of_stick(channel, low, high)
+    elif _fits("m", si):
+        guess = "GUESS: full travel of the input for 1 in the log is not known"
+        return Guess(channel, si, EDIT, remarks=(guess,))
+    else:
+        unit = si
+    return Guess(channel, unit, remarks=(f"GUESS: {low:.4g} to {high:.4g} taken for {unit}",))
+
+
+def _fits(unit: str, si: str) -> bool:
+    try:
+        units.factor(unit, si)
+    except ValueError:
+        return False
+    return True
+
+
+def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
+    # Most records begin with the stick at rest; where this one does not, receivers' middle.
+    begin = values[: max(len(values) // 100, 5)]
+    rest = float(np.median(begin)) if np.ptp(begin) < 0.02 * np.ptp(values) else 1500.0
+    remark = f"GUESS: pulse widths, {rest:g} us at rest"
+    if si == "1":
+        remark = f"{remark}, {_FULL_PULSE:g} us to the stop"
+        return Guess(channel, "1", 1.0 / _FULL_PULSE, rest, (remark,))
+    return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
+
+
+def _of_stick(channel: str, low: float, high: float) -> Guess:
+    largest = max(-low, high)
+    for full, unit, scale in ((1.5, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
+        if largest <= full:
+            what = "thousandths" if scale != 1.0 else {"1": "parts of full travel"}.get(unit, unit)
+            remark = f"GUESS: {low:.4g} to {high:.4g} taken for {what}"
+            return Guess(channel, unit, scale, remarks=(remark,))
+    remark = f"GUESS: {low:.4g} to {high:.4g}; scale: 1 over what full travel is in the log"
+    return Guess(channel, "1", EDIT, remarks=(remark,))
+
+
+def rotor_speed(channel: str, series: Series) -> float:
+    """The mean speed of a rotor [rad/s], in rpm above what a rotor turns in rad/s.
+
+    Args:
+        channel: its name.
+        series: its samples.
+    """
+    mean = float(np.nanmean(series.values))
+    unit = series.unit or without_unit(channel)[1]
+    if unit and _fits(unit, "rad/s"):
+        return mean * units.factor(unit, "rad/s")
+    return mean * units.factor("rpm", "rad/s") if mean > 500.0 else mean

@@ -1,0 +1,213 @@
+"""The words of the files that `heli-jax new` writes."""
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from heli_jax import naming
+from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
+from heli_jax.errors import InputError
+from heli_jax.flights.describe import TimeInfo
+from heli_jax.new_config.guess import EDIT, Guess
+
+_MOST_LISTED = 12
+# Short words of YAML (on, y, null) and numbers are none of these.
+_PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
+
+
+class Chosen(NamedTuple):
+    """The model, what a configuration calls it, and whether it is linear from a file."""
+
+    model: Any
+    name: str | dict[str, str]
+    linear: bool
+
+
+class Signals(NamedTuple):
+    """Channels by the model's inputs and outputs; None where none was found."""
+
+    inputs: Mapping[str, Guess | None]
+    outputs: Mapping[str, Guess | None]
+    known: Mapping[str, tuple[str, float]]
+    """constants of the flight, with the channel that they are the mean of"""
+    rest: Sequence[str]
+
+
+def configuration(
+    *,
+    chosen: Chosen,
+    log: str,
+    time: TimeInfo | None,
+    flight: int | None,
+    preset: str | None,
+    signals: Signals | None,
+    vehicle: str | None,
+    free: Mapping[str, float | str],
+) -> str:
+    """The configuration as text.
+
+    Args:
+        chosen: the model.
+        log: as the configuration names it.
+        time: the clock of a table.
+        flight: the number, where a log holds several.
+        preset: the table of the autopilot, in place of signals.
+        signals: by the model's names.
+        vehicle: the vehicle file, as the configuration names it.
+        free: starts by parameter.
+
+    Raises:
+        InputError: the log holds no output of the model.
+    """
+    lines = [
+        f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
+        "# heli-jax keys TEXT explains keys; heli-jax check says whether the log is enough.",
+        f"model: {_value(chosen.name)}",
+    ]
+    if vehicle is not None:
+        lines.append(f"vehicle: {_value(vehicle)}")
+    lines += ["flights:", f"  - log: {_value(log)}"]
+    if flight is not None:
+        lines.append(f"    flight: {flight}")
+    lines += _clock(time)
+    if preset is not None:
+        lines += [
+            "    # rate: 100                  # Hz; of the fastest channel unless given",
+            "    # window: auto               # or [first, last] s: the parts that say most",
+            f"    signals: {{preset: {preset}}}   # heli-jax info shows the channels",
+        ]
+    else:
+        assert signals is not None
+        lines += _flight(chosen, signals, time, log)
+    axes = _axes(chosen.model)
+    lines += [
+        "fit:",
+        "  # With a disturbance, since gusts move real machines too; where none do, output-error",
+        "  # and no section disturbance.",
+        f"  method: {'filter-error' if axes else 'output-error'}",
+        "  free:                          # what is found, and where the search begins",
+    ]
+    lines += [f"    {name}: {{start: {_number(start)}}}" for name, start in free.items()]
+    lines += [
+        "  # nuisance: {time_shift: true} # where the stick was logged late or early",
+        *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
+        "rls: null",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def vehicle(model: Any, found: Mapping[str, tuple[str, float]]) -> str:
+    """A vehicle file to fill in.
+
+    Args:
+        model: whose parameters it has.
+        found: those that the log tells, with the channel that they are the mean of.
+    """
+    lines = ["# Of your machine, measured or from its drawings; a source helps whoever reads it."]
+    given, known = naming.defaults(model.Params), naming.names(model.Params)
+    # Any number stands for one that has to be there: it only shows what the model reads.
+    params = model.Params(**{n: given.get(n, 1.0) for n in known})
+    needed = {*(n for n in known if n not in given), *needed_but_missing(model, params)}
+    for name in known:
+        if name not in needed and not _is_read(model, params, name):
+            continue
+        unit, meaning = naming.unit(model.Params, name) or "1", naming.meaning(model.Params, name)
+        value = EDIT if name in needed else f"{float(getattr(params, name)):g}"
+        if name in found:
+            channel, mean = found[name]
+            value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
+        lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
+    return "\n".join(lines) + "\n"
+
+
+def _is_read(model: Any, params: Any, name: str) -> bool:
+    return math.isfinite(float(getattr(params, name))) and reads(model, params, name)
+
+
+def _axes(model: Any) -> tuple[str, ...]:
+    """The axes on which gusts may act."""
+    return tuple(axis.name for axis in axes_of(model))
+
+
+def _clock(time: TimeInfo | None) -> list[str]:
+    if time is None:
+        return []
+    lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
+    if not time.uniform or time.gaps:
+        longest = max((g.length for g in time.gaps), default=0.0)
+        words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s"
+        lines += [
+            f"    gaps: split                  # {words}; fail refuses long ones",
+            f"    rate: {_round(time.rate):g}                    # Hz; the log has no even steps",
+        ]
+    return lines
+
+
+def _round(rate: float) -> float:
+    """Two digits: a rate of 99.98 Hz is one of 100."""
+    return float(f"{rate:.2g}")
+
+
+def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -> list[str]:
+    if not signals.outputs:
+        listed = ", ".join(signals.rest[:_MOST_LISTED])
+        wanted = ", ".join(naming.names(chosen.model.Outputs))
+        raise InputError(f"{log}: found none of {wanted} by its name, expected one; got {listed}")
+    lines = [
+        f"    known: {{{name}: {value:.5g}}}       # GUESS: mean of {_comment(channel)}, in SI"
+        for name, (channel, value) in signals.known.items()
+    ]
+    lines.append("    signals:")
+    if time is not None:
+        unit = "" if time.unit == "s" else f", unit: {time.unit}"
+        guessed = "   # GUESS: the unit, by its steps" if time.guessed else ""
+        lines.append(f"      time: {{signal: {_value(time.column)}{unit}}}{guessed}")
+    lines.append("      inputs:")
+    for name, found in signals.inputs.items():
+        meaning = naming.meaning(chosen.model.Inputs, name)
+        lines += _signal(name, found, meaning)
+    lines.append("      outputs:")
+    for name, found in signals.outputs.items():
+        lines += _signal(name, found, naming.meaning(chosen.model.Outputs, name))
+    if signals.rest:
+        listed = ", ".join(signals.rest[:_MOST_LISTED])
+        more = "" if len(signals.rest) <= _MOST_LISTED else ", ..."
+        lines.append(f"      # not used: {_comment(listed)}{more}")
+    return lines
+
+
+def _signal(name: str, found: Guess | None, meaning: str) -> list[str]:
+    words = [f"        # {name}: {_comment(meaning)}"] if meaning else []
+    if found is None:
+        # A constant that nobody knows moves nothing: the user says which channel it is.
+        return [*words, f"        {name}: {{signal: {EDIT}}}   # no channel's name says so"]
+    keys = [f"signal: {_value(found.channel)}", f"unit: {_value(found.unit)}"]
+    if found.offset:
+        keys.append(f"offset: {found.offset:g}")
+    if found.scale != 1.0:
+        keys.append(f"scale: {_number(found.scale)}")
+    remarks = "; ".join(map(_comment, found.remarks))
+    return [
+        *words,
+        f"        {name}: {{{', '.join(keys)}}}" + (f"   # {remarks}" if remarks else ""),
+    ]
+
+
+def _number(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def _value(value: Any) -> str:
+    """One value as it may stand within {...}."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {_value(v)}" for k, v in value.items()) + "}"
+    # What YAML might read as something else stands in quotes, which are those of JSON too.
+    text = str(value)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+
+
+def _comment(text: str) -> str:
+    # Names of a log may hold line breaks, which would end the comment.
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

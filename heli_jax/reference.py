@@ -1,0 +1,64 @@
+"""`heli-jax keys`: what may stand in a configuration, in the terminal and as a JSON schema."""
+
+import json
+import shutil
+import textwrap
+from pathlib import Path
+
+from heli_jax.config.keys import Key, json_schema, keys, matching
+from heli_jax.errors import InputError
+
+_WIDEST = 100
+"""columns of text: longer lines are hard to read"""
+
+
+def print_keys(pattern: str | None) -> None:
+    """The keys of a configuration with what may stand there, its default and its meaning.
+
+    Args:
+        pattern: a text in the keys to be shown; all unless given.
+
+    Raises:
+        InputError: no key holds it.
+    """
+    found = keys() if pattern is None else matching(pattern)
+    if not found:
+        raise InputError(f"keys: expected a text that some key or its meaning holds, got {pattern}")
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    for key in found:
+        print(*_lines(key, width), sep="\n")
+
+
+def as_json(pattern: str | None) -> str:
+    """The keys as a list for other programs.
+
+    Args:
+        pattern: as `print_keys`.
+    """
+    found = keys() if pattern is None else matching(pattern)
+    return json.dumps([key._asdict() for key in found], indent=1)
+
+
+def write_schema(path: Path) -> None:
+    """The JSON schema in a file, which editors are told of.
+
+    Args:
+        path: where; what stands there is replaced.
+    """
+    path.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
+
+
+def _lines(key: Key, width: int) -> list[str]:
+    default = "has to be there" if key.default is None else f"default {key.default}"
+    # A default of null says that the key may be left out, and no more.
+    default = "optional" if key.default == "null" else default
+    head = textwrap.wrap(
+        f"{key.path}: {key.kind}; {default}",
+        width,
+        subsequent_indent="    ",
+        break_on_hyphens=False,
+    )
+    indent = "    "
+    return head + textwrap.wrap(
+        key.meaning, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+    )

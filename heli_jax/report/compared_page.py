@@ -1,0 +1,88 @@
+"""The page of several runs side by side: tables, and simulated outputs over the measured."""
+
+import base64
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+
+from heli_jax.identification.result import Signals
+from heli_jax.report import style
+from heli_jax.report.compared_runs import ComparedRuns
+from heli_jax.report.figures.panels import panels
+
+_MOST_FIGURES = 24
+
+
+class _Picture(NamedTuple):
+    title: str
+    data: str
+
+
+def write_page(path: Path, compared: ComparedRuns) -> None:
+    """The page, self-contained.
+
+    Args:
+        path: the HTML file.
+        compared: the runs.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("heli_jax.report", "."), autoescape=True
+    )
+    page = environment.get_template("compared.html.j2").render(
+        labels=compared.labels,
+        tables=[
+            ("Estimates", compared.estimates),
+            ("Verdicts", compared.verdicts),
+            ("Agreement", compared.agreement),
+        ],
+        notes=compared.notes,
+        pictures=list(_pictures(compared)),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _pictures(compared: ComparedRuns) -> Iterator[_Picture]:
+    for name, output, found in itertools.islice(_overlaps(compared), _MOST_FIGURES):
+        made = style.svg(lambda f=found, n=name, o=output: _overlay(f, n, o))
+        if made is not None:
+            data = base64.b64encode(made[1]).decode("ascii")
+            yield _Picture(f"{output}, {name}", data)
+
+
+def _overlaps(
+    compared: ComparedRuns,
+) -> Iterator[tuple[str, str, list[tuple[str, Signals]]]]:
+    """Flights and outputs that more than one run has, with the runs' signals."""
+    by_place: dict[tuple[str, str], list[tuple[str, Signals]]] = {}
+    for label, run in zip(compared.labels, compared.runs, strict=True):
+        for signals in run.signals:
+            for output in signals.measured:
+                by_place.setdefault((signals.flight, output), []).append((label, signals))
+    for (name, output), found in by_place.items():
+        if len(found) > 1:
+            yield name, output, found
+
+
+def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str) -> Figure:
+    (ax,) = panels(None, 2.9, [1.0])
+    first = found[0][1]
+    style.samples(
+        ax, first.times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
+    )
+    for i, (label, signals) in enumerate(found):
+        color = style.CYCLE[i % len(style.CYCLE)]
+        dashes = ("-", "--", ":")[i // len(style.CYCLE) % 3]
+        simulated = signals.simulated[output]
+        style.line(ax, signals.times, simulated, color=color, ls=dashes, lw=0.9, label=label)
+    ax.set_title(f"{output}, {name}: simulated", loc="left")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel(f"{output} (SI)")
+    ends = [np.nanmin([s.times[0] for _, s in found]), np.nanmax([s.times[-1] for _, s in found])]
+    ax.set_xlim(float(ends[0]), float(ends[1]) if ends[1] > ends[0] else float(ends[0]) + 1.0)
+    style.legend_above(ax)
+    return ax.figure  # pyright: ignore[reportReturnType]

@@ -1,0 +1,220 @@
+"""Several fits side by side: estimates and their differences, agreement, verdicts."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from heli_jax.errors import InputError
+from heli_jax.identification.result import Estimate
+from heli_jax.numbers import rounded
+from heli_jax.report.saved_fit import SavedFit, load_fit
+from heli_jax.summaries import Summary, as_html, as_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NOT_DETERMINED = "not determined"
+_ABSENT = "–"
+_METRICS = (("VAF", "vaf"), ("fit [%]", "nrmse_fit_percent"), ("TIC", "tic"))
+_LATEX = str.maketrans(
+    {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "^": r"\^{}", "–": "--", "±": r"$\pm$"}
+    | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
+)
+_JOINT = (
+    "Differences are from the first run, in the standard deviation that the two have together if "
+    "nothing is common to them."
+)
+_SAME = (
+    "{first} and {second} share a log: their estimates hang together, and differ by less than that "
+    "by chance."
+)
+
+
+class Table(NamedTuple):
+    """Text in rows under a head."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+class ComparedRuns(NamedTuple):
+    """Fits, each with a name that no other has."""
+
+    labels: tuple[str, ...]
+    runs: tuple[SavedFit, ...]
+
+    @property
+    def estimates(self) -> Table:
+        """Each parameter's estimate and sd by run, and the differences from the first."""
+        first = self.labels[0]
+        several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
+        rows = []
+        for name in _in_order(run.estimates for run in self.runs):
+            found = [run.estimates.get(name) for run in self.runs]
+            units = {e.unit for e in found if e is not None}
+            cells = [_measured(e, with_unit=len(units) > 1) for e in found]
+            # Where an optimiser stopped on its way there is nothing to compare.
+            there = [
+                None if run.status == "not-converged" else run.estimates.get(name)
+                for run in self.runs
+            ]
+            apart = [_difference(there[0], other) for other in there[1:]]
+            rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
+        return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
+
+    @property
+    def agreement(self) -> Table:
+        """VAF, NRMSE fit and Theil's coefficient of every output by run, the held-out flights by
+        themselves."""
+        rows = []
+        for held_out in (False, True):
+            of = [run.validation if held_out else run.metrics for run in self.runs]
+            for output in _in_order(of):
+                for words, key in _METRICS:
+                    values = [getattr(m.get(output), key, None) for m in of]
+                    where = "held out" if held_out else "fitted"
+                    rows.append((output, where, words, *map(_number, values)))
+        return Table(("output", "flights", "metric", *self.labels), tuple(rows))
+
+    @property
+    def verdicts(self) -> Table:
+        """By run whether it converged, what the data determine, and whether the model is
+        adequate."""
+        rows = [
+            (
+                label,
+                run.model,
+                run.method,
+                run.status,
+                run.verdict,
+                {True: "yes", False: "no", None: "not judged"}[run.adequate],
+            )
+            for label, run in zip(self.labels, self.runs, strict=True)
+        ]
+        head = ("run", "model", "method", "optimiser", "what the data determine", "adequate")
+        return Table(head, tuple(rows))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know of the differences."""
+        notes, first = [_JOINT], self.runs[0]
+        for label, run in zip(self.labels[1:], self.runs[1:], strict=True):
+            if _logs(run) & _logs(first):
+                notes.append(_SAME.format(first=self.labels[0], second=label))
+        for label, run in zip(self.labels, self.runs, strict=True):
+            if run.status == "not-converged":
+                notes.append(f"{label} did not converge: its numbers are no result.")
+            elif run.adequate is False:
+                notes.append(f"{label} is not adequate: its intervals may be too narrow.")
+        return tuple(notes)
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """Long: a row for each run and parameter; NaN where the data do not determine it."""
+        from heli_jax.exports import runs_frame
+
+        estimates = [run.estimates for run in self.runs]
+        return runs_frame(dict(zip(self.labels, estimates, strict=True)))
+
+    def to_csv(self) -> str:
+        """As `to_dataframe`, as text; cells of what is not determined are empty."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(["run", "parameter", "value", "sd", "lower95", "upper95", "unit"])
+        for label, run in zip(self.labels, self.runs, strict=True):
+            for name, e in run.estimates.items():
+                known = e.sd is not None
+                numbers = (e.value, e.sd, e.lower95, e.upper95) if known else ("",) * 4
+                writer.writerow([label, name, *numbers, e.unit])
+        return out.getvalue()
+
+    def to_latex(self) -> str:
+        """The estimates as a table for a paper, with booktabs."""
+        head, rows = self.estimates
+        lines = [
+            r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
+            r"\toprule",
+            " & ".join(map(_latex, head)) + r" \\",
+            r"\midrule",
+            *(" & ".join(map(_latex, row)) + r" \\" for row in rows),
+            r"\bottomrule",
+            r"\end{tabular}",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def _summary(self) -> Summary:
+        head, rows = self.estimates
+        title = f"{len(self.runs)} runs: {', '.join(self.labels)}"
+        return Summary(title, head, rows, self.notes)
+
+    def __repr__(self) -> str:
+        return as_text(self._summary())
+
+    def _repr_html_(self) -> str:
+        return as_html(self._summary())
+
+
+def compare_runs(runs: Sequence[str | Path | SavedFit]) -> ComparedRuns:
+    """Fits side by side.
+
+    Args:
+        runs: run directories, or what `load_fit` read; two at least. Differences are from the
+            first.
+
+    Raises:
+        InputError: fewer than two, or a directory holds no fit.
+    """
+    if len(runs) < 2:
+        raise InputError(f"compare: expected two runs at least, got {len(runs)}")
+    fits = tuple(run if isinstance(run, SavedFit) else load_fit(run) for run in runs)
+    return ComparedRuns(_labels([fit.directory for fit in fits]), fits)
+
+
+def _labels(directories: Sequence[Path]) -> tuple[str, ...]:
+    """The shortest ends of paths that tell them apart."""
+    paths = [d.absolute().parts for d in directories]
+    for depth in range(1, max(map(len, paths)) + 1):
+        labels = ["/".join(p[-depth:]) for p in paths]
+        if len(set(labels)) == len(labels):
+            return tuple(labels)
+    # The same directory twice: by their place.
+    return tuple(f"{p[-1]} ({i})" for i, p in enumerate(paths, 1))
+
+
+# Any: mappings of estimates or of metrics by name.
+def _in_order(mappings: Any) -> list[str]:
+    return list(dict.fromkeys(name for mapping in mappings for name in mapping))
+
+
+def _measured(e: Estimate | None, *, with_unit: bool) -> str:
+    if e is None:
+        return _ABSENT
+    if e.sd is None:
+        return NOT_DETERMINED
+    value, sd = rounded(e.value, e.sd)
+    return f"{value} ± {sd}" + (f" {e.unit}" if with_unit else "")
+
+
+def _difference(first: Estimate | None, other: Estimate | None) -> str:
+    if first is None or other is None or first.sd is None or other.sd is None:
+        return _ABSENT
+    joint = math.hypot(first.sd, other.sd)
+    if first.unit != other.unit or not joint:
+        return _ABSENT
+    return f"{(other.value - first.value) / joint:+.1f}"
+
+
+def _number(value: float | None) -> str:
+    return _ABSENT if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def _logs(run: SavedFit) -> set[str]:
+    """Fingerprints of the logs that were fitted."""
+    fitted = (flight for flight in run.content["data"] if not flight.get("hold_out"))
+    return {flight["sha256"] for flight in fitted if flight.get("sha256")}
+
+
+def _latex(text: str) -> str:
+    return text.translate(_LATEX)

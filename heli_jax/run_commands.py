@@ -1,0 +1,93 @@
+"""Commands about runs that were made: `heli-jax runs`, `heli-jax compare`."""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from heli_jax import run_directory
+from heli_jax.errors import InputError
+from heli_jax.terminal_table import print_table
+
+_DEEPEST = 3
+"""folders below the one that is asked for"""
+
+
+def runs(options: argparse.Namespace) -> int:
+    """`heli-jax runs`: what fits a folder holds, the latest last."""
+    folder = Path(options.directory)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of runs, got none")
+    listed = sorted(_found(folder), key=lambda run: run["date"])
+    if options.json:
+        print(json.dumps(listed, indent=1))
+        return 0
+    if not listed:
+        raise InputError(f"{folder}: holds no run of heli-jax fit")
+    keys = ("run", "date", "model", "method", "status", "adequate")
+    rows = [tuple(str(run[k]) for k in keys) for run in listed]
+    print_table(keys, rows)
+    return 0
+
+
+def _found(folder: Path) -> Iterator[dict[str, Any]]:
+    for path in _files(folder, _DEEPEST):
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            adequate = {True: "yes", False: "no", None: "not judged"}[content["adequate"]]
+            row = {k: content[k] for k in ("model", "method", "status")}
+        # Any file may be called so: what no fit wrote is no run.
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
+        name = str(path.parent.relative_to(folder))
+        yield {"run": name, "date": date, **row, "adequate": adequate}
+
+
+def _files(folder: Path, deepest: int) -> Iterator[Path]:
+    try:
+        inside = sorted(folder.iterdir())
+    except OSError:
+        return
+    for path in inside:
+        if path.name == "fit.json" and path.is_file():
+            yield path
+        elif deepest and path.is_dir() and not path.is_symlink():
+            yield from _files(path, deepest - 1)
+
+
+def compare(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+    """`heli-jax compare`: fits side by side."""
+    from heli_jax.report.compared_runs import compare_runs
+
+    place = None if options.out is None else Path(options.out)
+    endings = (".html", ".csv", ".tex")
+    if place is not None and place.suffix.lower() not in endings:
+        raise InputError(f"--out {place}: expected a name ending in {', '.join(endings)}")
+    compared = compare_runs(options.runs)
+    # Numbers for names: several directories' names are wider than a terminal.
+    numbered = compared._replace(labels=tuple(str(i + 1) for i in range(len(compared.runs))))
+    for number, row in zip(numbered.labels, compared.verdicts.rows, strict=True):
+        label, model, method, status, verdict, adequate = row
+        print(f"{number}: {label}: {model} by {method}, {status}. {verdict} adequate: {adequate}")
+    for table in (numbered.estimates, numbered.agreement):
+        print_table(table.head, list(table.rows))
+    for note in numbered.notes:
+        print(f"! {note}")
+    if place is None:
+        return 0
+    run_directory.require_place(place, f"--out {place}")
+    with run_directory.whole_file(place, f"--out {place}") as temporary:
+        if place.suffix.lower() == ".html":
+            from heli_jax.report.compared_page import write_page
+
+            write_page(temporary, compared)
+        else:
+            csv = place.suffix.lower() == ".csv"
+            temporary.write_text(
+                compared.to_csv() if csv else compared.to_latex(), encoding="utf-8"
+            )
+    say(f"wrote {place}")
+    return 0

@@ -1,0 +1,145 @@
+"""What `simulate` and `sweep` print and write: without the estimation, which they need not load."""
+
+import contextlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heli_jax import config as configuration
+from heli_jax import run_directory
+from heli_jax.flights import write as tables
+from heli_jax.terminal_table import print_table
+
+if TYPE_CHECKING:
+    from heli_jax.generate import Simulated
+    from heli_jax.sweeps.run import Progress
+
+
+def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
+    """A table as CSV or Parquet at `out`, which appears whole or not at all, or as CSV on stdout.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    if out is None:
+        tables.write_table(sys.stdout.buffer, columns)
+        return
+    with run_directory.whole_file(out, f"--out {out}") as temporary:
+        tables.write_table(temporary, columns)
+
+
+def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simulated") -> None:
+    """The page of what was simulated at `out`, which appears whole or not at all.
+
+    Args:
+        out: the HTML file to write.
+        experiment: the configuration, of which the page shows the vehicle.
+        simulated: the runs.
+
+    Raises:
+        InputError: the place cannot be written to.
+    """
+    # Imported here: no other command needs the page.
+    from heli_jax.report.view import write_view as write
+
+    title, params = experiment.path.stem, experiment.vehicle.params
+    with run_directory.whole_file(out, f"--view {out}") as temporary:
+        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes)
+
+
+@contextlib.contextmanager
+def sweep_progress() -> Iterator["Callable[[Progress], None]"]:
+    """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
+    line."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    # A bar in a log file is a line of carriage returns.
+    if not sys.stderr.isatty():
+        yield _Lines()
+        return
+    columns = (TextColumn("sweep"), BarColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling", total=1.0)
+        yield lambda p: bar.update(task, completed=p.done / p.total, description=_progress_words(p))
+
+
+class _Lines:
+    """A line at the first chunk, the last, and every ten seconds between."""
+
+    def __init__(self) -> None:
+        self.last = -math.inf
+
+    def __call__(self, p: "Progress") -> None:
+        now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
+        if p.done == p.total or now - self.last > 10.0:
+            self.last = now
+            print(f"heli-jax: sweep: {_progress_words(p)}", file=sys.stderr, flush=True)
+
+
+def _progress_words(p: "Progress") -> str:
+    words = f"{p.done} of {p.total} elements"
+    # The first chunk compiles: a rate that contained it would foretell hours.
+    if math.isnan(p.rate):
+        return words
+    words = f"{words}, {p.rate:.3g} a second"
+    if p.done == p.total:
+        return words
+    left = max(0, round(p.remaining))
+    return f"{words}, {left // 3600}:{left // 60 % 60:02d}:{left % 60:02d} left"
+
+
+def _counted(elements: int) -> str:
+    return "1 element" if elements == 1 else f"{elements} elements"
+
+
+def print_sweep(out: Path) -> None:
+    """The summary of a sweep on standard output."""
+    # From the file, not from memory: a resumed sweep prints what all its runs have computed.
+    totals = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    counts = {k: v for k, v in totals["status"].items() if v}
+    words = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
+    print(f"{_counted(totals['elements'])} of {totals['model']}: {words}")
+    rows = []
+    for name, result in totals["results"].items():
+        numbers = [
+            f"{result[k]:.4g}" if k in result else ""
+            for k in ("min", "q05", "median", "q95", "max")
+        ]
+        error = totals.get("float32_error", {}).get(name)
+        rows.append(
+            (name, *numbers, result.get("unit", ""), "" if error is None else f"{error:.1g}")
+        )
+    # The last column only where the sweep compared single with double precision.
+    head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
+    width = len(head) if "float32_error" in totals else len(head) - 1
+    print_table(head[:width], [row[:width] for row in rows])
+    for name, worst_ones in totals["worst"].items():
+        element = worst_ones[0]
+        at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
+        print(f"worst {name}: element {element['element']}, {at}")
+    for note in totals["notes"]:
+        print(f"! {note}")
+    for name, result in totals["results"].items():
+        # Quantiles are of the finite values alone: how many were not is part of the answer.
+        apart = {"infinite": result.get("infinite", 0), "not a number": result.get("nan", 0)}
+        if sum(apart.values()):
+            words = " and ".join(f"{k} {what}" for what, k in apart.items() if k)
+            of = result["n"] + sum(apart.values())
+            print(f"! {name}: of {of} values {words}, which its line leaves out")
+    if not totals["status"].get("ok"):
+        print("! no element is ok: see docs/sweeps.md for what each status means")
+    timing = totals["timing"]
+    # A sweep that was resumed when all was there has computed nothing, and has no rate.
+    if timing["computed_elements"]:
+        print(
+            f"{_counted(timing['computed_elements'])} in {timing['seconds']:.3g} s "
+            f"({timing['elements_per_s']:.3g} a second, with compilation)"
+        )
+    print(f"store: {out / 'sweep.zarr'}")

@@ -1,0 +1,131 @@
+"""Runs side by side: numbers by hand, text from files escaped, and the commands."""
+
+import csv
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heli_jax import cli, compare_runs
+from heli_jax.errors import InputError
+
+METRICS = dict.fromkeys(
+    ("vaf", "nrmse_fit_percent", "rmse", "tic", "bias", "variance", "covariance"), 0.5
+)
+
+
+def write_run(
+    folder: Path, estimates: dict[str, tuple[float, float | None]], **more: object
+) -> Path:
+    """A run directory with what `load_fit` reads, its numbers made up."""
+    folder.mkdir(parents=True)
+    parameters = {
+        name: {
+            "value": value,
+            "sd": sd,
+            "lower95": None if sd is None else value - 1.96 * sd,
+            "upper95": None if sd is None else value + 1.96 * sd,
+            "unit": "kg m^2",
+            "start": 1.0,
+            "prior_share": 0.0,
+            "at_bound": False,
+            "sd_white": sd,
+            "sd_alone": sd,
+        }
+        for name, (value, sd) in estimates.items()
+    }
+    content = {
+        "model": "roll",
+        "method": "output-error",
+        "status": "converged",
+        "verdict": {"text": "The data determine all."},
+        "identifiable": True,
+        "adequate": True,
+        "parameters": parameters,
+        "nuisance": {},
+        "intervals": None,
+        "metrics": {"p": METRICS},
+        "validation": {},
+        "notes": [],
+        "data": [{"flight": "flight 1", "hold_out": False, "sha256": folder.name[:1]}],
+    } | more
+    (folder / "fit.json").write_text(json.dumps(content))
+    t = np.arange(20) * 0.1
+    rows = ["flight,time,lat,p_measured,p_simulated"]
+    rows += [f"flight 1,{x:g},{np.sin(x):g},{np.cos(x):g},{np.cos(x) + 0.1:g}" for x in t]
+    (folder / "signals.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def test_differences_are_in_the_joint_sd(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {"Ixx": (0.020, 0.003), "If": (2e-4, 1e-5), "a": (5.0, None)})
+    b = write_run(tmp_path / "b", {"Ixx": (0.025, 0.004), "K_1": (1.0, 0.1), "a": (5.0, 0.5)})
+    compared = compare_runs([a, b])
+    rows = {row[0]: row[1:] for row in compared.estimates.rows}
+    # 0.005 over hypot(0.003, 0.004)
+    assert rows["Ixx"] == ("0.0200 ± 0.003", "0.0250 ± 0.004", "+1.0", "kg m^2")
+    assert rows["If"][1:3] == ("–", "–")
+    assert rows["a"][0] == "not determined"
+    assert rows["a"][2] == "–"
+    assert r"K\_1" in compared.to_latex()
+    read = list(csv.DictReader(io.StringIO(compared.to_csv())))
+    undetermined = next(r for r in read if r["run"] == "a" and r["parameter"] == "a")
+    assert (undetermined["value"], undetermined["sd"]) == ("", "")
+    frame = compared.to_dataframe().set_index(["run", "parameter"])
+    assert math.isnan(frame.loc[("a", "a"), "value"])
+    assert frame.loc[("b", "Ixx"), "sd"] == 0.004
+
+
+def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a1", {"Ixx": (0.02, 0.001)})
+    b = write_run(tmp_path / "a2", {"Ixx": (0.03, 0.001)}, status="not-converged")
+    compared = compare_runs([a, b])
+    assert compared.estimates.rows[0][3] == "–"
+    words = " ".join(compared.notes)
+    assert "a2 did not converge" in words
+    assert "share a log" in words
+
+
+def test_the_commands_list_and_compare(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hostile = "<script>alert(1)</script>"
+    a = write_run(tmp_path / "runs" / "a", {"Ixx": (0.02, 0.001)}, model=hostile)
+    b = write_run(tmp_path / "runs" / "deeper" / "b", {"Ixx": (0.03, 0.001)})
+    (tmp_path / "runs" / "c").mkdir()
+    (tmp_path / "runs" / "c" / "fit.json").write_text("[1]")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["runs", "--json"]) == 0
+    assert {r["run"] for r in json.loads(capsys.readouterr().out)} == {"a", "deeper/b"}
+    page = tmp_path / "out.html"
+    assert cli.main(["compare", str(a), str(b), "--out", str(page)]) == 0
+    out = capsys.readouterr().out
+    assert "2 - 1 [sd]" in out
+    assert "+7.1" in out
+    html = page.read_text()
+    assert hostile not in html
+    assert "&lt;script&gt;" in html
+    assert html.count("data:image/svg+xml") == 1
+    assert "http" not in html.replace("http://www.w3.org", "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["compare", "a"], ["compare", "a", "none"], ["compare", "a", "b", "--out", "x.pdf"]],
+)
+def test_wrong_runs_end_in_a_sentence(
+    arguments: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        write_run(tmp_path / name, {"Ixx": (0.02, 0.001)})
+    assert cli.main(arguments) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    with pytest.raises(InputError, match="two runs"):
+        compare_runs([tmp_path / "a"])

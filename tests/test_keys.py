@@ -1,0 +1,82 @@
+"""The reference of a configuration against the classes that check it, and JSON's own checker."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from heli_jax import cli, yaml_file
+from heli_jax.config.keys import json_schema, keys
+from heli_jax.config.schema import Config
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = sorted([*(ROOT / "configs").glob("*.yaml"), *(ROOT / "configs/logs").glob("*.yaml")])
+CHECKER = jsonschema.Draft202012Validator(json_schema())
+
+
+def problems(content: dict) -> list[str]:
+    return [e.message for e in CHECKER.iter_errors(content)]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
+def test_the_schema_takes_what_is_shipped(path: Path) -> None:
+    assert not problems(yaml_file.read_mapping(path))
+
+
+@pytest.mark.parametrize(
+    ("place", "content", "valid"),
+    [
+        ("fit.start", "equation-error", True),
+        ("fit.start", {"method": "equation-error", "stepwise": True}, True),
+        ("fit.start", {"methd": "given"}, False),
+        ("fit.nuisance", {"input_offset": ["x_roll"]}, True),
+        ("fit.nuisance", {"input_offset": 3}, False),
+        ("fit.methd", "output-error", False),
+        ("fit.method", "filter-error", True),
+        ("disturbance", {"on": ["p", "q"], "tau_w": 0.3, "sigma_w": {"p": 1, "q": 2}}, True),
+        ("onboard", {"servos": {"on": ["lat"]}}, True),
+        ("onboard", {"servos": [{"on": ["lat"]}], "gyro": {"on": {"ped": "r"}}}, True),
+        ("onboard", {"servos": {"on": "lat"}}, False),
+    ],
+)
+def test_the_schema_and_the_checker_of_configurations_agree(
+    place: str, content: Any, valid: bool
+) -> None:
+    config: dict[str, Any] = {"model": "bench-roll", "fit": {"free": {"a": {"start": 1.0}}}}
+    at, names = config, place.split(".")
+    for name in names[:-1]:
+        at = at[name]
+    at[names[-1]] = content
+    assert (not problems(config)) == valid
+    try:
+        Config.model_validate(copy.deepcopy(config))
+        accepted = True
+    except ValueError:
+        accepted = False
+    assert accepted == valid
+
+
+def test_every_key_stands_once_with_its_section_before_it() -> None:
+    paths = [key.path for key in keys()]
+    assert len(set(paths)) == len(paths)
+    for i, path in enumerate(paths):
+        above = path.rpartition(".")[0].removesuffix(".NAME").removesuffix("[]")
+        assert not above or above in paths[:i]
+
+
+def test_keys_in_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("COLUMNS", "50")
+    assert cli.main(["keys", "outputs.NAME.delay"]) == 0
+    shown = capsys.readouterr().out
+    assert "flights[].signals.outputs.NAME.delay" in shown
+    assert "by how much it is logged late [s]" in shown
+    assert all(len(line) <= 50 for line in shown.splitlines())
+    assert cli.main(["keys", "no such key"]) == 2
+    assert "no such key" in capsys.readouterr().err
+    assert cli.main(["keys", "--schema", str(tmp_path / "s.json")]) == 0
+    assert yaml.safe_load((tmp_path / "s.json").read_text())["$schema"]

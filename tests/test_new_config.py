@@ -1,0 +1,144 @@
+"""`heli-jax new`: guesses of logs whose channels are known, and files that others then read."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heli_jax import cli, yaml_file
+from heli_jax.config.schema import Config
+from heli_jax.new_config.guess import Series, by_motion, by_name, scaled, words_of
+
+T = np.arange(0.0, 20.0, 0.02)
+STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))
+RATE = np.convolve(STICK, np.exp(-T / 0.2) * 0.1)[: T.size]
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    rows = np.column_stack(list(columns.values()))
+    lines = [",".join(columns), *(",".join(f"{x:.10g}" for x in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def table(rate: str = "roll_rate_dps", stick: str = "aileron_pwm") -> dict[str, np.ndarray]:
+    noise = 0.01 * np.random.default_rng(0).standard_normal(T.size)
+    return {
+        "time_ms": 1e3 * T + 5e5,
+        stick: 1496.0 + 400.0 * STICK,
+        rate: np.degrees(RATE + noise),
+        "battery": 12.4 - 0.01 * T,
+    }
+
+
+def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = write(tmp_path / "run.csv", table()), tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "heli-jax check" in said
+    assert "are yours to give" not in said
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    signals = made.flights[0].signals
+    assert made.flights[0].log == "run.csv"
+    assert signals.time is not None
+    assert (signals.time.signal, signals.time.unit) == (
+        "time_ms",
+        "ms",
+    )
+    lat = signals.inputs["lat"]
+    assert (lat.signal, lat.unit, lat.offset, lat.scale) == ("aileron_pwm", "1", 1496.0, 0.002)
+    assert {n: (o.signal, o.unit) for n, o in signals.outputs.items()} == {
+        "p": ("roll_rate_dps", "deg/s")
+    }
+    assert "GUESS" in out.read_text()
+    assert "not used: battery" in out.read_text()
+    # What stands there is not replaced.
+    before = out.read_text()
+    assert cli.main(["new", str(log), "--out", str(out)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert out.read_text() == before
+
+
+def test_what_only_the_user_knows_is_refused_until_it_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = table("roll_deg") | {"rpm": np.full(T.size, 1450.0)}
+    log, out = write(tmp_path / "run.csv", columns), tmp_path / "mine.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-on-stand"]) == 0
+    assert "numbers are yours to give" in capsys.readouterr().err
+    vehicle = yaml_file.read_mapping(tmp_path / "mine-vehicle.yaml")
+    assert vehicle["Omega"]["value"] == pytest.approx(1450 * np.pi / 30, rel=1e-4)
+    assert vehicle["L3"] == {"value": "EDIT", "unit": "m"}
+    assert cli.main(["check", str(out)]) == 2
+    assert "EDIT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("log", ["none.csv", "text.csv"], ids=["missing", "nothing of a model"])
+def test_a_log_that_tells_nothing_ends_in_a_sentence(
+    log: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "text.csv", {"t": T, "a": STICK, "b": RATE})
+    assert cli.main(["new", str(tmp_path / log), "--out", str(tmp_path / "x.yaml")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_names_of_a_log_cannot_leave_their_place(tmp_path: Path) -> None:
+    hostile = 'lat"}, fit: {x'
+    columns = {"t": T, hostile.replace(",", ";"): STICK, "p": RATE, "#a: b": RATE}
+    log, out = write(tmp_path / "run.csv", columns), tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "roll-flybarless"]) == 0
+    made = Config.model_validate(yaml_file.read_mapping(out))
+    assert made.flights[0].signals.outputs["p"].signal == "p"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("gyro.x", ("gyro", "x")),
+        ("rollRate [deg/s]", ("roll", "rate")),
+        ("Roll (deg)", ("roll",)),
+        ("log.roll_rad", ("log", "roll")),
+        ("p", ("p",)),
+    ],
+)
+def test_the_words_of_a_name_are_without_its_unit(name: str, words: tuple[str, ...]) -> None:
+    assert words_of(name) == words
+
+
+def test_a_whole_name_goes_before_one_that_holds_it_and_commands_are_no_measurements() -> None:
+    names = ["roll_setpoint", "log.roll", "roll", "roll_sp", "rolling"]
+    assert by_name(["phi", "roll"], names) == ["roll", "log.roll"]
+
+
+@pytest.mark.parametrize(
+    ("values", "si", "unit", "scale"),
+    [
+        (np.linspace(-40, 40, 50), "rad", "deg", 1.0),
+        (np.linspace(-0.6, 0.6, 50), "rad", "rad", 1.0),
+        (np.linspace(-200, 200, 50), "rad/s", "deg/s", 1.0),
+        (np.linspace(-80, 95, 50), "1", "%", 1.0),
+        (np.linspace(-900, 950, 50), "1", "1", 0.001),
+        (np.linspace(-0.9, 0.95, 50), "1", "1", 1.0),
+        (np.linspace(-0.9, 0.95, 50), "m", "m", "EDIT"),
+    ],
+)
+def test_units_by_the_size_of_numbers(
+    values: np.ndarray, si: str, unit: str, scale: float | str
+) -> None:
+    found = scaled("x", Series(np.arange(50.0), values), si)
+    assert (found.unit, found.scale) == (unit, scale)
+    assert any(r.startswith("GUESS") for r in found.remarks)
+
+
+def test_of_channels_without_names_the_one_that_the_output_follows_is_taken() -> None:
+    rng = np.random.default_rng(1)
+    channels = {f"ch{i}": Series(T, rng.standard_normal(T.size)) for i in range(4)}
+    channels["ch7"] = Series(T, -1500.0 * STICK)
+    found = by_motion(Series(T, RATE), channels)
+    assert found is not None
+    assert found[0] == "ch7"
+    del channels["ch7"]
+    assert by_motion(Series(T, RATE), channels) is None

@@ -1,0 +1,87 @@
+"""What a script meets: pickling, the version, and errors that say what to pass."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import heli_jax
+from heli_jax import Flight, Free, Problem, cli, linear_model, models, simulate
+
+LINEAR = linear_model("roll-flybarless")
+PARAMS = LINEAR.vehicle().params
+U = {"lat": np.sin(0.1 * np.arange(200))}
+FLIGHT = Flight(
+    inputs=U, outputs={"p": np.zeros(200)}, dt=0.02, sd={"p": 0.1}, hold={"lat": "zero-order"}
+)
+FREE = {"Lb": Free(100.0)}
+
+
+@pytest.mark.parametrize(
+    "model", [models.roll, models.roll_on_stand, models.helicopter("full"), LINEAR.model]
+)
+def test_models_come_through_pickle(model: heli_jax.Model) -> None:
+    again = pickle.loads(pickle.dumps(model))
+    assert again.name == model.name
+    assert again.Params._fields if hasattr(model.Params, "_fields") else again.Params
+    # Built by keyword, as before.
+    state = again.State(**dict.fromkeys(heli_jax.naming.names(model.State), 0.5))
+    assert pickle.loads(pickle.dumps(state)) == state
+
+
+def test_a_problem_goes_to_another_process_and_simulates_there() -> None:
+    problem = Problem(LINEAR.model, PARAMS, [FLIGHT], FREE)
+    expected = simulate(problem.model, problem.vehicle, problem.flights[0]).outputs.p
+    code = (
+        "import sys, pickle, jax; jax.config.update('jax_enable_x64', True)\n"
+        "from heli_jax import simulate\n"
+        "p = pickle.load(sys.stdin.buffer)\n"
+        "y = simulate(p.model, p.vehicle, p.flights[0]).outputs.p\n"
+        "sys.stdout.write(repr(float(y[-1])))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps(problem), capture_output=True, check=True
+    )
+    assert float(run.stdout) == pytest.approx(float(expected[-1]), rel=1e-12)
+
+
+def test_the_version_is_that_of_the_distribution(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.strip() == heli_jax.__version__
+    assert set(heli_jax.__all__) <= set(dir(heli_jax))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((LINEAR.model, "heli.yaml", [FLIGHT], FREE), "load_vehicle"),
+        ((LINEAR.model, object(), [FLIGHT], FREE), "expected the model's Params, got object"),
+        ((LINEAR.model, PARAMS, FLIGHT, FREE), r"pass \[flight\]"),
+        ((LINEAR.model, PARAMS, ["flight.csv"], FREE), "read_flight"),
+        ((LINEAR.model, PARAMS, [FLIGHT], {"Lb": 100.0}), r"expected Free\(100\)"),
+        ((LINEAR.model, PARAMS, [FLIGHT], ["Lb"]), "Free by the parameter's name"),
+    ],
+)
+def test_a_wrong_argument_is_told_what_to_pass(arguments: tuple, words: str) -> None:
+    with pytest.raises(TypeError, match=words):
+        Problem(*arguments)
+
+
+def test_a_configuration_is_no_problem() -> None:
+    with pytest.raises(TypeError, match="load_config"):
+        heli_jax.fit("configs/bench-roll.yaml")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="by_name"):
+        simulate("roll", PARAMS, U)  # pyright: ignore[reportArgumentType]
+
+
+def test_angles_of_more_than_a_turn_are_warned_of() -> None:
+    turning = Flight(
+        inputs=U, outputs={"phi": np.linspace(-40.0, 40.0, 200)}, dt=0.02, sd={"phi": 1.0},
+        hold={"lat": "zero-order"},
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="np.radians"):
+        Problem(LINEAR.model, PARAMS, [turning], FREE)
