@@ -11,7 +11,6 @@ mean over all runs, over the true response, the root mean square over a band's b
 the scatter of the runs leaves of it; negative squares count as zero.
 """
 
-import sys
 from typing import Any, NamedTuple
 
 import jax
@@ -157,6 +156,8 @@ def three_sticks(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 40
-    closed_loop(count)
-    three_sticks(count)
+    from script import Size, asked
+
+    options = asked(__doc__, "five minutes", Size("runs", 40, 4, "of each"))
+    closed_loop(options.runs)
+    three_sticks(options.runs)
