@@ -20,6 +20,7 @@ from heli_jax.numbers import rounded
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.report.tables.handling import handling_lines
 from heli_jax.terminal_table import print_table
 from heli_jax.workflow import FitRun
 
@@ -73,6 +74,9 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
+    if supplementary.responses is not None:
+        for line in handling_lines(supplementary.responses.handling):
+            print(line)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     print(f"acceptance card: {summary(card(problem, fit))}")

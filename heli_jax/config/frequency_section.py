@@ -1,6 +1,6 @@
 """What may stand in a configuration's section `frequency`: responses of the logs, before a fit."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
@@ -40,6 +40,25 @@ class TransferConfig(BaseModel):
         return self
 
 
+class HandlingConfig(BaseModel):
+    """A response that handling qualities are read off."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    input: str
+    output: str
+    """an angle, or a rate [rad/s], whose response is integrated"""
+    response: Literal["rate", "attitude-command", "open-loop"] = "rate"
+    gain: _Positive = 1.0
+    """of an open loop that the response is a part of"""
+
+    @model_validator(mode="after")
+    def _of_a_loop(self) -> "HandlingConfig":
+        if self.gain != 1.0 and self.response != "open-loop":
+            raise ValueError(f"gain: expected response: open-loop with it, got {self.response}")
+        return self
+
+
 class FrequencyConfig(BaseModel):
     """Which frequencies, in windows of which length."""
 
@@ -52,3 +71,6 @@ class FrequencyConfig(BaseModel):
     points: Annotated[int, Field(ge=8, le=2000)] = 120
     """frequencies, equally spaced in the logarithm"""
     transfer_functions: list[TransferConfig] = []
+    handling: list[HandlingConfig] | None = None
+    """responses whose handling qualities are shown; unless given those of roll, pitch and yaw to
+    their sticks; [] for none"""

@@ -26,6 +26,8 @@ from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEA
 from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report.card import card
+from heli_jax.report.fitted_responses import FittedResponses
+from heli_jax.report.handling_json import handling_json
 from heli_jax.versions import versions
 
 
@@ -38,6 +40,8 @@ class SupplementaryAnalyses(NamedTuple):
     """whether the log is enough, as it was before the fit"""
     methods: MethodComparison | None = None
     """further methods beside the fit's own"""
+    responses: FittedResponses | None = None
+    """of the model and of the flights, with their handling qualities"""
 
 
 def fit_json(
@@ -89,6 +93,9 @@ def fit_json(
             "covariance": "coloured residuals" if fit.coloured else "white",
             **_residuals(fit),
             "baseline_rls": _baseline(baseline),
+            "handling_qualities": handling_json(
+                supplementary.responses.handling if supplementary.responses else ()
+            ),
             "equation_error_start": _first_guess(problem),
             "frequency_error_start": _frequency_start(problem),
             "starts": [row._asdict() for row in fit.starts],

@@ -13,6 +13,7 @@ from heli_jax.report.tables.estimates import (
     verdict,
 )
 from heli_jax.report.tables.first_guess import first_guess, selection_steps, start_method
+from heli_jax.report.tables.handling import handling, handling_sentences
 from heli_jax.report.tables.headline import (
     Headline,
     adequate,
@@ -42,6 +43,8 @@ __all__ = [
     "constants",
     "first_guess",
     "further_sentences",
+    "handling",
+    "handling_sentences",
     "headline",
     "intervals",
     "meanings",
