@@ -41,7 +41,7 @@ def responses_of_log(
         )
     config = experiment.config.frequency or FrequencyConfig()
     wanted = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
-    settings = Settings(config.band, config.window, config.points, wanted)
+    settings = Settings(config.band, config.window, config.points or Settings().points, wanted)
     _check_pairs(experiment, config)
     flights = read_flights(experiment)
     for note in (n for f in flights for n in (f.source.notes if f.source else ())):

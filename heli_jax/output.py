@@ -73,6 +73,8 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
+    if (responses := report_tables.responses(fit)) is not None:
+        print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     print(f"acceptance card: {summary(card(problem, fit))}")

@@ -274,7 +274,7 @@ def _fits(
         pair = output.pairs[wanted.input]
         hz = omega / (2.0 * np.pi)
         low, high = wanted.band or (0.0, np.inf)
-        used = (_smooth(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+        used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
         H = np.where(used, pair.H, np.nan)
         # With its hold, which is half a sample late, so that the delay is the machine's own.
         hold = holds[wanted.input]
@@ -287,10 +287,14 @@ def _fits(
     return tuple(fits)
 
 
-def _smooth(omega: np.ndarray, coherence: np.ndarray) -> np.ndarray:
+def octave_mean(omega: np.ndarray, coherence: np.ndarray) -> np.ndarray:
     """Its mean (k,) over an octave; zero where there is none.
 
     Single frequencies that reach a limit by chance have too large a gain, by the same chance.
+
+    Args:
+        omega: (k,) [rad/s].
+        coherence: (k,); NaN where there is none.
     """
     octaves = np.log2(omega)
     near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5

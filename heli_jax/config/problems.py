@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from heli_jax import naming, units
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
@@ -72,12 +73,30 @@ def problem(experiment: Experiment) -> Problem:
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
+            frequency=_responses(experiment),
         )
         return with_chosen_windows(whole)
     except ValueError as e:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
         place = path if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+
+
+def _responses(experiment: Experiment) -> ResponseOptions:
+    """Which frequency responses are fitted, where the method fits any."""
+    config, method = experiment.config.frequency, experiment.config.fit
+    if method is not None and method.method != "frequency-response":
+        for key in ("pairs", "coherence"):
+            # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
+            if config is not None and getattr(config, key):
+                raise InputError(
+                    f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
+                    f"got {method.method}"
+                )
+    if config is None:
+        return ResponseOptions()
+    pairs = tuple(PairOptions(**dict(p)) for p in config.pairs or ())
+    return ResponseOptions(config.band, config.window, config.points, config.coherence, pairs)
 
 
 def with_chosen_windows(problem: Problem) -> Problem:
@@ -133,9 +152,9 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
-    if config.intervals.bootstrap and config.method == "frequency-error":
+    if config.intervals.bootstrap and config.method in ("frequency-error", "frequency-response"):
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with method frequency-error, which "
+            f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "
             "estimates the noise's spectrum; expected another method, or none"
         )
     if config.intervals.bootstrap and config.nuisance.time_shift:

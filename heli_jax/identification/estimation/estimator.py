@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run
@@ -69,10 +70,16 @@ class Estimator(abc.ABC):
     rows_are_samples: ClassVar[bool] = True
     """whether the first rows are the samples in time of every signal, flight after flight and
     output after output: then their autocorrelation can be allowed for"""
+    noise_spectrum: ClassVar[bool] = False
+    """whether the noise's spectrum is estimated, so that intervals hold where residuals in time are
+    not white; rows are then numbers at frequencies, of no sample and maybe of no flight"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
+    nuisances_in_rows: ClassVar[bool] = True
+    """whether initial states and biases have a part in the rows: else the simulation in time has
+    them found by themselves"""
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -116,6 +123,16 @@ class Estimator(abc.ABC):
             flights: those fitted.
         """
         return noise
+
+    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """`prepared` where the method asks more of the problem than its flights.
+
+        Args:
+            problem: what is fitted.
+            noise: standard deviations by flight and output.
+            flights: those fitted, or those held out.
+        """
+        return self.prepared(noise, flights)
 
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level about which the likelihood is laid out in rows.
@@ -254,6 +271,16 @@ class Estimator(abc.ABC):
             at += y.shape[0]
         return total
 
+    def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
+        """How many independent numbers the noise is estimated from.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that the rows are divided by.
+        """
+        return measured_count(data)
+
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """By flight and output what is measured but for bias and noise, (N,), or (runs, N) where
@@ -290,6 +317,19 @@ class Estimator(abc.ABC):
             sd: of the measurement noise, SI, by 'flight/output'.
         """
         return False
+
+    def response_agreement(
+        self, layout: Layout, data: Data, noise: Noise, z: Array
+    ) -> ResponseAgreement | None:
+        """How model and measured frequency responses agree, where these are what is fitted.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: at the optimum.
+            z: the unknowns.
+        """
+        return None
 
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool

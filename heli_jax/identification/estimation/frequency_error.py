@@ -27,6 +27,7 @@ from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
@@ -63,6 +64,8 @@ class FrequencyError(Estimator):
 
     rows_are_samples = False
     least_squares = False
+    nuisances_in_rows = False
+    noise_spectrum = True
     errors = "residuals"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -138,7 +141,7 @@ class FrequencyError(Estimator):
         freedom = rows / max(rows - len(layout.free), 1)
         spectra = [s * freedom for s in smoothed(errors)]
         # Biases and initial states are in none of these rows: the simulation in time has them.
-        z = _in_time(layout, data, noise, z)
+        z = in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
         sd = tuple(
             {n: np.asarray(np.sqrt(np.mean(s[:, j, j].real))) for j, n in enumerate(names)}
@@ -227,24 +230,6 @@ def _whitening(spectra: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
 def _count(N: int) -> int:
     """Lines of a record of N samples, without zero and the Nyquist frequency."""
     return (N - 1) // 2
-
-
-@eqx.filter_jit
-def _in_time(layout: Layout, data: Data, noise: Noise, z: Array) -> Array:
-    """z with the biases, offsets and initial states by which the simulation is nearest in time."""
-    first = layout.first_nuisance
-    if first == z.shape[0]:
-        return z
-
-    def rows(part: Array) -> Array:
-        u = unpack(layout, data, z.at[first:].set(part))
-        return jnp.concatenate([OUTPUT_ERROR.residuals(layout, data, noise, u).rows, part])
-
-    # Linear in them: one step is enough.
-    r, J = rows(z[first:]), jax.jacfwd(rows)(z[first:])
-    step = jnp.linalg.lstsq(J, -r)[0]
-    # The simulation of an unstable machine over a whole record is no number: left as it is.
-    return z.at[first:].add(jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0))
 
 
 @eqx.filter_jit

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
@@ -171,6 +172,17 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         tuple(dict.fromkeys(advice)),
         tuple(_as_expected(outputs)),
     )
+
+
+def by_responses(agreement: ResponseAgreement) -> Adequacy:
+    """Whether a model is adequate to measured frequency responses: by the squared errors over their
+    variance, which gusts do not change, while a simulation in time knows nothing of gusts.
+
+    Args:
+        agreement: of the model's responses with the measured ones.
+    """
+    doubts = (agreement.doubt,) if agreement.doubt else ()
+    return Adequacy(not doubts, False, (), agreement.sentences, doubts=doubts)
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:

@@ -132,6 +132,8 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     # A filter of a nonlinear model would be compiled for every candidate by itself.
     if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
         return None
+    if at.layout.estimator.noise_spectrum:
+        return None
     # Of a simulation that diverges there is nothing to compare with.
     if not np.isfinite(e.J).all():
         return None

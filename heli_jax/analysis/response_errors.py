@@ -1,0 +1,209 @@
+"""Errors of frequency responses between inputs and outputs together: covariance and whitening.
+
+With Z, U, E the transforms of instruments, inputs and errors in each window, the response that is
+left in the errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
+
+    P_i V_ij P_j^H S_ij,    P = S_zu^-1,
+
+with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
+have, overlapping ones by their correlation: exact for a chirp too, whose power at one frequency is
+in one window.
+
+Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
+2, for the estimate by instrument.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from heli_jax.analysis.flight_responses import octave_mean
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectral import inverse
+from heli_jax.analysis.windowed import OVERLAP, PER_AVERAGE, Windowed
+
+_LEAST, _PART = 2.0, 0.08
+"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines of the window at
+least, and as a part of the frequency"""
+_ROUNDING = 1e-14
+"""of a signal's density, below which noise is not taken to fall"""
+_SMALLEST = 1e-9
+"""eigenvalue of the noise's matrix of coherences: outputs that were computed from one another have
+none of their own"""
+
+
+class Averages(NamedTuple):
+    """What the inputs alone say of the responses' errors; p outputs, m inputs, k lines."""
+
+    P: np.ndarray
+    """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
+    each output has; NaN where inputs move as one"""
+    V: np.ndarray
+    """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
+
+
+def averages(w: Windowed) -> Averages:
+    """Of flights in windows."""
+    p, m = len(w.outputs), len(w.inputs)
+    P, V = [], np.zeros((p, p, len(w.numbers), m, m), complex)
+    # Most outputs miss samples in the same windows, or nowhere: each case once.
+    inverses: dict[bytes, np.ndarray] = {}
+    spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
+    keys = [w.seen[:, j].tobytes() for j in range(p)]
+    for i, first in enumerate(keys):
+        if first not in inverses:
+            S = _cross(w.seen[:, i], w.Z, w.U)
+            z, u = (_cross(w.seen[:, i], v, v) for v in (w.Z, w.U))
+            inverses[first] = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
+        P.append(inverses[first])
+        for j, second in enumerate(keys):
+            if (first, second) not in spreads:
+                spreads[first, second] = _spread(w, w.seen[:, i], w.seen[:, j])
+            V[i, j] = spreads[first, second]
+    return Averages(np.stack(P), V)
+
+
+def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, m, m) mean over the windows seen of conj(a) b."""
+    return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
+
+
+def _spread(w: Windowed, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(k, m, m) covariance of two means of conj(Z) E of white noise E of density 1."""
+    a, b = first[:, None, None] * w.Z, second[:, None, None] * w.Z
+    same = np.einsum("wkx,wky->kxy", np.conj(a), b, optimize=True)
+    # Half a window later the phase of a line has turned by half turns.
+    both, turned = w.follows, OVERLAP * (-1.0) ** w.lines
+    after = np.einsum("wkx,wky->kxy", np.conj(a[:-1][both]), b[1:][both], optimize=True)
+    before = np.einsum("wkx,wky->kxy", np.conj(a[1:][both]), b[:-1][both], optimize=True)
+    return (same + turned[:, None, None] * (after + before)) / (np.sum(first) * np.sum(second))
+
+
+def response_of(
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+) -> Complex[np.ndarray, "k p m"]:
+    """The response dH from the inputs that errors have; NaN where inputs move as one.
+
+    Args:
+        w: the flights in windows.
+        at: of these.
+        E: errors, or the outputs themselves; zero in windows that an output does not have.
+    """
+    S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
+    S = S / np.sum(w.seen, axis=0)[None, :, None]
+    return np.einsum("pkmz,kpz->kpm", at.P, S)
+
+
+def noise_density(
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+) -> Complex[np.ndarray, "k p p"]:
+    """The spectral matrix of what no response explains of the errors, smoothed over frequency.
+
+    Args:
+        w: the flights in windows.
+        at: of these.
+        E: errors (W, k, p); zero in windows that an output does not have.
+    """
+    dH = np.nan_to_num(response_of(w, at, E))
+    D = (E - np.einsum("wkm,kpm->wkp", w.U, dH, optimize=True)) * w.seen[:, None, :]
+    both = w.seen.T @ w.seen
+    # Each input takes one of the independent averages for its own response.
+    freedom = np.maximum(both - PER_AVERAGE * len(w.inputs), 0.0)
+    S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
+    S = np.where(both > 0, S / np.maximum(np.where(both > 0, freedom, 1.0), 0.5), 0.0)
+    width = np.maximum(_LEAST, _PART * w.lines)
+    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
+    S = np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
+    power = np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    return _definite(S, np.maximum(_ROUNDING * power, 1e-300))
+
+
+def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """A spectral matrix (k, p, p) that has an inverse; `floor` (p,) of its diagonal."""
+    power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
+    scale = np.sqrt(power)
+    rho = S / (scale[:, :, None] * scale[:, None, :])
+    # Outputs with missing samples share some of their windows only: pairs of them need not agree.
+    values, vectors = np.linalg.eigh(0.5 * (rho + np.conj(np.swapaxes(rho, 1, 2))))
+    rho = np.einsum("kia,ka,kja->kij", vectors, np.maximum(values, _SMALLEST), np.conj(vectors))
+    return rho * scale[:, :, None] * scale[:, None, :]
+
+
+def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
+    """Of the errors of all responses at one frequency.
+
+    Args:
+        at: what the inputs say.
+        S: the noise's spectral matrix.
+    """
+    P = np.nan_to_num(at.P)
+    return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
+
+
+def whitening(
+    at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
+) -> Complex[np.ndarray, "k r r"]:
+    """What makes independent rows of variance 1 of the errors of the responses that are used; the
+    rows of the others are zero. r = p m.
+
+    Args:
+        at: what the inputs say.
+        S: the noise's spectral matrix.
+        used: which responses at which frequencies.
+    """
+    k, p, m = used.shape
+    taken = used.reshape(k, -1)
+    C = covariance(at, S).reshape(k, p * m, p * m)
+    size = np.sqrt(np.real(np.einsum("krr->kr", C)))
+    # A response that is not used is one of variance 1 that goes with no other.
+    scale = np.where(taken & (size > 0), size, 1.0)
+    both = taken[:, :, None] & taken[:, None, :]
+    C = np.where(both, C / (scale[:, :, None] * scale[:, None, :]), 0.0)
+    C = C + np.eye(p * m) * ~taken[:, None, :]
+    return np.linalg.inv(np.linalg.cholesky(C)) / scale[:, None, :] * taken[:, :, None]
+
+
+def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
+    """Of each output with each input, what the others explain taken out; 0 where inputs move as
+    one."""
+    H = response_of(w, at, w.Y)
+    left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
+    density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
+    spread = [
+        np.einsum("kxa,kab,kxb->kx", P, _cross(w.seen[:, j], w.Z, w.Z), np.conj(P), optimize=True)
+        for j, P in enumerate(at.P)
+    ]
+    error = density[:, :, None] * np.real(np.stack(spread, axis=1))
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(np.abs(H) ** 2 / (np.abs(H) ** 2 + error))
+
+
+def pairs_used(
+    w: Windowed,
+    options: ResponseOptions,
+    coherence: Float[np.ndarray, "k p m"],
+    sound: Bool[np.ndarray, "k p m"],
+) -> Bool[np.ndarray, "k p m"]:
+    """Which responses take part at which frequencies.
+
+    Args:
+        w: the flights in windows.
+        options: pairs, bands and coherences asked for.
+        coherence: partial.
+        sound: where there is a response at all.
+    """
+    used = np.zeros(sound.shape, bool)
+    omega = 2.0 * np.pi * w.hz
+    everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
+    for pair in options.pairs or everything:
+        if pair.input not in w.inputs or pair.output not in w.outputs:
+            continue
+        at = (slice(None), w.outputs.index(pair.output), w.inputs.index(pair.input))
+        low, high = pair.band or (0.0, np.inf)
+        least = options.coherence if pair.coherence is None else pair.coherence
+        # The mean over an octave: a single frequency that reaches a limit by chance has too large
+        # a gain by the same chance.
+        enough = octave_mean(omega, coherence[at]) >= least
+        used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
+    return used

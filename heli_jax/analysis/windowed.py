@@ -1,0 +1,256 @@
+"""Flights in half-overlapping Hann windows, at lines of the window that are independent.
+
+Every second line is used: estimates of responses at lines next to one another are correlated by
+4/9, at lines two apart by 1/36, and 95 % of what all lines say is in these. From the second line on
+a constant has no part in them.
+
+Sources: Welch (1967); Bendat and Piersol, Random Data (2010), chapters 7 and 9; Harris (1978).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.spectra import OWN, leakage
+from heli_jax.flights.flight import Flight
+
+_LONGEST = 30.0
+"""window [s] unless one is stated"""
+_HIGHEST = 0.4
+"""of the rate: above it an anti-aliasing filter has changed what was logged"""
+_APART = 2
+"""lines from one that is used to the next"""
+OVERLAP = 1.0 / 6.0
+"""correlation of the transforms of white noise in two Hann windows that overlap by half"""
+PER_AVERAGE = 1.0 + 2.0 * OVERLAP**2
+"""windows that make one independent average"""
+
+
+class Windowed(NamedTuple):
+    """Flights of one rate, W windows of them at k lines; transforms scaled to densities per Hz."""
+
+    inputs: tuple[str, ...]
+    """the m that move"""
+    instruments: tuple[str, ...]
+    """those of them that are taken by an excitation that was logged"""
+    outputs: tuple[str, ...]
+    """the p of which windows are complete"""
+    dt: float
+    """[s]"""
+    length: int
+    """samples of a window"""
+    numbers: tuple[int, ...]
+    """of the k lines, in periods of a window"""
+    starts: tuple[tuple[int, ...], ...]
+    """by flight the first sample of each window"""
+    Z: np.ndarray
+    """(W, k, m) of the instruments, or of the inputs themselves"""
+    U: np.ndarray
+    """(W, k, m) of the inputs"""
+    Y: np.ndarray
+    """(W, k, p) of the outputs; zero where a sample is missing"""
+    seen: np.ndarray
+    """(W, p) 1 where all samples of an output are there, else 0"""
+    own: np.ndarray
+    """(k, p, m) where an input and an output have more power than the window's sidelobes bring"""
+    notes: tuple[str, ...]
+    """outputs that are left out, and why"""
+
+    @property
+    def lines(self) -> np.ndarray:
+        """(k,) numbers of the lines"""
+        return np.asarray(self.numbers)
+
+    @property
+    def hz(self) -> np.ndarray:
+        """(k,) frequencies [Hz]"""
+        return self.lines / (self.length * self.dt)
+
+    @property
+    def seconds(self) -> float:
+        """length of a window"""
+        return self.length * self.dt
+
+    @property
+    def follows(self) -> np.ndarray:
+        """(W - 1,) whether a window overlaps the one before it."""
+        flight = np.repeat(np.arange(len(self.starts)), [len(s) for s in self.starts])
+        first = np.concatenate([np.asarray(s, int) for s in self.starts])
+        return (np.diff(first) == self.length // 2) & (np.diff(flight) == 0)
+
+    @property
+    def averages(self) -> np.ndarray:
+        """(p,) independent averages of each output"""
+        return np.sum(self.seen, axis=0) / PER_AVERAGE
+
+    def by_flight(self, v: np.ndarray) -> list[np.ndarray]:
+        """An array (W, ...) of all windows in parts, flight by flight."""
+        return np.split(v, np.cumsum([len(s) for s in self.starts])[:-1])
+
+
+def window_transforms(
+    x: Float[np.ndarray | Array, "c N"],
+    starts: Sequence[int],
+    length: int,
+    lines: Sequence[int] | np.ndarray,
+    dt: float | Array,
+) -> Complex[np.ndarray | Array, "c W k"]:
+    """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
+
+    Args:
+        x: signals (c, N).
+        starts: first samples of the W windows.
+        length: samples of each.
+        lines: the k lines of the window that are kept.
+        dt: between two samples [s].
+    """
+    xp = jnp if isinstance(x, jax.Array) else np
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    at = np.asarray(starts, int)[:, None] + np.arange(length)
+    transforms = xp.fft.rfft(x[:, at] * window, axis=-1)[..., np.asarray(lines, int)]
+    return transforms * (2.0 * dt / np.sum(window**2)) ** 0.5
+
+
+def windowed(flights: Sequence[Flight], options: ResponseOptions = ResponseOptions()) -> Windowed:
+    """Flights in windows.
+
+    Inputs with an instrument in every flight (`Flight.instruments`) are taken by it.
+
+    Args:
+        flights: of one rate, with the same inputs; samples of outputs may be missing.
+        options: band, window and points.
+
+    Raises:
+        ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
+            no output has windows enough.
+    """
+    dt = _one_rate(flights)
+    seconds = options.window or min(max(f.duration for f in flights) / 5.0, _LONGEST)
+    # Even, so that half of it is a number of samples.
+    length = 2 * round(0.5 * seconds / dt)
+    lines = _lines(options, length, dt)
+    inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
+    if not inputs:
+        raise ValueError("no input moves, expected one that does")
+    instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
+    outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
+    starts = tuple(_starts(f, length) for f in flights)
+    seen = np.concatenate(
+        [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
+    )
+    kept = np.sum(seen, axis=0) / PER_AVERAGE >= len(inputs) + 1
+    if not kept.any():
+        raise ValueError(
+            f"expected at least {len(inputs) + 1} independent averages for {len(inputs)} inputs, "
+            f"got {np.max(np.sum(seen, axis=0), initial=0.0) / PER_AVERAGE:.2g} from windows of "
+            f"{length * dt:g} s without a missing sample; a shorter window, or longer flights"
+        )
+    notes = tuple(
+        f"{n}: its responses take no part, expected at least {len(inputs) + 1} independent "
+        f"averages, got {count / PER_AVERAGE:.2g} from windows of {length * dt:g} s without a "
+        "missing sample"
+        for n, count, fine in zip(outputs, np.sum(seen, axis=0), kept, strict=True)
+        if not fine
+    )
+    outputs = tuple(n for n, fine in zip(outputs, kept, strict=True) if fine)
+    seen = seen[:, kept]
+
+    def transformed(by_flight: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        parts = [
+            window_transforms(x, s, length, range(length // 2), dt)
+            for x, s in zip(by_flight, starts, strict=True)
+        ]
+        whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
+        return whole[:, lines], np.mean(np.abs(whole) ** 2, axis=0).T
+
+    U, of_inputs = transformed([np.stack([f.inputs[n] for n in inputs]) for f in flights])
+    Z = U
+    if instruments:
+        by = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
+        signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in by]
+        Z = transformed([np.stack(s) for s in signals])[0]
+    Y, of_outputs = transformed([_filled(f, outputs) for f in flights])
+    own_u, own_y = (
+        np.stack([(OWN * leakage(S) < S)[lines] for S in power], axis=1)
+        for power in (of_inputs, of_outputs)
+    )
+    own = own_u[:, None, :] & own_y[:, :, None]
+    Y = Y * seen[:, None, :]
+    return Windowed(
+        inputs,
+        instruments,
+        outputs,
+        dt,
+        length,
+        tuple(lines.tolist()),
+        starts,
+        Z,
+        U,
+        Y,
+        seen,
+        own,
+        notes,
+    )
+
+
+def _one_rate(flights: Sequence[Flight]) -> float:
+    rates = sorted({round(1.0 / f.dt, 6) for f in flights})
+    if len(rates) > 1:
+        listed = ", ".join(f"{r:g}" for r in rates)
+        raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
+    return flights[0].dt
+
+
+def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
+    """Every second line of the band, or of these the ones nearest to points of a logarithm."""
+    if length < 16:
+        raise ValueError(f"window: expected at least 16 samples, {16 * dt:.3g} s; got {length}")
+    low, high = options.band or (2.0 / (length * dt), _HIGHEST / dt)
+    if high >= 0.5 / dt:
+        raise ValueError(
+            f"band: expected frequencies below half the rate of {1.0 / dt:.4g} Hz, got {high:g} Hz"
+        )
+    # Fewer than two periods in a window are not told from its own shape.
+    if low < 2.0 / (length * dt) * (1.0 - 1e-9):
+        raise ValueError(
+            f"band: expected at least two periods in a window of {length * dt:g} s, from "
+            f"{2.0 / (length * dt):.3g} Hz on; got {low:g} Hz"
+        )
+    first, last = (f * length * dt for f in (low, high))
+    lines = np.arange(int(np.ceil(first - 1e-6)), int(last + 1e-6) + 1, _APART)
+    if not lines.size:
+        raise ValueError(
+            f"band: expected one that holds a line of the window, every {1 / (length * dt):.3g} "
+            f"Hz; got {low:g} to {high:g} Hz"
+        )
+    if options.points is None or options.points >= lines.size:
+        return lines
+    spaced = np.geomspace(lines[0], lines[-1], options.points)
+    return lines[np.unique(np.argmin(np.abs(lines[:, None] - spaced), axis=0))]
+
+
+def _starts(flight: Flight, length: int) -> tuple[int, ...]:
+    return tuple(range(0, flight.n_samples - length + 1, length // 2))
+
+
+def _seen(
+    flight: Flight, starts: tuple[int, ...], length: int, outputs: tuple[str, ...]
+) -> np.ndarray:
+    """(windows, p) 1 where a window has every sample of an output."""
+    seen = np.zeros((len(starts), len(outputs)))
+    for j, name in enumerate(outputs):
+        if name in flight.outputs:
+            missing = np.concatenate([[0], np.cumsum(~np.isfinite(flight.outputs[name]))])
+            seen[:, j] = [missing[s + length] == missing[s] for s in starts]
+    return seen
+
+
+def _filled(flight: Flight, outputs: tuple[str, ...]) -> np.ndarray:
+    """(p, N), zero where nothing is measured."""
+    absent = np.zeros(flight.n_samples)
+    return np.stack([np.nan_to_num(flight.outputs.get(n, absent), nan=0.0) for n in outputs])
