@@ -170,10 +170,9 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
-    if responses is not None:
-        adequacy = by_responses(responses)
+    in_time = (problem, params, signals, white, against, layout.determined)
+    adequacy = by_responses(responses) or _adequacy(*in_time)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)

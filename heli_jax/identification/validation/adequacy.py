@@ -174,13 +174,15 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     )
 
 
-def by_responses(agreement: ResponseAgreement) -> Adequacy:
+def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
     """Whether a model is adequate to measured frequency responses: by the squared errors over their
     variance, which gusts do not change, while a simulation in time knows nothing of gusts.
 
     Args:
-        agreement: of the model's responses with the measured ones.
+        agreement: of the model's responses with the measured ones; None where none were fitted.
     """
+    if agreement is None:
+        return None
     doubts = (agreement.doubt,) if agreement.doubt else ()
     return Adequacy(not doubts, False, (), agreement.sentences, doubts=doubts)
 
