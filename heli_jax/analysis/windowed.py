@@ -138,64 +138,79 @@ def windowed(flights: Sequence[Flight], options: ResponseOptions = ResponseOptio
     if not inputs:
         raise ValueError("no input moves, expected one that does")
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
-    outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
     starts = tuple(_starts(f, length) for f in flights)
-    seen = np.concatenate(
-        [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
-    )
-    kept = np.sum(seen, axis=0) / PER_AVERAGE >= len(inputs) + 1
-    if not kept.any():
-        raise ValueError(
-            f"expected at least {len(inputs) + 1} independent averages for {len(inputs)} inputs, "
-            f"got {np.max(np.sum(seen, axis=0), initial=0.0) / PER_AVERAGE:.2g} from windows of "
-            f"{length * dt:g} s without a missing sample; a shorter window, or longer flights"
-        )
-    notes = tuple(
-        f"{n}: its responses take no part, expected at least {len(inputs) + 1} independent "
-        f"averages, got {count / PER_AVERAGE:.2g} from windows of {length * dt:g} s without a "
-        "missing sample"
-        for n, count, fine in zip(outputs, np.sum(seen, axis=0), kept, strict=True)
-        if not fine
-    )
-    outputs = tuple(n for n, fine in zip(outputs, kept, strict=True) if fine)
-    seen = seen[:, kept]
-
-    def transformed(by_flight: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        parts = [
-            window_transforms(x, s, length, range(length // 2), dt)
-            for x, s in zip(by_flight, starts, strict=True)
-        ]
-        whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
-        return whole[:, lines], np.mean(np.abs(whole) ** 2, axis=0).T
-
-    U, of_inputs = transformed([np.stack([f.inputs[n] for n in inputs]) for f in flights])
+    outputs, seen, notes = _complete(flights, starts, length, (length * dt, len(inputs)))
+    cut = _Cut(starts, length, lines, dt)
+    U, of_inputs = cut.transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
     Z = U
     if instruments:
         by = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
         signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in by]
-        Z = transformed([np.stack(s) for s in signals])[0]
-    Y, of_outputs = transformed([_filled(f, outputs) for f in flights])
-    own_u, own_y = (
-        np.stack([(OWN * leakage(S) < S)[lines] for S in power], axis=1)
-        for power in (of_inputs, of_outputs)
-    )
-    own = own_u[:, None, :] & own_y[:, :, None]
+        Z = cut.transforms([np.stack(s) for s in signals])[0]
+    Y, of_outputs = cut.transforms([_filled(f, outputs) for f in flights])
+    own = of_inputs[:, None, :] & of_outputs[:, :, None]
     Y = Y * seen[:, None, :]
-    return Windowed(
-        inputs,
-        instruments,
-        outputs,
-        dt,
-        length,
-        tuple(lines.tolist()),
-        starts,
-        Z,
-        U,
-        Y,
-        seen,
-        own,
-        notes,
+    names, numbers = (inputs, instruments, outputs), tuple(lines.tolist())
+    return Windowed(*names, dt, length, numbers, starts, Z, U, Y, seen, own, notes)
+
+
+class _Cut(NamedTuple):
+    """How flights are cut into windows."""
+
+    starts: tuple[tuple[int, ...], ...]
+    length: int
+    lines: np.ndarray
+    dt: float
+
+    def transforms(self, signals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """(W, k, c) of signals (c, N) by flight, and (k, c) where they have more power than the
+        window's sidelobes bring from other lines."""
+        # Of all lines first: what leaks into those that are kept comes from any.
+        parts = [
+            window_transforms(x, s, self.length, range(self.length // 2), self.dt)
+            for x, s in zip(signals, self.starts, strict=True)
+        ]
+        whole = np.moveaxis(np.concatenate(parts, axis=1), 0, -1)
+        power = np.mean(np.abs(whole) ** 2, axis=0).T
+        own = [(OWN * leakage(S) < S)[self.lines] for S in power]
+        return whole[:, self.lines], np.stack(own, axis=1)
+
+
+def _complete(
+    flights: Sequence[Flight],
+    starts: tuple[tuple[int, ...], ...],
+    length: int,
+    asked: tuple[float, int],
+) -> tuple[tuple[str, ...], np.ndarray, tuple[str, ...]]:
+    """The outputs that have windows enough, which windows (W, p), and why others have not.
+
+    Args:
+        flights: of one rate.
+        starts: of the windows.
+        length: samples of a window.
+        asked: the same in seconds, and how many inputs move.
+    """
+    outputs = tuple(dict.fromkeys(n for f in flights for n in f.outputs))
+    seen = np.concatenate(
+        [_seen(f, s, length, outputs) for f, s in zip(flights, starts, strict=True)]
     )
+    seconds, inputs = asked
+    averages = np.sum(seen, axis=0) / PER_AVERAGE
+    kept = averages >= inputs + 1
+    need = f"expected at least {inputs + 1} independent averages for {inputs} inputs, got"
+    windows = f"from windows of {seconds:g} s without a missing sample"
+    if not kept.any():
+        raise ValueError(
+            f"{need} {np.max(averages, initial=0.0):.2g} {windows}; a shorter window, or longer "
+            "flights"
+        )
+    each = list(zip(outputs, averages, kept, strict=True))
+    notes = tuple(
+        f"{n}: its responses take no part, {need} {count:.2g} {windows}."
+        for n, count, fine in each
+        if not fine
+    )
+    return tuple(n for n, _, fine in each if fine), seen[:, kept], notes
 
 
 def _one_rate(flights: Sequence[Flight]) -> float:

@@ -133,7 +133,5 @@ def test_a_configuration_says_which_responses_are_fitted(tmp_path):
         (0.5, 8.0), 10.0, None, 0.3, (PairOptions("lat", "p", None, 0.5),)
     )
     path.write_text(CONFIG + FIT.replace("METHOD", "output-error"))
-    with pytest.raises(
-        InputError, match=r"frequency\.pairs: is for fit.method: frequency-response"
-    ):
+    with pytest.raises(InputError, match=r"pairs: is for fit.method: frequency-response"):
         configuration.problem(configuration.load(path))

@@ -132,8 +132,7 @@ class FrequencyResponse(Estimator):
         z = in_time(layout, data, noise, z)
         u, weights = unpack(layout, data, z), back(noise.whitening)
         weights = weights._replace(simulated=_forgetful(layout, data, u, weights))
-        begun = (u.states, u.offsets) if layout.initial_state or layout.offsets else None
-        weights = weights._replace(begun=begun)
+        weights = weights._replace(begun=(u.states, u.offsets))
         errors = np.asarray(_errors(layout, data, on_device(weights), z))
         density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, weights.simulated, density)
@@ -260,10 +259,9 @@ def _flight_errors(
 ) -> Complex[Array, "W k p"]:
     """One flight's, output by output in the order of the windows."""
     w = weights.windows
-    if weights.begun is not None:
-        states, offsets = weights.begun
-        # Numbers, not unknowns: in the rows they have no part but through the windows.
-        u = u._replace(states=states, offsets=offsets)
+    states, offsets = weights.begun
+    # Numbers, not unknowns: they are found in time, since responses hardly tell them.
+    u = u._replace(states=states, offsets=offsets)
     machine, flight = machine_of(layout, data, u, i), data.flights[i]
     names = layout.outputs[i]
     measured = {n: jnp.nan_to_num(flight.outputs[n]) for n in names}

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex
 
@@ -20,10 +22,12 @@ from heli_jax.analysis.response_errors import (
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.analysis.windowed import Windowed, windowed
 from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.linear_machine import forgets
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.input_offsets import offset_inputs
 
 # Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
 
@@ -46,9 +50,9 @@ class ResponseWeights(NamedTuple):
     """(k, p, p) the noise's spectral matrix, per Hz"""
     whitening: Any
     """(k, r, r), r = p m"""
-    begun: Any = None
-    """by flight the initial states and input offsets that suit the record best; None before these
-    are known: the simulation then begins at the model's own"""
+    begun: Any
+    """by flight the initial States (None where they are the model's own) and the inputs' offsets by
+    name, as they suit the record in time best; zero before these are known"""
 
     @property
     def log_determinant(self) -> float:
@@ -88,10 +92,19 @@ def first_weights(
     _require_lines(w, options, asked)
     forgetful = forgetful_outputs(problem, flights, w) if simulated is None else simulated
     density = noise_density(w, at, w.Y)
-    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None)
+    begun = _at_rest(problem, len(flights))
+    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, begun)
     weights = weighed(weights, forgetful, density)
     _require_numbers(problem, weights)
     return weights
+
+
+def _at_rest(problem: Problem, flights: int) -> tuple[tuple[Any, ...], tuple[dict, ...]]:
+    """Initial states and offsets of zero, in the form in which they are found later."""
+    # The same form from the beginning: another one would be compiled anew.
+    state = zeros(problem.model.State) if problem.nuisance.initial_state else None
+    offsets = {n: jnp.zeros(()) for n in offset_inputs(problem)}
+    return (state,) * flights, (offsets,) * flights
 
 
 def weighed(
@@ -121,23 +134,9 @@ def forgetful_outputs(problem: Problem, flights: Sequence[Flight], w: Windowed) 
         flights: those fitted.
         w: in windows.
     """
-    each = [
-        [*naming.asdict(naming.replace(problem.start_params(), **f.known)).items()] for f in flights
-    ]
-    return outputs_that_forget(problem.model, [dict(v) for v in each], flights_of(flights), w)
-
-
-class Driven(NamedTuple):
-    """What is needed of a flight beside the model's parameters."""
-
-    sizes: np.ndarray
-    """(m,) standard deviation of each of the model's inputs"""
-    samples: int
-
-
-def flights_of(flights: Sequence[Flight]) -> list[dict[str, np.ndarray]]:
-    """By flight its inputs."""
-    return [dict(f.inputs) for f in flights]
+    start = problem.start_params()
+    parameters = [naming.asdict(naming.replace(start, **f.known)) for f in flights]
+    return outputs_that_forget(problem.model, parameters, [f.inputs for f in flights], w)
 
 
 # model is a Model and parameters are by name: records of any model.
@@ -211,13 +210,9 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
 
 def on_device(weights: ResponseWeights) -> ResponseWeights:
     """The same, what a trace needs of it as JAX's arrays: copied once, not with every call."""
-    import jax
-
     return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
 
 
 def back(weights: ResponseWeights) -> ResponseWeights:
     """The same in NumPy."""
-    import jax
-
     return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)
