@@ -48,8 +48,8 @@ class ResponseAgreement(NamedTuple):
     lower95: float
     upper95: float
     """what random errors let expect of it with 95 % probability"""
-    freedom: int
-    """degrees of freedom"""
+    freedom: float
+    """degrees of freedom: independent numbers less unknowns"""
     window: float
     """[s]"""
     averages: tuple[tuple[str, float], ...]
@@ -150,19 +150,13 @@ def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.
     return mismatch(Measured(omega, H, np.abs(H), w.seconds, coherence), H - E)
 
 
-def expected_interval(
-    w: Windowed, used: Bool[np.ndarray, "k p m"], unknowns: int
-) -> tuple[int, float, float]:
-    """Degrees of freedom, and the 95 % interval of chi-squared over them, with noise that was
-    estimated from what no response explains: Fisher's F.
+def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
+    """What chi-squared over its degrees of freedom lies in with 95 % probability, where the noise
+    was estimated from what no response explains: Fisher's F.
 
     Args:
-        w: the flights in windows.
-        used: which responses take part at which frequencies.
-        unknowns: that were estimated from them.
+        freedom: degrees of freedom.
+        of_noise: those of the noise.
     """
-    freedom = max(2 * int(used.sum()) - unknowns, 1)
-    of_noise = np.maximum(w.averages - len(w.inputs), 1.0)
-    left = float(np.sum(2.0 * np.any(used, axis=2) * of_noise))
-    low, high = scipy.special.fdtri(freedom, max(left, 1.0), np.array([0.025, 0.975]))
-    return freedom, float(low), float(high)
+    low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))
+    return float(low), float(high)

@@ -21,11 +21,13 @@ from jaxtyping import Bool, Complex, Float
 from heli_jax.analysis.flight_responses import octave_mean
 from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.analysis.spectral import inverse
-from heli_jax.analysis.windowed import OVERLAP, PER_AVERAGE, Windowed
+from heli_jax.analysis.windowed import PER_AVERAGE, Windowed, hann
 
 _LEAST, _PART = 2.0, 0.08
 """sd of the Gaussian that smooths the noise's spectrum over frequency: lines of the window at
 least, and as a part of the frequency"""
+_NEIGHBOURS = 3
+"""lines to either side with which a line is correlated in Hann windows"""
 _ROUNDING = 1e-14
 """of a signal's density, below which noise is not taken to fall"""
 _SMALLEST = 1e-9
@@ -41,27 +43,51 @@ class Averages(NamedTuple):
     each output has; NaN where inputs move as one"""
     V: np.ndarray
     """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
+    share: np.ndarray
+    """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
+    are correlated, and responses are smooth"""
+    power: np.ndarray
+    """(k,) of white noise in a window over its density: less than 1 at the first line, of which the
+    mean takes a part"""
+
+
+class _Correlations(NamedTuple):
+    """Of the transforms of white noise at each line with those at the d-th line after it, (k,)."""
+
+    same: np.ndarray
+    """in one window"""
+    before: np.ndarray
+    """in the window half a length after it"""
+    after: np.ndarray
+    """in the window half a length before it"""
 
 
 def averages(w: Windowed) -> Averages:
     """Of flights in windows."""
-    p, m = len(w.outputs), len(w.inputs)
-    P, V = [], np.zeros((p, p, len(w.numbers), m, m), complex)
+    p, m, k = len(w.outputs), len(w.inputs), len(w.numbers)
+    P, share, V = [], [], np.zeros((p, p, k, m, m), complex)
+    turns = np.outer(w.lines, np.arange(w.length)) / w.length
+    g = hann(w.length) * np.exp(-2j * np.pi * turns)
+    g = g - np.mean(g, axis=1, keepdims=True)
+    near = [_correlations(g, d) for d in range(min(_NEIGHBOURS + 1, k))]
     # Most outputs miss samples in the same windows, or nowhere: each case once.
-    inverses: dict[bytes, np.ndarray] = {}
+    inverses: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
     keys = [w.seen[:, j].tobytes() for j in range(p)]
     for i, first in enumerate(keys):
-        if first not in inverses:
-            S = _cross(w.seen[:, i], w.Z, w.U)
-            z, u = (_cross(w.seen[:, i], v, v) for v in (w.Z, w.U))
-            inverses[first] = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
-        P.append(inverses[first])
+        seen = w.seen[:, i]
         for j, second in enumerate(keys):
             if (first, second) not in spreads:
-                spreads[first, second] = _spread(w, w.seen[:, i], w.seen[:, j])
+                spreads[first, second] = _spread(w, seen, w.seen[:, j], near[0])
             V[i, j] = spreads[first, second]
-    return Averages(np.stack(P), V)
+        if first not in inverses:
+            S = _cross(seen, w.Z, w.U)
+            z, u = (_cross(seen, v, v) for v in (w.Z, w.U))
+            of_case = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
+            inverses[first] = of_case, _share(w, seen, np.nan_to_num(of_case), near)
+        P.append(inverses[first][0])
+        share.append(inverses[first][1])
+    return Averages(np.stack(P), V, np.stack(share), np.real(near[0].same))
 
 
 def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -69,15 +95,48 @@ def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
 
 
-def _spread(w: Windowed, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(k, m, m) covariance of two means of conj(Z) E of white noise E of density 1."""
-    a, b = first[:, None, None] * w.Z, second[:, None, None] * w.Z
-    same = np.einsum("wkx,wky->kxy", np.conj(a), b, optimize=True)
-    # Half a window later the phase of a line has turned by half turns.
-    both, turned = w.follows, OVERLAP * (-1.0) ** w.lines
-    after = np.einsum("wkx,wky->kxy", np.conj(a[:-1][both]), b[1:][both], optimize=True)
-    before = np.einsum("wkx,wky->kxy", np.conj(a[1:][both]), b[:-1][both], optimize=True)
-    return (same + turned[:, None, None] * (after + before)) / (np.sum(first) * np.sum(second))
+def _correlations(g: np.ndarray, d: int) -> _Correlations:
+    """Of windows times the turning of each line (k, samples), less their means."""
+    half, size = g.shape[1] // 2, np.sum(hann(g.shape[1]) ** 2)
+    a, b = g[: len(g) - d], np.conj(g[d:])
+    same = np.sum(a * b, axis=1)
+    before = np.sum(a[:, half:] * b[:, :half], axis=1)
+    after = np.sum(a[:, :half] * b[:, half:], axis=1)
+    return _Correlations(same / size, before / size, after / size)
+
+
+def _spread(w: Windowed, first: np.ndarray, second: np.ndarray, c: _Correlations) -> np.ndarray:
+    """(k - d, m, m) covariance of two means of conj(Z) E of white noise E of density 1, the second
+    at the d-th line after the first."""
+    d = len(w.numbers) - len(c.same)
+    a = first[:, None, None] * w.Z[:, : len(c.same)]
+    b = second[:, None, None] * w.Z[:, d:]
+    both = w.follows
+
+    def summed(x: np.ndarray, y: np.ndarray, correlation: np.ndarray) -> np.ndarray:
+        products = np.einsum("wkx,wky->kxy", np.conj(x), y, optimize=True)
+        return correlation[:, None, None] * products
+
+    total = summed(a, b, c.same) + summed(a[:-1][both], b[1:][both], c.before)
+    total = total + summed(a[1:][both], b[:-1][both], c.after)
+    return total / (np.sum(first) * np.sum(second))
+
+
+def _share(w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[_Correlations]) -> np.ndarray:
+    """(k, m) one over the sum of an error's correlations with those at the lines around it."""
+    size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
+    for d, c in enumerate(near):
+        k = len(c.same)
+        V = _spread(w, seen, seen, c)
+        C = np.real(np.einsum("kxa,kab,kxb->kx", P[:k], V, np.conj(P[d:]), optimize=True))
+        if d == 0:
+            size = np.sqrt(np.maximum(C, 1e-300))
+            continue
+        # Where they alternate nothing is gained: no response moves that fast.
+        rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
+        total[:k] += rho
+        total[d:] += rho
+    return 1.0 / total
 
 
 def response_of(
@@ -112,6 +171,7 @@ def noise_density(
     freedom = np.maximum(both - PER_AVERAGE * len(w.inputs), 0.0)
     S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
     S = np.where(both > 0, S / np.maximum(np.where(both > 0, freedom, 1.0), 0.5), 0.0)
+    S = S / at.power[:, None, None]
     width = np.maximum(_LEAST, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     S = np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
@@ -144,8 +204,8 @@ def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndar
 def whitening(
     at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
 ) -> Complex[np.ndarray, "k r r"]:
-    """What makes independent rows of variance 1 of the errors of the responses that are used; the
-    rows of the others are zero. r = p m.
+    """What makes rows of variance 1 of the errors of the responses that are used, independent of
+    one another at a line; the rows of the others are zero. r = p m.
 
     Args:
         at: what the inputs say.

@@ -1,8 +1,4 @@
-"""Flights in half-overlapping Hann windows, at lines of the window that are independent.
-
-Every second line is used: estimates of responses at lines next to one another are correlated by
-4/9, at lines two apart by 1/36, and 95 % of what all lines say is in these. From the second line on
-a constant has no part in them.
+"""Flights in half-overlapping Hann windows, each less its mean, at the lines of the window.
 
 Sources: Welch (1967); Bendat and Piersol, Random Data (2010), chapters 7 and 9; Harris (1978).
 """
@@ -23,12 +19,9 @@ _LONGEST = 30.0
 """window [s] unless one is stated"""
 _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
-_APART = 2
-"""lines from one that is used to the next"""
-OVERLAP = 1.0 / 6.0
-"""correlation of the transforms of white noise in two Hann windows that overlap by half"""
-PER_AVERAGE = 1.0 + 2.0 * OVERLAP**2
-"""windows that make one independent average"""
+PER_AVERAGE = 1.0 + 2.0 / 36.0
+"""windows that make one independent average: transforms of white noise in two Hann windows that
+overlap by half are correlated by 1/6"""
 
 
 class Windowed(NamedTuple):
@@ -110,10 +103,17 @@ def window_transforms(
         dt: between two samples [s].
     """
     xp = jnp if isinstance(x, jax.Array) else np
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
-    at = np.asarray(starts, int)[:, None] + np.arange(length)
-    transforms = xp.fft.rfft(x[:, at] * window, axis=-1)[..., np.asarray(lines, int)]
+    window = hann(length)
+    parts = x[:, np.asarray(starts, int)[:, None] + np.arange(length)]
+    # A constant is in the first line alone, and that is kept.
+    parts = parts - xp.mean(parts, axis=-1, keepdims=True)
+    transforms = xp.fft.rfft(parts * window[None, None], axis=-1)[..., np.asarray(lines, int)]
     return transforms * (2.0 * dt / np.sum(window**2)) ** 0.5
+
+
+def hann(length: int) -> Float[np.ndarray, " n"]:
+    """The window."""
+    return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
 
 
 def windowed(flights: Sequence[Flight], options: ResponseOptions = ResponseOptions()) -> Windowed:
@@ -222,22 +222,21 @@ def _one_rate(flights: Sequence[Flight]) -> float:
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:
-    """Every second line of the band, or of these the ones nearest to points of a logarithm."""
+    """The lines of the band, or of these the ones nearest to points of a logarithm."""
     if length < 16:
         raise ValueError(f"window: expected at least 16 samples, {16 * dt:.3g} s; got {length}")
-    low, high = options.band or (2.0 / (length * dt), _HIGHEST / dt)
+    low, high = options.band or (1.0 / (length * dt), _HIGHEST / dt)
     if high >= 0.5 / dt:
         raise ValueError(
             f"band: expected frequencies below half the rate of {1.0 / dt:.4g} Hz, got {high:g} Hz"
         )
-    # Fewer than two periods in a window are not told from its own shape.
-    if low < 2.0 / (length * dt) * (1.0 - 1e-9):
+    if low < 1.0 / (length * dt) * (1.0 - 1e-9):
         raise ValueError(
-            f"band: expected at least two periods in a window of {length * dt:g} s, from "
-            f"{2.0 / (length * dt):.3g} Hz on; got {low:g} Hz"
+            f"band: expected at least one period in a window of {length * dt:g} s, from "
+            f"{1.0 / (length * dt):.3g} Hz on; got {low:g} Hz"
         )
     first, last = (f * length * dt for f in (low, high))
-    lines = np.arange(int(np.ceil(first - 1e-6)), int(last + 1e-6) + 1, _APART)
+    lines = np.arange(int(np.ceil(first - 1e-6)), int(last + 1e-6) + 1)
     if not lines.size:
         raise ValueError(
             f"band: expected one that holds a line of the window, every {1 / (length * dt):.3g} "

@@ -8,8 +8,8 @@ $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 The model goes through the same windows as the record: what windows do to a response they do to
 both, and nothing is biased. Where it is unstable, or remembers longer than a window, its response
 at each frequency is taken instead, with the inputs as they act between samples. Errors are complex
-and linear, at frequencies that are independent, whitened between outputs and inputs by the noise's
-spectral matrix: what no response explains of the errors.
+and linear, whitened between outputs and inputs by the noise's spectral matrix: what no response
+explains of the errors. Lines of a window count for as much as they are independent.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
@@ -136,7 +136,7 @@ class FrequencyResponse(Estimator):
         errors = np.asarray(_errors(layout, data, on_device(weights), z))
         density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, weights.simulated, density)
-        level = -2.0 * weights.log_determinant / max(int(np.sum(weights.used)), 1)
+        level = -2.0 * weights.log_determinant / max(weights.numbers, 1.0)
         sd = _sd(layout, data, weights, z)
         return z, Noise(sd, np.asarray(level), on_device(weights))
 
@@ -151,8 +151,8 @@ class FrequencyResponse(Estimator):
         """
         weights: ResponseWeights = noise.whitening
         squares = float(np.sum(np.square(np.asarray(e.r)[: 2 * weights.used.size])))
-        count = float(np.sum(np.asarray(weights.used)))
-        return 2.0 * weights.log_determinant - 0.5 * squares - count * float(np.log(np.pi))
+        constant = weights.numbers * float(np.log(np.pi))
+        return 2.0 * weights.log_determinant - 0.5 * squares - constant
 
     def log_density(self, layout: Layout, data: Data, rows: Float[Array, " n"]) -> Array:
         """Of the whitened rows, the spectrum taken as it was estimated.
@@ -176,9 +176,8 @@ class FrequencyResponse(Estimator):
             data: the numbers of the problem.
             noise: with the weights.
         """
-        weights = back(noise.whitening)
-        of_noise = np.maximum(weights.windows.averages - len(weights.windows.inputs), 1.0)
-        return int(np.sum(2.0 * np.any(weights.used, axis=2) * of_noise)) + layout.determined
+        # The nuisances are not taken from them.
+        return int(noise.whitening.numbers_of_noise) + layout.determined
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """The simulated flights: what disturbs them is in the noise.
@@ -207,7 +206,8 @@ class FrequencyResponse(Estimator):
         E = response_of(w, weights.averages, np.asarray(_errors(layout, data, noise.whitening, z)))
         H = response_of(w, weights.averages, w.Y)
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
-        freedom, low, high = expected_interval(w, used, len(layout.of_interest))
+        freedom = max(2.0 * weights.numbers - len(layout.of_interest), 1.0)
+        low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(
             w, used, H, E, weights.variance(), weights.coherence, weights.simulated
         )
@@ -226,17 +226,16 @@ class FrequencyResponse(Estimator):
 
 def _rows(layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns) -> Float[Array, " r"]:
     w = weights.windows
-    total = jnp.sum(w.seen, axis=0)
-    first, S = 0, jnp.zeros(())
+    first, sums = 0, []
     for i, starts in enumerate(w.starts):
         part = slice(first, first + len(starts))
         first += len(starts)
         if not starts:
             continue
-        E = _flight_errors(layout, data, weights, u, i)
-        seen, Z = w.seen[part], jnp.conj(w.Z[part])
-        S = S + jnp.einsum("wp,wkz,wkp->kpz", seen.astype(Z.dtype), Z, E)
-    dH = jnp.einsum("pkmz,kpz->kpm", weights.averages.P, S / total[None, :, None])
+        E, Z = _flight_errors(layout, data, weights, u, i), jnp.conj(w.Z[part])
+        sums.append(jnp.einsum("wp,wkz,wkp->kpz", w.seen[part].astype(Z.dtype), Z, E))
+    S = sum(sums[1:], sums[0]) / jnp.sum(w.seen, axis=0).astype(sums[0].dtype)[None, :, None]
+    dH = jnp.einsum("pkmz,kpz->kpm", weights.averages.P, S)
     rows = jnp.einsum("kab,kb->ka", weights.whitening, dH.reshape(dH.shape[0], -1))
     # Of a complex normal error each part has half of the variance.
     return 2.0**0.5 * jnp.concatenate([jnp.real(rows).reshape(-1), jnp.imag(rows).reshape(-1)])
@@ -251,7 +250,7 @@ def _errors(
     parts = [
         _flight_errors(layout, data, weights, u, i) for i, starts in enumerate(w.starts) if starts
     ]
-    return jnp.concatenate(parts) * w.seen[:, None, :]
+    return jnp.concatenate(parts) * w.seen[:, None, :].astype(parts[0].dtype)
 
 
 def _flight_errors(

@@ -56,10 +56,10 @@ class Machine(NamedTuple):
         Args:
             z: exp(i omega dt).
         """
-        identity = jnp.eye(self.Ad.shape[0])
-        resolvent = jnp.linalg.inv(z[:, None, None] * identity[None] - self.Ad[None])
-        G = jnp.einsum("pn,knj,jr->kpr", self.C.astype(z.dtype), resolvent, self.B.astype(z.dtype))
-        return G, self.D.astype(z.dtype)
+        Ad, B, C, D = (v.astype(z.dtype) for v in (self.Ad, self.B, self.C, self.D))
+        identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
+        resolvent = jnp.linalg.inv(z[:, None, None] * identity[None] - Ad[None])
+        return jnp.einsum("pn,knj,jr->kpr", C, resolvent, B), D
 
 
 def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:

@@ -49,18 +49,34 @@ class ResponseWeights(NamedTuple):
     density: Any
     """(k, p, p) the noise's spectral matrix, per Hz"""
     whitening: Any
-    """(k, r, r), r = p m"""
+    """(k, r, r), r = p m: rows whose squares count for as much as a line is independent"""
+    share: Any
+    """(k,) of each line how much of an independent one it is"""
     begun: Any
     """by flight the initial States (None where they are the model's own) and the inputs' offsets by
     name, as they suit the record in time best; zero before these are known"""
 
     @property
     def log_determinant(self) -> float:
-        """Of the whitening of the responses that take part."""
+        """Of the whitening of the responses that take part, lines by their share."""
         r = np.arange(self.whitening.shape[1])
         diagonal = np.real(np.asarray(self.whitening)[:, r, r])
         taken = np.asarray(self.used).reshape(diagonal.shape)
-        return float(np.sum(np.log(diagonal[taken])))
+        share = np.asarray(self.share)[:, None]
+        logs = np.log(np.where(taken, diagonal / np.sqrt(share), 1.0))
+        return float(np.sum(share * logs))
+
+    @property
+    def numbers(self) -> float:
+        """Independent complex ones that take part."""
+        return float(np.sum(np.asarray(self.share)[:, None, None] * np.asarray(self.used)))
+
+    @property
+    def numbers_of_noise(self) -> float:
+        """Independent real ones that the noise's spectrum is taken from."""
+        averages = np.maximum(self.windows.averages - len(self.windows.inputs), 1.0)
+        seen = np.any(np.asarray(self.used), axis=2)
+        return float(np.sum(2.0 * np.asarray(self.share)[:, None] * seen * averages))
 
     def variance(self) -> np.ndarray:
         """(k, p, m) of the complex error of each response"""
@@ -93,7 +109,7 @@ def first_weights(
     forgetful = forgetful_outputs(problem, flights, w) if simulated is None else simulated
     density = noise_density(w, at, w.Y)
     begun = _at_rest(problem, len(flights))
-    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, begun)
+    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, None, begun)
     weights = weighed(weights, forgetful, density)
     _require_numbers(problem, weights)
     return weights
@@ -119,11 +135,18 @@ def weighed(
     """
     w = weights.windows
     # What goes through the same windows as the record may be of their sidelobes: so is the other.
+    # A response at one frequency is not told from the window's shape by less than two periods.
     through = np.asarray(simulated, bool)[None, :, None]
-    used = np.asarray(weights.asked) & (through | np.asarray(w.own))
+    own = np.asarray(w.own) & (w.lines >= 2)[:, None, None]
+    used = np.asarray(weights.asked) & (through | own)
     at = Averages(*(np.asarray(v) for v in weights.averages))
-    W = whitening(at, density, used)
-    return weights._replace(simulated=simulated, used=used, density=density, whitening=W)
+    each = np.moveaxis(at.share, 0, 1)
+    share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
+    share = np.where(share > 0, share, 1.0)
+    W = whitening(at, density, used) * np.sqrt(share)[:, None, None]
+    return weights._replace(
+        simulated=simulated, used=used, density=density, whitening=W, share=share
+    )
 
 
 def forgetful_outputs(problem: Problem, flights: Sequence[Flight], w: Windowed) -> tuple[bool, ...]:
@@ -200,11 +223,11 @@ def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
     nuisance = problem.nuisance
     unknowns = len(problem.free) + nuisance.time_shift
     unknowns += len(naming.names(problem.model.Inputs)) if nuisance.input_gain else 0
-    numbers = 2 * int(np.sum(weights.used))
+    numbers = 2.0 * weights.numbers
     if numbers <= unknowns:
         raise ValueError(
             f"frequency: expected more independent numbers than the {unknowns} unknowns, got "
-            f"{numbers} of the responses; a wider band, a longer window or a lower coherence"
+            f"{numbers:.2g} of the responses; a wider band, a longer window or a lower coherence"
         )
 
 
