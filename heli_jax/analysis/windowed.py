@@ -91,7 +91,7 @@ def window_transforms(
     starts: Sequence[int],
     length: int,
     lines: Sequence[int] | np.ndarray,
-    dt: float | Array,
+    dt: float,
 ) -> Complex[np.ndarray | Array, "c W k"]:
     """Fourier transforms of Hann windows, scaled so that squares are one-sided densities per Hz.
 
@@ -108,7 +108,7 @@ def window_transforms(
     # A constant is in the first line alone, and that is kept.
     parts = parts - xp.mean(parts, axis=-1, keepdims=True)
     transforms = xp.fft.rfft(parts * window[None, None], axis=-1)[..., np.asarray(lines, int)]
-    return transforms * (2.0 * dt / np.sum(window**2)) ** 0.5
+    return transforms * float((2.0 * dt / np.sum(window**2)) ** 0.5)
 
 
 def hann(length: int) -> Float[np.ndarray, " n"]:
@@ -218,7 +218,7 @@ def _one_rate(flights: Sequence[Flight]) -> float:
     if len(rates) > 1:
         listed = ", ".join(f"{r:g}" for r in rates)
         raise ValueError(f"expected flights of one rate, got {listed} Hz; set flights[].rate")
-    return flights[0].dt
+    return float(flights[0].dt)
 
 
 def _lines(options: ResponseOptions, length: int, dt: float) -> np.ndarray:

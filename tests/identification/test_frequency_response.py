@@ -1,13 +1,17 @@
 """Fit of frequency responses: estimates, an unstable machine in a loop, and what is refused."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
 from heli_jax import config as configuration
 from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.dynamics.jacobians import StateSpace
 from heli_jax.errors import InputError
+from heli_jax.identification.estimation.linear_machine import Machine, forgets
 from heli_jax.report import tables
 from heli_jax.report.files import fit_json
 from tests.identification.bench import BENCH, record, vehicle
@@ -25,11 +29,11 @@ def with_a_gap(flight: Flight) -> Flight:
     return Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll})
 
 
-def test_two_flights_with_missing_samples_are_fitted_through_their_windows():
-    both = [with_a_gap(record(BENCH, seed=3, n=3000)), record(BENCH, seed=4, n=3000)]
+def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
+    flight = with_a_gap(record(BENCH, seed=3, n=4000))
     options = ResponseOptions(window=8.0, band=(0.25, 8.0))
     problem = Problem(
-        models.roll_on_stand, vehicle(BENCH), both, FREE,
+        models.roll_on_stand, vehicle(BENCH), [flight], FREE,
         method="frequency-response", frequency=options,
     )  # fmt: skip
     found = fit(problem)
@@ -37,8 +41,8 @@ def test_two_flights_with_missing_samples_are_fitted_through_their_windows():
     for name, one in found.estimates.items():
         assert one.lower95 < BENCH[name] < one.upper95
         assert one.sd < 0.01 * BENCH[name]
-    # Stopped before the gap and begun after it: 13 windows less those that hold a missing sample.
-    assert dict(found.responses.averages)["roll"] == pytest.approx((13 + 11) / (1 + 2 / 36))
+    # Of 19 windows two hold the gap.
+    assert dict(found.responses.averages)["roll"] == pytest.approx(17 / (1 + 2 / 36))
     assert found.responses.lower95 < found.responses.chi_squared < found.responses.upper95
     assert found.adequate
     [pair] = found.responses.pairs
@@ -51,6 +55,33 @@ def test_two_flights_with_missing_samples_are_fitted_through_their_windows():
     assert "through the windows" in str(tables.responses(found).rows)
 
 
+def test_simulation_and_response_of_a_machine_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    A = np.array([[0.95, 0.1], [-0.2, 0.9]])
+    B, C, D = (rng.standard_normal(s) for s in ((2, 2), (3, 2), (3, 2)))
+    U, x0 = rng.standard_normal((90, 2)), rng.standard_normal(2)
+    machine = Machine(*(jnp.asarray(v) for v in (A, B, U, U, C, D, x0)))
+    _, y, _ = scipy.signal.dlsim((A, B, C, D, 1.0), U, x0=x0)
+    np.testing.assert_allclose(machine.simulated(32), y.T, rtol=1e-10, atol=1e-12)
+    omega = np.array([0.1, 0.7, 2.0])
+    G, direct = machine.responses(np.exp(1j * omega))
+    for j in range(2):
+        num, den = scipy.signal.ss2tf(A, B, C, D, input=j)
+        for i in range(3):
+            _, expected = scipy.signal.freqz(num[i], den, omega)
+            np.testing.assert_allclose(G[:, i, j] + direct[i, j], expected, rtol=1e-9)
+
+
+def test_only_outputs_that_forget_within_a_window_are_simulated():
+    # A lag of 2 s, its integral, and a divergence that only the third output feels.
+    A = np.array([[-0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.2]])
+    matrices = StateSpace(*(jnp.asarray(v) for v in (A, np.eye(3)[:, :1], np.eye(3), A[:, :1])))
+    assert forgets(matrices, 0.02, np.ones(1), 500, 6000).tolist() == [True, False, False]
+    # Shorter than the lag remembers.
+    assert not forgets(matrices, 0.02, np.ones(1), 90, 6000)[0]
+
+
+@pytest.mark.slow
 def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
     """Gusts that come back through the stick bias a direct response; the logged steps do not."""
     path = tmp_path / "falling.yaml"
@@ -86,7 +117,7 @@ def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
     assert not any(pair.simulated for pair in found.responses.pairs)
     for name, one in found.estimates.items():
         assert abs(one.value - truth[name]) < 3.0 * one.sd
-        assert one.sd < 0.15 * abs(truth[name])
+        assert one.sd < 0.3 * abs(truth[name])
 
 
 @pytest.mark.parametrize(
