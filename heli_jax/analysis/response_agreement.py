@@ -70,7 +70,7 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What a reader of the fit has to know."""
+        """What takes no part."""
         words = list(self.notes)
         left = [f"{p.input} to {p.output}" for p in self.pairs if not p.lines]
         if left:
@@ -82,13 +82,18 @@ class ResponseAgreement(NamedTuple):
                 f"{some} of {total} lines of the responses take no part: outside of a band, below "
                 "a coherence, or of no more power than the window's sidelobes."
             )
-        if self.chi_squared > self.upper95:
-            words.append(
-                f"Squared errors of the responses are {self.chi_squared:.3g} times what their "
-                f"random errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the "
-                "model lacks something, the machine is not linear, or an input follows the outputs."
-            )
         return tuple(words)
+
+    @property
+    def misfit(self) -> str:
+        """What chi-squared says where it lies above its interval; empty elsewhere."""
+        if not self.chi_squared > self.upper95:
+            return ""
+        return (
+            f"Squared errors of the responses are {self.chi_squared:.3g} times what their random "
+            f"errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the model lacks "
+            "something, the machine is not linear, or an input follows the outputs."
+        )
 
 
 def pair_agreements(

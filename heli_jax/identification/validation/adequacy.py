@@ -183,8 +183,11 @@ def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
     """
     if agreement is None:
         return None
-    doubts = (agreement.doubt,) if agreement.doubt else ()
-    return Adequacy(not doubts, False, (), agreement.sentences, doubts=doubts)
+    misfit = (agreement.misfit,) if agreement.misfit else ()
+    if agreement.doubt:
+        remarks, doubts = agreement.sentences, (agreement.doubt,)
+        return Adequacy(False, False, (), misfit, remarks=remarks, doubts=doubts)
+    return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:
