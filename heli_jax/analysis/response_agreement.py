@@ -39,6 +39,12 @@ class PairAgreement(NamedTuple):
     response at each frequency was taken"""
 
 
+APART = (
+    "Too few windows hold all outputs to say how their errors go together: these are taken as "
+    "independent, and intervals are too narrow where they are not. A shorter window has more."
+)
+
+
 class ResponseAgreement(NamedTuple):
     """All responses together."""
 

@@ -164,19 +164,35 @@ def noise_density(
         at: of these.
         E: errors (W, k, p); zero in windows that an output does not have.
     """
-    dH = np.nan_to_num(response_of(w, at, E))
-    D = (E - np.einsum("wkm,kpm->wkp", w.U, dH, optimize=True)) * w.seen[:, None, :]
-    both = w.seen.T @ w.seen
+    own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
+    power = np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    floor = np.maximum(_ROUNDING * power, 1e-300)
+    if not w.together:
+        return _definite(own[:, :, None] * np.eye(own.shape[1]), floor) / at.power[:, None, None]
+    # Coherences from windows that all outputs have: those of pairs would contradict one another,
+    # and the noise that seems to be left of several outputs with a common one would be anything.
+    S = _left(w, E, np.repeat(w.common[:, None], own.shape[1], axis=1))
+    size = np.sqrt(np.maximum(own, floor) / np.maximum(np.real(np.einsum("kii->ki", S)), floor))
+    return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
+
+
+def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(k, p, p) smooth spectral matrix of what the inputs leave of errors in the windows seen
+    (W, p); of outputs with other windows than one another only the diagonal is sound."""
+    P = []
+    for mask in seen.T:
+        z, u = (np.real(np.einsum("kaa->ka", _cross(mask, v, v))) for v in (w.Z, w.U))
+        P.append(np.nan_to_num(inverse(_cross(mask, w.Z, w.U), z, u)))
+    S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
+    dH = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
+    D = (E - np.einsum("wkm,kpm->wkp", w.U, dH, optimize=True)) * seen[:, None, :]
     # Each input takes one of the independent averages for its own response.
-    freedom = np.maximum(both - PER_AVERAGE * len(w.inputs), 0.0)
+    freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
     S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
-    S = np.where(both > 0, S / np.maximum(np.where(both > 0, freedom, 1.0), 0.5), 0.0)
-    S = S / at.power[:, None, None]
+    S = S / np.sqrt(freedom[:, None] * freedom[None, :])
     width = np.maximum(_LEAST, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
-    S = np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
-    power = np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
-    return _definite(S, np.maximum(_ROUNDING * power, 1e-300))
+    return np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
 
 
 def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
@@ -184,7 +200,7 @@ def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
     power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
     scale = np.sqrt(power)
     rho = S / (scale[:, :, None] * scale[:, None, :])
-    # Outputs with missing samples share some of their windows only: pairs of them need not agree.
+    # Of more outputs than averages, or of some that were computed from others, none is left.
     values, vectors = np.linalg.eigh(0.5 * (rho + np.conj(np.swapaxes(rho, 1, 2))))
     rho = np.einsum("kia,ka,kja->kij", vectors, np.maximum(values, _SMALLEST), np.conj(vectors))
     return rho * scale[:, :, None] * scale[:, None, :]

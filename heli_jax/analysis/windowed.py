@@ -19,6 +19,10 @@ _LONGEST = 30.0
 """window [s] unless one is stated"""
 _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
+_SMOOTHED = 3.5
+"""independent lines at least over which the noise's spectrum is smoothed"""
+_FOR_MATRIX = 4.0
+"""averages for each output from which a spectral matrix has an inverse of about the right size"""
 PER_AVERAGE = 1.0 + 2.0 / 36.0
 """windows that make one independent average: transforms of white noise in two Hann windows that
 overlap by half are correlated by 1/6"""
@@ -75,6 +79,18 @@ class Windowed(NamedTuple):
         flight = np.repeat(np.arange(len(self.starts)), [len(s) for s in self.starts])
         first = np.concatenate([np.asarray(s, int) for s in self.starts])
         return (np.diff(first) == self.length // 2) & (np.diff(flight) == 0)
+
+    @property
+    def common(self) -> np.ndarray:
+        """(W,) 1 where a window has every sample of all outputs, else 0"""
+        return np.min(np.asarray(self.seen), axis=1)
+
+    @property
+    def together(self) -> bool:
+        """Whether there are windows enough to say how the errors of outputs go together: the
+        inverse of a spectral matrix from few averages is too large."""
+        left = np.sum(self.common) / PER_AVERAGE - len(self.inputs)
+        return len(self.outputs) == 1 or bool(left * _SMOOTHED >= _FOR_MATRIX * len(self.outputs))
 
     @property
     def averages(self) -> np.ndarray:

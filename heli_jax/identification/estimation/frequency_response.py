@@ -27,6 +27,7 @@ from jaxtyping import Array, Complex, Float
 
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import (
+    APART,
     ResponseAgreement,
     expected_interval,
     pair_agreements,
@@ -220,7 +221,7 @@ class FrequencyResponse(Estimator):
             w.seconds,
             tuple(zip(w.outputs, w.averages.tolist(), strict=True)),
             w.instruments,
-            w.notes,
+            w.notes if w.together else (*w.notes, APART),
         )
 
 
