@@ -97,7 +97,8 @@ def forgets(
     if not all(np.isfinite(v).all() for v in (A, B, C)):
         return np.zeros(C.shape[0], bool)
     Ad = scipy.linalg.expm(A * dt)
-    lags = np.unique(np.geomspace(1, max(samples, 2 * length), _LAGS).astype(int))
+    lags = np.geomspace(1, max(samples, 2 * length), _LAGS).astype(int)
+    lags = np.unique(np.append(lags, length))
     with np.errstate(all="ignore"):
         powers = [np.linalg.matrix_power(Ad, int(t)) for t in lags]
         g = np.array([np.linalg.norm(C @ P @ (B * sizes), axis=1) for P in powers])
