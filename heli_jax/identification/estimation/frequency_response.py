@@ -324,13 +324,15 @@ def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple
     in the band."""
     runs = with_biases(layout, jax.device_get(simulated_at(layout, data, z)))
     w, sd = weights.windows, [dict[str, Any]() for _ in data.flights]
-    in_band = np.sum(np.real(np.einsum("kpp->kp", weights.density)), axis=0)
-    in_band = np.sqrt(in_band * (w.hz[-1] - w.hz[0]) / max(len(w.hz) - 1, 1)) if len(w.hz) else 1.0
+    in_band = np.mean(np.real(np.einsum("kpp->kp", weights.density)), axis=0)
+    in_band = np.sqrt(in_band * max(float(np.ptp(w.hz)), 1.0 / w.seconds))
     for i, name in signals(layout):
         y = np.asarray(data.flights[i].outputs[name])
         left = (y - runs[i][name])[np.isfinite(y)]
         stands = name not in w.outputs or weights.simulated[w.outputs.index(name)]
-        size = float(np.sqrt(np.mean(left**2))) if stands else np.nan
+        # A simulation that diverges overflows in its square.
+        with np.errstate(all="ignore"):
+            size = float(np.sqrt(np.mean(left**2))) if stands else np.nan
         if not np.isfinite(size):
             j = w.outputs.index(name) if name in w.outputs else 0
             size = float(in_band[j])
