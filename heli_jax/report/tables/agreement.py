@@ -49,23 +49,24 @@ def responses(fit: Fit) -> Table | None:
     agreement = fit.responses
     if agreement is None:
         return None
-    head = ("response", "Hz", "lines", "coherence", "chi-squared", "J", "model")
+    usual = f"J (usual: < {USUAL_J:g})"
+    head = ("response", "Hz", "lines", "coherence", "chi-squared", usual, "model")
     rows = [
         (
             f"{p.input} to {p.output}",
             f"{number(p.low, 2)} to {number(p.high, 2)}",
-            f"{p.lines} of {p.of}",
+            f"{p.lines}/{p.of}",
             number(p.coherence, 2),
             number(p.chi_squared, 2),
-            f"{number(p.J, 2)} (usual: below {USUAL_J:g})",
-            "through the windows" if p.simulated else "at each frequency",
+            number(p.J, 3),
+            "in windows" if p.simulated else "by line",
         )
         for p in agreement.pairs
         if p.lines
     ]
     between = f"{number(agreement.lower95, 2)} to {number(agreement.upper95, 2)}"
-    total = number(agreement.chi_squared, 2)
-    rows.append(("all together", "", "", "", f"{total} (expected: {between})", "", ""))
+    rows.append(("all together", "", "", "", number(agreement.chi_squared, 2), "", ""))
+    rows.append(("expected", "", "", "", between, "", ""))
     return Table(head, rows)
 
 
