@@ -93,7 +93,7 @@ def one_run(
     least, out = bound(u, sigma), []
     for method in METHODS:
         free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
-        options = ResponseOptions(window=window)
+        options = ResponseOptions(window=window if method == METHODS[0] else None)
         problem = Problem(
             models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
         )

@@ -20,6 +20,7 @@ from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
@@ -85,7 +86,7 @@ def problem(experiment: Experiment) -> Problem:
 def _responses(experiment: Experiment) -> ResponseOptions:
     """Which frequency responses are fitted, where the method fits any."""
     config, method = experiment.config.frequency, experiment.config.fit
-    if method is not None and method.method != "frequency-response":
+    if method is not None and not estimator_of(method.method).fits_responses:
         for key in ("pairs", "coherence"):
             # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
             if config is not None and getattr(config, key):
@@ -93,6 +94,7 @@ def _responses(experiment: Experiment) -> ResponseOptions:
                     f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
                     f"got {method.method}"
                 )
+        return ResponseOptions()
     if config is None:
         return ResponseOptions()
     pairs = tuple(PairOptions(**dict(p)) for p in config.pairs or ())
@@ -152,7 +154,7 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
-    if config.intervals.bootstrap and config.method in ("frequency-error", "frequency-response"):
+    if config.intervals.bootstrap and estimator_of(config.method).noise_spectrum:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "
             "estimates the noise's spectrum; expected another method, or none"

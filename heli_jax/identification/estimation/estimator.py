@@ -73,6 +73,8 @@ class Estimator(abc.ABC):
     noise_spectrum: ClassVar[bool] = False
     """whether the noise's spectrum is estimated, so that intervals hold where residuals in time are
     not white; rows are then numbers at frequencies, of no sample and maybe of no flight"""
+    fits_responses: ClassVar[bool] = False
+    """whether frequency responses are what is fitted, as `Problem.frequency` says"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True

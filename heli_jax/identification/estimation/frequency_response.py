@@ -66,6 +66,7 @@ class FrequencyResponse(Estimator):
     least_squares = False
     nuisances_in_rows = False
     noise_spectrum = True
+    fits_responses = True
     errors = "residuals"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
