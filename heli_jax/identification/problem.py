@@ -94,7 +94,8 @@ class Problem:
     first_guess: Any = None
     """how the starts were found, for the report; None where they were given"""
     frequency: ResponseOptions = field(default_factory=ResponseOptions)
-    """frequency-response: band, windows, and the responses that are fitted; nothing else takes any"""
+    """frequency-response: band, windows, and the responses that are fitted; the same problem by
+    another method takes no notice of it"""
 
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.
@@ -204,12 +205,8 @@ class Problem:
 
 
 def _check_method(problem: Problem) -> None:
-    model, estimator = problem.model, estimator_of(problem.method)
-    if problem.frequency != ResponseOptions() and not estimator.fits_responses:
-        raise ValueError(
-            f"frequency: is for method frequency-response, expected none with {problem.method}"
-        )
-    if not estimator.process_noise:
+    model = problem.model
+    if not estimator_of(problem.method).process_noise:
         return
     if model.noise_intensity is None:
         raise ValueError(
