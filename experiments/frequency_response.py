@@ -42,7 +42,7 @@ def still(v, u: np.ndarray) -> np.ndarray:
     M[:4, :4], M[:4, 4] = A, B
     E = scipy.linalg.expm(M * DT)
     num, den = scipy.signal.ss2tf(E[:4, :4], E[:4, 4:], np.eye(4)[:1], np.zeros((1, 1)))
-    return scipy.signal.lfilter(num[0], den, u)
+    return np.asarray(scipy.signal.lfilter(num[0], den, u))
 
 
 def bound(u: np.ndarray, sigma: float) -> np.ndarray:
