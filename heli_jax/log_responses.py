@@ -46,7 +46,8 @@ def responses_of_log(
         )
     config = experiment.config.frequency or FrequencyConfig()
     wanted = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
-    settings = Settings(config.band, config.window, config.points, wanted)
+    points = config.points or Settings().points
+    settings = Settings(config.band, config.window, points, wanted)
     check_pairs(experiment, "transfer_functions", config.transfer_functions)
     asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)

@@ -77,6 +77,8 @@ def print_fit(run: FitRun) -> None:
     if supplementary.responses is not None:
         for line in handling_lines(supplementary.responses.handling):
             print(line)
+    if (responses := report_tables.responses(fit)) is not None:
+        print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     print(f"acceptance card: {summary(card(problem, fit))}")

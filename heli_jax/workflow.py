@@ -350,7 +350,8 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     from heli_jax.report.fitted_responses import fitted_responses
 
     options = run.config.config.frequency or FrequencyConfig()
-    settings = Settings(options.band, options.window, options.points)
+    points = options.points or Settings().points
+    settings = Settings(options.band, options.window, points)
     logged = {n for f in run.problem.training for n in f.outputs}
     asked = asked_handling(run.config, logged)
     responses = fitted_responses(run.fit, run.problem, settings, asked)

@@ -233,7 +233,7 @@ def responses(
             f"{np.min(n):.2f}: a longer record, or shorter segments"
         )
     # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
-    P = _inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
+    P = inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
     H = np.swapaxes(P @ S[:, z][:, :, y], 1, 2)
     left = _left(S, u, y, H)
     # Covariance of S_zu^-1 S_ze, where that of S_ze is S_zz times the noise over the averages.
@@ -249,7 +249,7 @@ def responses(
     return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
 
 
-def _inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Of matrices (k, m, m); NaN where one is singular but for rounding.
 
     Args:
@@ -264,8 +264,8 @@ def _inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray
         scaled = np.where(sound[:, None, None], scaled, np.eye(M.shape[1]))
         # In coherences, so that units do not count.
         sound &= np.linalg.svd(scaled, compute_uv=False)[:, -1] > _SINGULAR
-        inverse = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
-        return np.where(sound[:, None, None], inverse * np.swapaxes(scale, 1, 2), np.nan)
+        inverted = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
+        return np.where(sound[:, None, None], inverted * np.swapaxes(scale, 1, 2), np.nan)
 
 
 def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarray:

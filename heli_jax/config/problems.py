@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from heli_jax import naming, units
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
@@ -69,6 +70,7 @@ def problem(experiment: Experiment) -> Problem:
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
             instrument=instrument_for(config.fit, config.fit.method),
+            frequency=_responses(experiment),
         )
         whole = with_chosen_windows(whole)
     except ValueError as e:
@@ -133,6 +135,24 @@ def _by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
     )
 
 
+def _responses(experiment: Experiment) -> ResponseOptions:
+    """Which frequency responses are fitted, where the method fits any."""
+    config, method = experiment.config.frequency, experiment.config.fit
+    if method is not None and not estimator_of(method.method).fits_responses:
+        for key in ("pairs", "coherence"):
+            # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
+            if config is not None and getattr(config, key):
+                raise InputError(
+                    f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
+                    f"got {method.method}"
+                )
+        return ResponseOptions()
+    if config is None:
+        return ResponseOptions()
+    pairs = tuple(PairOptions(**dict(p)) for p in config.pairs or ())
+    return ResponseOptions(config.band, config.window, config.points, config.coherence, pairs)
+
+
 def with_chosen_windows(problem: Problem) -> Problem:
     """The problem with each flight of `window: auto` in its most telling windows.
 
@@ -186,9 +206,9 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
-    if config.intervals.bootstrap and config.method == "frequency-error":
+    if config.intervals.bootstrap and estimator_of(config.method).noise_spectrum:
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with method frequency-error, which "
+            f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "
             "estimates the noise's spectrum; expected another method, or none"
         )
     if config.intervals.bootstrap and config.nuisance.time_shift:

@@ -367,6 +367,6 @@ class Config(_Strict):
     rls: RLSConfig | None = RLSConfig()
     disturbance: DisturbanceConfig | None = None
     frequency: FrequencyConfig | None = None
-    """of `heli-jax frf` (docs/frequency.md)"""
+    """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
     simulate: SimulateConfig | None = None
     sweep: SweepConfig | None = None

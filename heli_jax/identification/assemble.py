@@ -42,7 +42,7 @@ from heli_jax.identification.uncertainty.standard_errors import StandardErrors, 
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
-from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.closed_loop_trust import (
@@ -177,7 +177,9 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
     by_instrument = data.flights[0].by_instrument is not None
-    adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
+    responses = layout.estimator.response_agreement(layout, data, noise, best.z)
+    in_time = (problem, params, signals, white, against, layout.determined)
+    adequacy = by_responses(responses) or _adequacy(*in_time)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
@@ -203,6 +205,7 @@ def assemble(
         whiteness=white,
         adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined]),
         coloured=errors.coloured,
+        responses=responses,
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
@@ -96,6 +97,9 @@ class Problem:
     # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
     first_guess: Any = None
     """how the starts were found, for the report; None where they were given"""
+    frequency: ResponseOptions = field(default_factory=ResponseOptions)
+    """frequency-response: band, windows, and the responses that are fitted; the same problem by
+    another method takes no notice of it"""
 
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.

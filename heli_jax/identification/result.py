@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.methods import METHODS
+from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Moved, untrusted
@@ -140,6 +141,8 @@ class Fit:
     """whether the model explains what was measured, judged against what"""
     coloured: bool = False
     """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
+    responses: ResponseAgreement | None = None
+    """frequency-response: how the model's responses agree with the measured ones"""
     feedback: tuple[Feedback, ...] = ()
     """by flight and input, whether it follows the response"""
     moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
@@ -200,7 +203,8 @@ class Fit:
     @property
     def overconfident(self) -> bool:
         """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
-        return not self.white and not self.coloured
+        spectrum = estimator_of(self.method).noise_spectrum
+        return not self.white and not self.coloured and not spectrum
 
     @property
     def narrow(self) -> bool:

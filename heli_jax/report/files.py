@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.flights.write import stacked, write_table
@@ -92,6 +93,7 @@ def fit_json(
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             **_residuals(fit),
+            "responses": _responses(fit.responses),
             "baseline_rls": _baseline(baseline),
             "handling_qualities": handling_json(
                 supplementary.responses.handling if supplementary.responses else ()
@@ -118,6 +120,18 @@ def _residuals(fit: Fit) -> dict[str, Any]:
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
         "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
         "untrusted": list(fit.untrusted),
+    }
+
+
+def _responses(agreement: ResponseAgreement | None) -> dict[str, Any] | None:
+    """Measured frequency responses and the model's, where these were fitted."""
+    if agreement is None:
+        return None
+    return {
+        **agreement._asdict(),
+        "averages": dict(agreement.averages),
+        "pairs": [p._asdict() for p in agreement.pairs],
+        "usual_J": USUAL_J,
     }
 
 
@@ -256,6 +270,8 @@ def whiteness_note(fit: Fit) -> str:
             "residuals' autocorrelation"
             + (", which filter-error would use for a better estimate." if better else ".")
         )
+    elif estimator_of(fit.method).noise_spectrum:
+        consequence = "The intervals allow for it: the noise's spectrum is estimated."
     else:
         # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
         # samples.

@@ -226,6 +226,7 @@ def render(
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),
+        fitted_to=tables.responses(fit),
         supplementary=supplementary,
         choice=tables.choice(supplementary.choice) if supplementary.choice else None,
         intervals=tables.intervals(supplementary.intervals, fit)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run
@@ -74,10 +75,13 @@ class Estimator(abc.ABC):
     rows_by_flight: ClassVar[bool] = True
     """whether each row of the measurements is of one flight"""
     noise_spectrum: ClassVar[bool] = False
-    """whether the noise's spectrum is estimated, so that intervals allow for noise that is not
-    white"""
+    """whether the noise's spectrum is estimated, so that intervals hold where residuals in time are
+    not white; rows are then numbers at frequencies, of no sample and maybe of no flight"""
+    fits_responses: ClassVar[bool] = False
+    """whether frequency responses are what is fitted, as `Problem.frequency` says"""
     nuisances_in_rows: ClassVar[bool] = True
-    """whether the rows know of initial states, biases and offsets"""
+    """whether initial states and biases have a part in the rows: else the simulation in time has
+    them found by themselves"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
@@ -157,6 +161,16 @@ class Estimator(abc.ABC):
             noise: to begin with.
         """
         return noise
+
+    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """`prepared` where the method asks more of the problem than its flights.
+
+        Args:
+            problem: what is fitted.
+            noise: standard deviations by flight and output.
+            flights: those fitted, or those held out.
+        """
+        return self.prepared(noise, flights)
 
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level about which the likelihood is laid out in rows.
@@ -295,6 +309,16 @@ class Estimator(abc.ABC):
             at += y.shape[0]
         return total
 
+    def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
+        """How many independent numbers the noise is estimated from.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that the rows are divided by.
+        """
+        return measured_count(data)
+
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """By flight and output what is measured but for bias and noise, (N,), or (runs, N) where
@@ -331,6 +355,19 @@ class Estimator(abc.ABC):
             sd: of the measurement noise, SI, by 'flight/output'.
         """
         return False
+
+    def response_agreement(
+        self, layout: Layout, data: Data, noise: Noise, z: Array
+    ) -> ResponseAgreement | None:
+        """How model and measured frequency responses agree, where these are what is fitted.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: at the optimum.
+            z: the unknowns.
+        """
+        return None
 
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool

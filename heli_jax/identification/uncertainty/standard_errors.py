@@ -9,7 +9,6 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Z95, Verdict
 from heli_jax.identification.problem import Problem
@@ -57,7 +56,7 @@ def standard_errors(
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e, aliased=aliased) if usable else before
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
-    freedom = max(measured_count(at.data) - layout.determined, 1)
+    freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
     quantiles = np.full(layout.size, quantile)
     # Rows that are dependent under white noise too say nothing by the residuals' whiteness.

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
@@ -171,6 +172,22 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         tuple(dict.fromkeys(advice)),
         tuple(_as_expected(outputs)),
     )
+
+
+def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
+    """Whether a model is adequate to measured frequency responses: by the squared errors over their
+    variance, which gusts do not change, while a simulation in time knows nothing of gusts.
+
+    Args:
+        agreement: of the model's responses with the measured ones; None where none were fitted.
+    """
+    if agreement is None:
+        return None
+    misfit = (agreement.misfit,) if agreement.misfit else ()
+    if agreement.doubt:
+        remarks, doubts = agreement.sentences, (agreement.doubt,)
+        return Adequacy(False, False, (), misfit, remarks=remarks, doubts=doubts)
+    return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:

@@ -133,6 +133,11 @@ def rank_windows(
     Raises:
         ValueError: the length fits no flight, or no window may be used.
     """
+    if at.layout.estimator.noise_spectrum:
+        raise ValueError(
+            f"windows: method {problem.method} has no rows in time to rank them by, expected "
+            "output-error or filter-error"
+        )
     samples = window_samples(problem, length)
     if at.layout.estimator.rows_are_samples:
         s, spans, notes = _simulated(problem, at, e, samples)

@@ -1,6 +1,6 @@
 """What the report's page says, as words and as rows of text; the page itself is the template."""
 
-from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals
+from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals, responses
 from heli_jax.report.tables.baseline import baseline_facts, baseline_ratios
 from heli_jax.report.tables.estimates import (
     Nuisances,
@@ -56,6 +56,7 @@ __all__ = [
     "parameters",
     "prior_note",
     "residuals",
+    "responses",
     "selection_steps",
     "start_method",
     "starts",
