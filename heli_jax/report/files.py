@@ -15,7 +15,6 @@ from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Estimate, Fit, Signals
-from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.methods import estimator_of
@@ -29,6 +28,7 @@ from heli_jax.identification.validation.finding import Finding
 from heli_jax.report.card import card
 from heli_jax.report.fitted_responses import FittedResponses
 from heli_jax.report.handling_json import handling_json
+from heli_jax.report.method_content import frequency_start_content, methods_content
 from heli_jax.versions import versions
 
 
@@ -83,7 +83,7 @@ def fit_json(
             **_metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
-            "methods": _methods(supplementary.methods),
+            "methods": methods_content(supplementary.methods),
             "intervals": _intervals(supplementary.intervals),
             "record": [f._asdict() for f in supplementary.findings],
             "log_likelihood": fit.log_likelihood,
@@ -99,7 +99,7 @@ def fit_json(
                 supplementary.responses.handling if supplementary.responses else ()
             ),
             "equation_error_start": _first_guess(problem),
-            "frequency_error_start": _frequency_start(problem),
+            "frequency_error_start": frequency_start_content(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
             "notes": list(fit.notes),
@@ -159,20 +159,6 @@ def _first_guess(problem: Problem) -> dict[str, Any] | None:
     }
 
 
-def _frequency_start(problem: Problem) -> dict[str, Any] | None:
-    """What a fit in frequency found to begin with."""
-    guess = problem.first_guess
-    if not isinstance(guess, FrequencyErrorStart):
-        return None
-    return {
-        "status": guess.status,
-        "seconds": guess.seconds,
-        "values": {n: v._asdict() for n, v in guess.values.items()},
-        "sentences": list(guess.sentences),
-        "notes": list(guess.notes),
-    }
-
-
 def _metrics(fit: Fit) -> dict[str, Any]:
     return {
         "metrics": {n: m._asdict() for n, m in fit.metrics.items()},
@@ -212,25 +198,6 @@ def _choice(choice: Choice | None) -> dict[str, Any] | None:
         "nested": [t._asdict() for t in choice.nested],
         "sentences": list(choice.sentences),
     }
-
-
-def _methods(comparison: MethodComparison | None) -> dict[str, Any] | None:
-    """By method its estimates, and how far they are from those of the first."""
-    if comparison is None:
-        return None
-    results = {}
-    for r in comparison.results:
-        estimates = {} if r.fit is None or r.reason else r.fit.estimates
-        results[r.method] = {
-            "status": "refused" if r.fit is None else r.fit.status,
-            "verdict": r.word,
-            "reason": r.reason or None,
-            "seconds": r.seconds,
-            "parameters": {n: _parameter(e) for n, e in estimates.items()},
-            "difference_joint_sd": {n: comparison.difference(r, n) for n in estimates},
-            "notes": [] if r.fit is None else list(r.fit.notes),
-        }
-    return {"results": results, "sentences": list(comparison.sentences)}
 
 
 def _intervals(comparison: Intervals | None) -> dict[str, Any] | None:

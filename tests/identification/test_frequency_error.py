@@ -22,7 +22,7 @@ from heli_jax.identification.frequency_start import _value, frequency_error_star
 from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import layout_of
-from heli_jax.report.files import _methods
+from heli_jax.report.method_content import methods_content
 from heli_jax.report.tables import first_guess, methods
 from tests.identification.bench import BENCH, denominators, record, steps, vehicle
 
@@ -241,7 +241,7 @@ def test_methods_are_laid_side_by_side(by):
     assert [row[0] for row in rows] == ["Ixx", "If", "kappa", "verdict", "time"]
     assert rows[3] == ("verdict", "converged, adequate", "converged, adequate", "", "refused", "")
     assert rows[0][4:] == ("–", "–")
-    written = _methods(compared)["results"]
+    written = methods_content(compared)["results"]
     assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
     assert written["filter-error"]["reason"] == "there is no disturbance"
     moved = {**other.estimates, "If": b._replace(value=a.value + 5.0 * (a.sd**2 + b.sd**2) ** 0.5)}
