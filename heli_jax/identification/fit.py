@@ -1,6 +1,7 @@
 """fit and check: parameters with intervals and a verdict, from a Problem."""
 
 import time
+from dataclasses import replace
 from typing import NamedTuple
 
 from jaxtyping import Array, Float
@@ -37,6 +38,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
+from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -154,7 +156,10 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
             finite at the start values.
     """
     guess = _first_guess(problem)
-    return rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
+    return replace(ranking, record=tuple(f for f in found if f.severity != "ok"))
 
 
 def _starts(
