@@ -15,7 +15,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
 
-_RATE = 25.0
+_RATE = 50.0
 """[Hz] to which logs are averaged, so that the verdict is the same at any rate of the log: samples
 that come faster each tell less"""
 _SECONDS = 0.4
@@ -103,8 +103,10 @@ def _of_future(y: np.ndarray, drives: Mapping[str, np.ndarray], name: str, step:
 
     past = [column(y, k) for k in range(1, _OWN + 1)] + [np.ones(last - first)]
     past += [column(u, k) for u in drives.values() for k in range(lags + 1)]
+    # A step within a mean is told in full by the next one: that is no lead yet.
+    past += [column(u, -1) for u in drives.values()]
     known = _basis(np.stack(past, axis=1))
-    future = np.stack([column(drives[name], -k) for k in range(1, lags + 1)], axis=1)
+    future = np.stack([column(drives[name], -k) for k in range(2, lags + 1)], axis=1)
     size = float(np.linalg.norm(future - future.mean(axis=0), axis=0).max())
     new = _basis(future - known @ (known.T @ future), size)
     rest = column(y, 0) - known @ (known.T @ column(y, 0))
@@ -129,7 +131,7 @@ def _basis(X: np.ndarray, size: float | None = None) -> np.ndarray:
 
 def _finding(label: str, name: str, share: float, lead: float, output: str) -> Finding:
     words = (
-        f"{label}: {output} moves about {lead:.2g} s before {name} does (what {name} does later "
+        f"{label}: {output} moves {lead:.2g} s or more before {name} does (what {name} does later "
         f"explains {share:.0%} of what the past leaves of {output}): {name} is logged late (free a "
         "delay: nuisance.time_shift, or delays of the model) or follows the response (feedback)."
     )
