@@ -239,6 +239,7 @@ def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
             "as much of noise alone.",
         ),
         ("Use larger or more inputs, a longer record, or an output with less noise.",),
+        doubts=("what is said to be determined is so at an optimum of chance",),
     )
 
 
