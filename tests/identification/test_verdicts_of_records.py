@@ -5,6 +5,8 @@ import pytest
 import scipy.signal
 
 from heli_jax.flights.signal_facts import facts_of_all
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, _of_noise
+from heli_jax.identification.validation.advice import OutputAdequacy, Record
 from heli_jax.identification.validation.late_inputs import led_by
 
 RNG = np.random.default_rng(0)
@@ -56,3 +58,13 @@ def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise_and_dropouts_are_
     rests = scipy.signal.lfilter([0.05], [1.0, -0.95], u)
     assert of(np.round(rests, 5)).dropouts is None
     assert of(np.round(rests, 5)).stretches == ()
+
+
+def test_an_output_of_which_nothing_is_explained_is_named():
+    judged = [OutputAdequacy(n, True, v, v, True, 0.0) for n, v in (("p", 1e-5), ("phi", 0.99))]
+    measured = dict.fromkeys(("p", "phi"), np.zeros(3000))
+    record = Record("one", 0.01, measured, measured)
+    evidence = Evidence((record,), {}, {}, None, 5)
+    assert [_of_noise(o, evidence) for o in judged] == [True, False]
+    said = Adequacy(True, False, tuple(judged), unexplained=("p",))
+    assert said.summary == "yes, but nothing of p is explained"
