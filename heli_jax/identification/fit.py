@@ -39,6 +39,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
+from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -171,7 +172,10 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
         # Which part says most is asked of the simulation, whatever the fit goes by.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
     guess = _first_guess(problem)
-    return rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
+    return dataclasses.replace(ranking, record=tuple(f for f in found if f.severity != "ok"))
 
 
 def _starts(
