@@ -40,9 +40,8 @@ def check_model(model: Any, *, traceable: bool = True) -> None:
     """
     if isinstance(model, str):
         raise TypeError(
-            f"model: expected a heli_jax.Model, got its name {model!r:.60}; "
-            f"heli_jax.models.by_name({model!r:.60}) is the shipped one, "
-            f"heli_jax.linear_model({model!r:.60}).model one from a file"
+            "model: expected a heli_jax.Model, as heli_jax.models.by_name or heli_jax.linear_model "
+            f"gives one of a name, got the name {model!r:.60}"
         )
     if not isinstance(model, Model):
         raise TypeError(

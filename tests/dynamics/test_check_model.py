@@ -243,7 +243,7 @@ def test_every_way_in_says_it(case):
     ("value", "got"),
     [
         (None, "None"),
-        ("roll", "a str"),
+        ("roll", "the name 'roll'"),
         (Model, "the class Model"),
         (rates, "a function"),
         (
