@@ -227,7 +227,9 @@ def _windows(options: argparse.Namespace) -> int:
     experiment = workflow.load_config(options.config, options.set)
     ranking = log_windows.rank_log(experiment, options.log, options.length, progress=_say)
     log_windows.print_ranking(ranking)
-    return NOT_DETERMINED if log_windows.not_determined(ranking) else DONE
+    if log_windows.cannot_be_fitted(ranking) or log_windows.not_determined(ranking):
+        return NOT_DETERMINED
+    return DONE
 
 
 def _compatibility(options: argparse.Namespace) -> int:

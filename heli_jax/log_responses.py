@@ -3,12 +3,17 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from heli_jax import naming, run_directory
+from heli_jax import run_directory
+from heli_jax.analysis.attitude_responses import (
+    Handling,
+    measured_handling,
+)
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.frequency import asked_handling, check_pairs, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
-from heli_jax.errors import InputError, nearest
+from heli_jax.errors import InputError
 from heli_jax.numbers import number
 
 _TOO_LARGE = 2.0
@@ -41,8 +46,10 @@ def responses_of_log(
         )
     config = experiment.config.frequency or FrequencyConfig()
     wanted = tuple(Wanted(**dict(t)) for t in config.transfer_functions)
-    settings = Settings(config.band, config.window, config.points, wanted)
-    _check_pairs(experiment, config)
+    points = config.points or Settings().points
+    settings = Settings(config.band, config.window, points, wanted)
+    check_pairs(experiment, "transfer_functions", config.transfer_functions)
+    asked_handling(experiment)  # before the logs are read
     flights = read_flights(experiment)
     for note in (n for f in flights for n in (f.source.notes if f.source else ())):
         if progress is not None:
@@ -51,20 +58,6 @@ def responses_of_log(
         return flight_responses(flights, settings)
     except ValueError as e:
         raise InputError(f"{experiment.path}: frequency: {e}") from e
-
-
-def _check_pairs(experiment: Experiment, config: FrequencyConfig) -> None:
-    for i, wanted in enumerate(config.transfer_functions):
-        for role, record in (
-            ("input", experiment.model.Inputs),
-            ("output", experiment.model.Outputs),
-        ):
-            name, known = getattr(wanted, role), naming.names(record)
-            if name not in known:
-                raise InputError(
-                    f"{experiment.path}: frequency.transfer_functions[{i}].{role}: model "
-                    f"{experiment.model.name} has no {role} {name!r}{nearest(name, known)}"
-                )
 
 
 def run_responses(
@@ -79,21 +72,28 @@ def run_responses(
         say: called with notes, and where the page is.
     """
     from heli_jax.report.responses import write_responses
+    from heli_jax.report.tables.handling import handling_lines, handling_sentences
 
     found = responses_of_log(experiment, log, say)
+    # Of axes that did not move nobody asked by name, and nothing is to be said.
+    asked = asked_handling(experiment, found.outputs)
+    named = (experiment.config.frequency or FrequencyConfig()).handling is not None
+    handling = [
+        Handling(pair, None, measured_handling(found, pair))
+        for pair in asked
+        if named or pair.input in found.holds
+    ]
     with run_directory.whole(out) as temporary:
-        write_responses(temporary, found, units_of(experiment), Path(experiment.path).stem)
+        title = Path(experiment.path).stem
+        write_responses(temporary, found, units_of(experiment), title, handling)
     for note in found.notes:
         say(note)
     print_responses(found)
+    for line in handling_lines(handling):
+        print(line)
+    for sentence in handling_sentences(handling):
+        print(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
-
-
-def units_of(experiment: Experiment) -> dict[str, str]:
-    """SI units of the model's inputs and outputs, by name; 1 where it states none."""
-    model = experiment.model
-    records = (model.Inputs, model.Outputs)
-    return {n: naming.unit(r, n) or "1" for r in records for n in naming.names(r)}
 
 
 def print_responses(found: FlightResponses) -> None:

@@ -124,6 +124,11 @@ def print_ranking(ranking: Ranking) -> None:
     """The windows, best first, and those that are enough together, on standard output."""
     from heli_jax.terminal_table import print_table
 
+    if cannot_be_fitted(ranking):
+        # What a window expects of a model that the samples cannot show is no recommendation.
+        _print_doubts(ranking)
+        print(f"No window of {ranking.length:.3g} s is recommended.")
+        return
     taken = [choice.window for choice in ranking.taken]
     rest = [w for w in ranking.windows if not w.excluded and w not in taken]
     # By the geometric mean of the sds, as the D-criterion has it.
@@ -157,6 +162,11 @@ def print_ranking(ranking: Ranking) -> None:
     _print_doubts(ranking)
 
 
+def cannot_be_fitted(ranking: Ranking) -> bool:
+    """Whether the log says nothing of what is asked, whichever part of it is taken."""
+    return any(f.severity == "refuse" for f in ranking.record)
+
+
 def not_determined(ranking: Ranking) -> tuple[str, ...]:
     """The parameters that all windows together do not determine."""
     pairs = zip(ranking.parameters, ranking.all_sd, strict=True)
@@ -164,7 +174,9 @@ def not_determined(ranking: Ranking) -> tuple[str, ...]:
 
 
 def _print_doubts(ranking: Ranking) -> None:
-    """What the numbers of a ranking rest on."""
+    """What the numbers of a ranking rest on, and what speaks against the record."""
+    for finding in ranking.record:
+        print(f"{'x' if finding.severity == 'refuse' else '!'} {finding.topic}: {finding.sentence}")
     for name in ranking.guessed:
         print(f"noise of {name}: {ranking.noise[name]:.3g} ({GUESSED})")
     finite = ranking.all_sd[np.isfinite(ranking.all_sd)]

@@ -11,6 +11,7 @@ from heli_jax import run_directory
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
+from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
@@ -19,6 +20,7 @@ from heli_jax.numbers import rounded
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
+from heli_jax.report.tables.handling import handling_lines
 from heli_jax.terminal_table import print_table
 from heli_jax.workflow import FitRun
 
@@ -51,6 +53,11 @@ def print_fit(run: FitRun) -> None:
         print_table(table.head, table.rows)
         for sentence in supplementary.intervals.sentences:
             print(f"! {sentence}")
+    if supplementary.methods is not None:
+        side_by_side = report_tables.methods(supplementary.methods)
+        print_table(side_by_side.head, side_by_side.rows)
+        for sentence in supplementary.methods.sentences:
+            print(f"! {sentence}")
     # From the weakest claim to the strongest: simulation and prediction of the fitted flights, then
     # of those held out, where a model that was fitted too closely shows.
     for name, m in fit.metrics.items():
@@ -67,6 +74,11 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
+    if supplementary.responses is not None:
+        for line in handling_lines(supplementary.responses.handling):
+            print(line)
+    if (responses := report_tables.responses(fit)) is not None:
+        print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
     print(f"acceptance card: {summary(card(problem, fit))}")
@@ -113,8 +125,8 @@ def run_compatibility(
     return found.compatible
 
 
-def _print_first_guess(guess: EquationErrorStart) -> None:
-    print("Where the fit began, by equation error (no result):")
+def _print_first_guess(guess: EquationErrorStart | FrequencyErrorStart) -> None:
+    print(f"Where the fit began, by {report_tables.start_method(guess)} (no result):")
     for table in (report_tables.first_guess(guess), report_tables.selection_steps(guess)):
         if table.rows:
             print_table(table.head, table.rows)

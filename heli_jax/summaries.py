@@ -110,8 +110,9 @@ def of_fit(fit: Any) -> Summary:
     """Status, verdict, estimates with intervals, and agreement by output."""
     head, rows = of_estimates(fit.estimates)
     agreement = [f"{name}: VAF {percent(m.vaf)}" for name, m in fit.metrics.items()]
+    by = f" by instrument ({', '.join(fit.instruments)})" if fit.instruments else ""
     return Summary(
-        f"Fit of {fit.model} by {fit.method}: {fit.status}",
+        f"Fit of {fit.model} by {fit.method}{by}: {fit.status}",
         # The interval's own name: whether it allows for autocorrelated residuals.
         (*head[:3], fit.interval, *head[4:]),
         rows,

@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from heli_jax import config as configuration
 from heli_jax import run_directory
+from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
+from heli_jax.config.frequency import asked_handling
+from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
 from heli_jax.identification.fit import check, findings, fit, rates
+from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Fit
@@ -62,7 +66,7 @@ class FitRun:
     # matplotlib's classes are named in `report` alone.
     def figure(self, name: str) -> Any:
         """A figure of the report, drawn anew, as a matplotlib Figure: `response_OUTPUT`, `bode`,
-        `starts`, ...
+        `match_OUTPUT-INPUT`, `starts`, ...
 
         Raises:
             ValueError: the report has no figure of that name; the sentence lists those it has.
@@ -71,7 +75,8 @@ class FitRun:
         from heli_jax.report.html import Analysis, drawings
         from heli_jax.report.style import styled
 
-        draw = drawings(Analysis(self.fit, self.problem, self.baseline, self.supplementary))
+        shown = _with_responses(self) if name.startswith("match") else self.supplementary
+        draw = drawings(Analysis(self.fit, self.problem, self.baseline, shown))
         figure = styled(draw[name]) if name in draw else None
         if figure is None:
             raise ValueError(f"figure: expected one of {', '.join(draw)}, got {name!r}")
@@ -260,7 +265,27 @@ def _supplementary(
         raise InputError(f"{config.path}: fit: {e}") from e
     if options.compare:
         choice = compare_models(config, problem, progress=progress)
-    return SupplementaryAnalyses(choice, further)
+    return SupplementaryAnalyses(
+        choice, further, methods=_by_methods(config, problem, fitted, progress)
+    )
+
+
+def _by_methods(
+    config: Experiment, problem: Problem, fitted: Fit, progress: Say
+) -> MethodComparison | None:
+    """The same problem by the methods of `fit.also`; None where there are none."""
+    options = config.config.fit
+    assert options is not None
+    if not options.also:
+        return None
+    return compare_methods(
+        fitted,
+        configuration.by_other_methods(config, problem),
+        starts=options.starts,
+        seed=options.seed,
+        max_steps=options.max_steps,
+        progress=progress,
+    )
 
 
 def compare_models(
@@ -302,7 +327,7 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     run_directory.require_free(out)
     # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
-    vehicle, extra = run.config.vehicle, run.supplementary
+    vehicle, extra = run.config.vehicle, _with_responses(run)
     with run_directory.whole(out) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
@@ -315,7 +340,22 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         run.fit.timing["total"] = time.perf_counter() - run.began
         content = files.fit_json(run.fit, run.problem, run.baseline, extra)
         files.write_json(folder / "fit.json", content)
-    return replace(run, directory=out)
+    return replace(run, directory=out, supplementary=extra)
+
+
+def _with_responses(run: FitRun) -> SupplementaryAnalyses:
+    """The supplementary analyses with those of the frequency domain, which only a report shows."""
+    if run.supplementary.responses is not None:
+        return run.supplementary
+    from heli_jax.report.fitted_responses import fitted_responses
+
+    options = run.config.config.frequency or FrequencyConfig()
+    points = options.points or Settings().points
+    settings = Settings(options.band, options.window, points)
+    logged = {n for f in run.problem.training for n in f.outputs}
+    asked = asked_handling(run.config, logged)
+    responses = fitted_responses(run.fit, run.problem, settings, asked)
+    return run.supplementary._replace(responses=responses)
 
 
 def run_sweep(

@@ -90,8 +90,18 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     rows = list(csv.DictReader((out / "responses.csv").read_text().splitlines()))
     assert len(rows) == 120
     assert float(rows[7]["gain"]) == pytest.approx(abs(H[7]), rel=1e-12)
+    # The angle is not logged: that of the rate's response. The loop has no delay but the hold.
+    assert "lat to p, integrated: bandwidth [rad/s] data" in printed.out
+    (handling,) = json.loads((out / "handling_qualities.json").read_text())
+    assert handling["integrated"]
+    bandwidth = handling["data"]["numbers"]["phase_bandwidth"]
+    # -90 - atan(w / 3) deg passes -135 deg at the pole.
+    assert bandwidth["value"] == pytest.approx(3.0, abs=2.5 * bandwidth["sd"])
+    assert bandwidth["sd"] < 0.8
+    assert handling["data"]["numbers"]["phase_delay"] is None
     page = (out / "responses.html").read_text()
     assert "lat to p" in page
+    assert "Handling qualities" in page
     assert (out / "figures/p-lat.png").exists()
 
 
@@ -110,6 +120,8 @@ def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, ca
         ("frequency.band=[5, 1]", "expected two increasing frequencies in Hz, got [5, 1]"),
         ("frequency.window=200", "a part of at least 10000 samples (a window)"),
         ("frequency.transfer_functions.0.output=q", "has no output 'q'"),
+        ("frequency.handling=[{input: lat, output: q}]", "handling[0].output: model"),
+        ("frequency.handling=[{input: lat, output: p, gain: 2}]", "expected response: open-loop"),
         ("frequency.transfer_functions.0.zeros=3", "expected at most as many as poles (1), got 3"),
         ("flights.0.signals.instruments={ped: {signal: sweep}}", "has no input 'ped'"),
         ("flights.0.signals.instruments={lat: {constant: 1}}", "expected a signal of the log"),

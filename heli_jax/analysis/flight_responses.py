@@ -5,10 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
-from heli_jax.analysis.spectral import CrossSpectra, Responses, composite, cross_spectra, responses
+from heli_jax.analysis.spectral import CrossSpectra, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
 """window [s] unless one is stated: what rotorcraft responses are usually taken from"""
@@ -111,12 +113,10 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
     notes = _notes(flights, inputs, instruments)
     outputs: dict[str, Output] = {}
-    for name in dict.fromkeys(n for f in flights for n in f.outputs):
-        records = _records(flights, inputs, instruments, name, round(window / dt))
-        if isinstance(records, str):
-            notes.append(records)
-            continue
-        outputs[name] = _output(records, dt, omega, window, (inputs, instruments))
+    names = (inputs, instruments)
+    for group, parts in _groups(flights, round(window / dt), notes):
+        records = _records(flights, names, group, parts)
+        outputs |= _outputs(records, dt, omega, window, (names, group))
     if not outputs:
         raise ValueError("; ".join(notes[-3:]))
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
@@ -165,59 +165,95 @@ def _notes(flights: Sequence[Flight], inputs: list[str], by: tuple[str, ...]) ->
     return notes
 
 
-def _records(
-    flights: Sequence[Flight],
-    inputs: list[str],
-    instruments: tuple[str, ...],
-    output: str,
-    window: int,
-) -> list[np.ndarray] | str:
-    """Parts (signals, N) without a missing sample, or why there are none in words."""
+type _Parts = tuple[tuple[int, int, int], ...]
+type _Names = tuple[list[str], tuple[str, ...]]
+
+
+def _groups(
+    flights: Sequence[Flight], window: int, notes: list[str]
+) -> list[tuple[list[str], _Parts]]:
+    """Outputs by the parts that they are known in, so that inputs are transformed once for all of
+    them; what has no part is noted."""
+    groups: dict[_Parts, list[str]] = {}
+    order = dict.fromkeys(n for f in flights for n in f.outputs)
+    for name in order:
+        parts = _parts(flights, name, window)
+        if isinstance(parts, str):
+            notes.append(parts)
+        else:
+            groups.setdefault(parts, []).append(name)
+    return [(names, parts) for parts, names in groups.items()]
+
+
+def _parts(flights: Sequence[Flight], output: str, window: int) -> _Parts | str:
+    """Flight, first and last sample of each part without a missing one, or why there is none."""
     parts, longest = [], 0
-    for f in flights:
+    for i, f in enumerate(flights):
         if output not in f.outputs:
             continue
-        y = f.outputs[output]
-        signals = [*(f.inputs[n] for n in inputs), *(f.instruments[n] for n in instruments), y]
-        seen = np.concatenate([[False], np.isfinite(y), [False]])
-        edges = np.flatnonzero(np.diff(seen.astype(int)))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
-            longest = max(longest, int(last - first))
+        for first, last in spans([f.outputs[output]]):
+            longest = max(longest, last - first)
             if last - first >= window:
-                parts.append(np.stack([s[first:last] for s in signals]))
+                parts.append((i, first, last))
     if parts:
-        return parts
+        return tuple(parts)
     return (
         f"{output}: no response, expected a part of at least {window} samples (a window) without a "
         f"missing one, got {longest} at most"
     )
 
 
-def _output(
+def _records(
+    flights: Sequence[Flight], names: _Names, outputs: list[str], parts: _Parts
+) -> list[np.ndarray]:
+    """Inputs, instruments and outputs (signals, N) of each part."""
+    inputs, instruments = names
+    return [
+        np.stack(
+            [
+                *(flights[i].inputs[n][first:last] for n in inputs),
+                *(flights[i].instruments[n][first:last] for n in instruments),
+                *(flights[i].outputs[n][first:last] for n in outputs),
+            ]
+        )
+        for i, first, last in parts
+    ]
+
+
+def _outputs(
     records: list[np.ndarray],
     dt: float,
     omega: np.ndarray,
     window: float,
-    names: tuple[list[str], tuple[str, ...]],
-) -> Output:
-    inputs, instruments = names
-    m = len(inputs)
-    u, y = list(range(m)), [m + len(instruments)]
+    names: tuple[_Names, list[str]],
+) -> dict[str, Output]:
+    (inputs, instruments), outputs = names
+    m, first = len(inputs), len(inputs) + len(instruments)
+    u, y = list(range(m)), list(range(first, first + len(outputs)))
     z = [m + instruments.index(n) if n in instruments else u[i] for i, n in enumerate(inputs)]
     by = z if instruments else None
-    found = responses(cross_spectra(records, dt, omega, window), u, y, by)
+    spectra = cross_spectra(records, dt, omega, window)
+    found = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
-    found.H[~own], found.sd[~own], found.coherence[~own] = np.nan, np.nan, np.nan
-    picture = _picture(records, dt, omega, window, (u, y, by))
-    pairs = {
-        n: Pair(found.H[:, 0, j], found.sd[:, 0, j], found.coherence[:, 0, j], picture[:, j])
-        for j, n in enumerate(inputs)
-    }
-    return Output(pairs, found.multiple[:, 0], found.noise[:, 0], float(found.averages[0]))
+    driven = np.all(own[:first], axis=0)
+    several = _several(records, dt, spectra, window, m)
+    result = {}
+    for i, name in enumerate(outputs):
+        seen = (driven & own[y[i]])[:, None]
+        H, sd, coherence = (
+            np.where(seen, v[:, i], np.nan) for v in (found.H, found.sd, found.coherence)
+        )
+        picture = _picture(several, omega, (u, y[i], by))
+        pairs = {
+            n: Pair(H[:, j], sd[:, j], coherence[:, j], picture[:, j]) for j, n in enumerate(inputs)
+        }
+        averages = float(found.averages[0])
+        result[name] = Output(pairs, found.multiple[:, i], found.noise[:, i], averages)
+    return result
 
 
 def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float) -> np.ndarray:
-    """At which frequencies (k,) every signal has power of its own.
+    """At which frequencies every signal has power of its own: (signals, k).
 
     Where one has none its spectrum is that of the window's sidelobes, which are coherent as well:
     two signals behind low-pass filters would show a response far above them.
@@ -227,32 +263,40 @@ def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float)
     for record in records:
         lines, transforms = segment_transforms(record, dt, length)
         power = power + np.sum(np.abs(transforms) ** 2, axis=1)
-    own = np.all([OWN * leakage(S) < S for S in np.transpose(power)], axis=0)
-    return own[np.clip(np.round(omega / lines[1]).astype(int), 0, own.size - 1)]
+    own = np.stack([OWN * leakage(S) < S for S in np.transpose(power)])
+    return own[:, np.clip(np.round(omega / lines[1]).astype(int), 0, own.shape[1] - 1)]
 
 
-def _picture(
-    records: list[np.ndarray],
-    dt: float,
-    omega: np.ndarray,
-    window: float,
-    which: tuple[list[int], list[int], list[int] | None],
-) -> np.ndarray:
-    """H (k, m) of several windows together; NaN where the record has no two of them."""
-    u, y, by = which
+def _several(
+    records: list[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
+) -> list[CrossSpectra]:
+    """Spectra of several windows beside those of one, as far as the records have three of each."""
     longest = max(r.shape[1] for r in records) * dt
     several: list[CrossSpectra] = []
     for length in _LENGTHS:
         # Three windows are the least that a coherence can be taken from.
         if not 2.0 * length * window <= longest or length * window < 16.0 * dt:
             continue
-        spectra = cross_spectra(records, dt, omega, length * window)
-        if np.min(spectra.averages) >= len(u) + 1:
+        own = length == 1.0
+        spectra = one if own else cross_spectra(records, dt, one.omega, length * window)
+        if np.min(spectra.averages) >= m + 1:
             several.append(spectra)
+    return several
+
+
+def _picture(
+    several: list[CrossSpectra], omega: np.ndarray, which: tuple[list[int], int, list[int] | None]
+) -> np.ndarray:
+    """H (k, m) of several windows together; NaN where the record has no two of them."""
+    u, y, by = which
     if len(several) < 2:
         return np.full((omega.size, len(u)), np.nan)
-    found: Responses = responses(composite(several, u, y), u, y, by)
-    return found.H[:, 0]
+    # Without the other outputs, of which each has its own weights.
+    kept = [*dict.fromkeys([*u, *(by or u)]), y]
+    place = {i: j for j, i in enumerate(kept)}
+    own = [s._replace(S=s.S[:, kept][:, :, kept]) for s in several]
+    us, zs = [place[i] for i in u], None if by is None else [place[i] for i in by]
+    return responses(composite(own, us, [place[y]]), us, [place[y]], zs).H[:, 0]
 
 
 def _fits(
@@ -274,7 +318,7 @@ def _fits(
         pair = output.pairs[wanted.input]
         hz = omega / (2.0 * np.pi)
         low, high = wanted.band or (0.0, np.inf)
-        used = (_smooth(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+        used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
         H = np.where(used, pair.H, np.nan)
         # With its hold, which is half a sample late, so that the delay is the machine's own.
         hold = holds[wanted.input]
@@ -285,16 +329,3 @@ def _fits(
             raise ValueError(f"{place}: {e}") from e
         fits.append((wanted, fitted))
     return tuple(fits)
-
-
-def _smooth(omega: np.ndarray, coherence: np.ndarray) -> np.ndarray:
-    """Its mean (k,) over an octave; zero where there is none.
-
-    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
-    """
-    octaves = np.log2(omega)
-    near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
-    seen = np.isfinite(coherence)
-    count = near @ seen.astype(float)
-    mean = near @ np.where(seen, coherence, 0.0) / np.maximum(count, 1.0)
-    return np.where(seen, mean, 0.0)

@@ -22,6 +22,8 @@ from jaxtyping import Array, Complex, Float
 
 _SINGULAR = 1e-9
 """smallest singular value of the inputs' matrix of coherences, below which they move as one"""
+_FINE = 64
+"""samples whose turns are sines, each times those of every so many"""
 _ROUNDING = 1e-14
 """of an output's density, what rounding leaves where the inputs explain all of it"""
 
@@ -167,15 +169,26 @@ def _products(
     """Mean over the segments of conj(X_a) X_b."""
     c, n = record.shape[0], window.shape[0]
     count = 1 + (record.shape[1] - n) // step
-    segments = record[:, step * np.arange(count)[:, None] + np.arange(n)]
-    segments = segments - segments.mean(axis=-1, keepdims=True)
+    # The bulk of the mean here, what is left of it in each segment below: it costs no pass there.
+    record = record - record.mean(axis=1, keepdims=True)
+    segments = record[:, step * np.arange(count)[:, None] + np.arange(n)].reshape(c * count, n)
     # One product of matrices: for the few hundred frequencies of a band faster than fast Fourier
     # transforms of twice the length, and they may lie anywhere.
-    angles = jnp.outer(jnp.arange(n, dtype=record.dtype), omega * dt)
-    windowed = (segments * window[None, None]).reshape(c * count, n)
-    X = jax.lax.complex(windowed @ jnp.cos(angles), -(windowed @ jnp.sin(angles)))
+    basis = window[:, None] * _turns(n, omega * dt)
+    X = segments @ basis - segments.mean(axis=1)[:, None] * basis.sum(axis=0)[None]
+    X = jax.lax.complex(X[:, : omega.size], X[:, omega.size :])
     X = X.reshape(c, count, -1)
     return jnp.einsum("ask,bsk->kab", jnp.conj(X), X) / count
+
+
+def _turns(n: int, angle: Float[Array, " k"]) -> Float[Array, "n 2*k"]:
+    """exp(-i m angle) of m from 0 to n - 1, real parts beside imaginary ones, by products of few
+    sines: so many would take as long as the transform."""
+    coarse = jnp.outer(_FINE * jnp.arange(-(-n // _FINE), dtype=angle.dtype), angle)[:, None]
+    fine = jnp.outer(jnp.arange(_FINE, dtype=angle.dtype), angle)[None]
+    (c, s), (C, S) = ((jnp.cos(v), jnp.sin(v)) for v in (fine, coarse))
+    turns = jnp.concatenate([C * c - S * s, -(S * c + C * s)], axis=2)
+    return turns.reshape(-1, 2 * angle.shape[0])[:n]
 
 
 def _independent(window: np.ndarray, step: int, count: int) -> float:
@@ -220,7 +233,7 @@ def responses(
             f"{np.min(n):.2f}: a longer record, or shorter segments"
         )
     # y = H u + e and a mean of conj(z) e that tends to zero: S_zy = S_zu H^T.
-    P = _inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
+    P = inverse(S[:, z][:, :, u], np.real(S[:, z, z]), np.real(S[:, u, u]))
     H = np.swapaxes(P @ S[:, z][:, :, y], 1, 2)
     left = _left(S, u, y, H)
     # Covariance of S_zu^-1 S_ze, where that of S_ze is S_zz times the noise over the averages.
@@ -236,7 +249,7 @@ def responses(
     return Responses(spectra.omega, H, sd, coherence, multiple, noise, n[:, 0])
 
 
-def _inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Of matrices (k, m, m); NaN where one is singular but for rounding.
 
     Args:
@@ -251,8 +264,8 @@ def _inverse(M: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray
         scaled = np.where(sound[:, None, None], scaled, np.eye(M.shape[1]))
         # In coherences, so that units do not count.
         sound &= np.linalg.svd(scaled, compute_uv=False)[:, -1] > _SINGULAR
-        inverse = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
-        return np.where(sound[:, None, None], inverse * np.swapaxes(scale, 1, 2), np.nan)
+        inverted = np.linalg.inv(np.where(sound[:, None, None], scaled, np.eye(M.shape[1])))
+        return np.where(sound[:, None, None], inverted * np.swapaxes(scale, 1, 2), np.nan)
 
 
 def _left(S: np.ndarray, u: list[int], y: list[int], H: np.ndarray) -> np.ndarray:

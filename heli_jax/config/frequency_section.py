@@ -1,9 +1,10 @@
-"""What may stand in a configuration's section `frequency`: responses of the logs, before a fit."""
+"""What may stand in a configuration's section `frequency`: responses of the logs, and their fit."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
+_Coherence = Annotated[float, Field(ge=0, lt=1)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -40,6 +41,38 @@ class TransferConfig(BaseModel):
         return self
 
 
+class PairConfig(BaseModel):
+    """A response that is to be fitted."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    input: str
+    output: str
+    band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
+    """[Hz]; that of all unless given"""
+    coherence: _Coherence | None = None
+    """likewise"""
+
+
+class HandlingConfig(BaseModel):
+    """A response that handling qualities are read off."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    input: str
+    output: str
+    """an angle, or a rate [rad/s], whose response is integrated"""
+    response: Literal["rate", "attitude-command", "open-loop"] = "rate"
+    gain: _Positive = 1.0
+    """of an open loop that the response is a part of"""
+
+    @model_validator(mode="after")
+    def _of_a_loop(self) -> "HandlingConfig":
+        if self.gain != 1.0 and self.response != "open-loop":
+            raise ValueError(f"gain: expected response: open-loop with it, got {self.response}")
+        return self
+
+
 class FrequencyConfig(BaseModel):
     """Which frequencies, in windows of which length."""
 
@@ -49,6 +82,14 @@ class FrequencyConfig(BaseModel):
     """first and last frequency [Hz]; unless given two periods in a window to 0.4 of the rate"""
     window: _Positive | None = None
     """length [s]; unless given a fifth of the longest flight, 30 s at most"""
-    points: Annotated[int, Field(ge=8, le=2000)] = 120
-    """frequencies, equally spaced in the logarithm"""
+    points: Annotated[int, Field(ge=8, le=2000)] | None = None
+    """frequencies, equally spaced in the logarithm; 120 unless given, and for fit.method:
+    frequency-response all that are independent"""
+    coherence: _Coherence = 0.0
+    """of fit.method: frequency-response: least partial coherence, in the mean over an octave"""
+    pairs: Annotated[list[PairConfig], Field(min_length=1)] | None = None
+    """responses that are fitted; all unless given"""
     transfer_functions: list[TransferConfig] = []
+    handling: list[HandlingConfig] | None = None
+    """responses whose handling qualities are shown; unless given those of roll, pitch and yaw to
+    their sticks; [] for none"""

@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from heli_jax import naming, units
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.kinematics import free_noise, sharpened, substeps_of
 from heli_jax.config.logs import first_signals, read_flights
 from heli_jax.config.schema import FitConfig, FreeConfig
-from heli_jax.config.starts import first_guesses
+from heli_jax.config.starts import first_guesses, instrument_for, started_in_frequency
 from heli_jax.dynamics.disturbance import disturbable, with_disturbance
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
 
@@ -47,12 +49,7 @@ def problem(experiment: Experiment) -> Problem:
     # simulation and for the candidate models alone.
     model, params, fixed = experiment.model, experiment.vehicle.params, ()
     if config.fit.method == "filter-error":
-        # A model with process noise of its own needs none beside it.
-        if config.disturbance is None and model.noise_intensity is None:
-            raise InputError(
-                f"{path}: fit.method: filter-error needs a disturbance, expected "
-                "disturbance: {axis: roll, poles: 1}"
-            )
+        _require_disturbance(experiment, "fit.method")
         model, params = disturbed(experiment)
         free = {**free_noise(model, params, flights), **free}
         fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
@@ -72,12 +69,88 @@ def problem(experiment: Experiment) -> Problem:
             window=None if config.fit.shooting is None else config.fit.shooting.window,
             continuity=None if config.fit.shooting is None else config.fit.shooting.continuity,
             first_guess=guess,
+            instrument=instrument_for(config.fit, config.fit.method),
+            frequency=_responses(experiment),
         )
-        return with_chosen_windows(whole)
+        whole = with_chosen_windows(whole)
     except ValueError as e:
         # What is wrong with the vehicle begins with "vehicle", and is not in the section `fit`.
         place = path if str(e).startswith("vehicle") else f"{path}: fit"
         raise InputError(f"{place}: {e}") from e
+    # Of the flights that are fitted: by now their windows are chosen.
+    return started_in_frequency(experiment, whole)
+
+
+def _require_disturbance(experiment: Experiment, place: str) -> None:
+    # A model with process noise of its own needs none beside it.
+    if experiment.config.disturbance is None and experiment.model.noise_intensity is None:
+        raise InputError(
+            f"{experiment.path}: {place}: filter-error needs a disturbance, expected "
+            "disturbance: {axis: roll, poles: 1}"
+        )
+
+
+def by_other_methods(experiment: Experiment, fitted: Problem) -> dict[str, Problem | str]:
+    """By method of `fit.also` the same problem for it, or why the method refuses it.
+
+    Args:
+        experiment: the configuration.
+        fitted: the problem by its own method.
+
+    Raises:
+        InputError: filter error is asked for without a disturbance.
+    """
+    assert experiment.config.fit is not None
+    if "filter-error" in experiment.config.fit.also:
+        _require_disturbance(experiment, "fit.also")
+    problems: dict[str, Problem | str] = {}
+    for method in experiment.config.fit.also:
+        try:
+            problems[method] = _by_method(experiment, fitted, method)
+        except ValueError as e:
+            problems[method] = str(e)
+    return problems
+
+
+def _by_method(experiment: Experiment, fitted: Problem, method: str) -> Problem:
+    config = experiment.config
+    assert config.fit is not None
+    model, params, fixed = experiment.model, experiment.vehicle.params, ()
+    free = {n: fitted.free[n] for n in config.fit.free}
+    if method == "filter-error":
+        model, params = disturbed(experiment)
+        free = {**free_noise(model, params, fitted.flights), **free}
+        fixed = () if config.disturbance is None else tuple(config.disturbance.fixed)
+    shooting = config.fit.shooting if estimator_of(method).windows else None
+    return dataclasses.replace(
+        fitted,
+        model=model,
+        vehicle=params,
+        free=free,
+        method=method,
+        fixed_noise=fixed,
+        window=None if shooting is None else shooting.window,
+        continuity=None if shooting is None else shooting.continuity,
+        instrument=instrument_for(config.fit, method),
+    )
+
+
+def _responses(experiment: Experiment) -> ResponseOptions:
+    """Which frequency responses are fitted, where the method fits any."""
+    config, method = experiment.config.frequency, experiment.config.fit
+    if method is not None and not estimator_of(method.method).fits_responses:
+        for key in ("pairs", "coherence"):
+            # `heli-jax frf` shows all responses: where nothing is fitted to them it has no effect.
+            if config is not None and getattr(config, key):
+                raise InputError(
+                    f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
+                    f"got {method.method}"
+                )
+        return ResponseOptions()
+    if config is None:
+        return ResponseOptions()
+    pairs = tuple(PairOptions(**dict(p)) for p in config.pairs or ())
+    return ResponseOptions(config.band, config.window, config.points, config.coherence, pairs)
 
 
 def with_chosen_windows(problem: Problem) -> Problem:
@@ -133,9 +206,9 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
             f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         )
-    if config.intervals.bootstrap and config.method == "frequency-error":
+    if config.intervals.bootstrap and estimator_of(config.method).noise_spectrum:
         raise InputError(
-            f"{path}: fit.intervals.bootstrap: not available with method frequency-error, which "
+            f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "
             "estimates the noise's spectrum; expected another method, or none"
         )
     if config.intervals.bootstrap and config.nuisance.time_shift:

@@ -198,6 +198,17 @@ class NuisanceConfig(_Strict):
     the sticks of a machine in free flight"""
 
 
+def _instrument_choice(value: object) -> object:
+    # By hand, as above: a name (of which `none` is one that no input has), or a list of them.
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, list) and value and all(isinstance(v, str) for v in value):
+        return value
+    raise ValueError(
+        f"expected an input, a list of inputs such as [lat, lon], or none, got {value!r:.60}"
+    )
+
+
 class IntervalsConfig(_Strict):
     """Intervals beside the Gaussian one."""
 
@@ -222,8 +233,9 @@ class ShootingConfig(_Strict):
 class StartMethodConfig(_Strict):
     """Where the starts of the free parameters come from."""
 
-    method: Literal["given", "equation-error"] = "given"
-    """equation-error: by regression of the records themselves, for linear models"""
+    method: Literal["given", "equation-error", "frequency-error"] = "given"
+    """equation-error: by regression of the records themselves, for linear models; frequency-error:
+    by a fit in frequency, from the starts that are given"""
     stepwise: bool = False
     """whether terms that hardly help to predict are left at zero"""
     # Entry and removal have one limit unless stated; where its number comes from stands with
@@ -235,8 +247,10 @@ class StartMethodConfig(_Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> "StartMethodConfig":
-        if self.stepwise and self.method == "given":
-            raise ValueError("stepwise: expected method: equation-error with it, got given")
+        if self.stepwise and self.method != "equation-error":
+            raise ValueError(
+                f"stepwise: expected method: equation-error with it, got {self.method}"
+            )
         # A term that enters and at once falls below the limit of removal would be taken in and out
         # for ever.
         if self.f_remove > self.f_enter:
@@ -253,12 +267,20 @@ def _start_method(value: Any) -> Any:
 class FitConfig(_Strict):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
+    also: list[Literal[tuple(METHODS)]] = []  # pyright: ignore[reportInvalidTypeForm]
+    """further methods by which the same is fitted, their estimates laid beside those of `method`"""
     free: dict[str, FreeConfig]
     start: Annotated[
         StartMethodConfig,
         BeforeValidator(_start_method, json_schema_input_type=str | StartMethodConfig),
     ] = StartMethodConfig()
-    """given, equation-error, or {method: equation-error, stepwise: true}"""
+    """given, equation-error, frequency-error, or {method: equation-error, stepwise: true}"""
+    # Any, since the validator before it has said what it may be.
+    instrument: Annotated[
+        Any, BeforeValidator(_instrument_choice, json_schema_input_type=str | list[str] | None)
+    ] = None
+    """frequency-error: inputs that are taken by their instrument, or none; unless given, all of
+    which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
     shooting: ShootingConfig | None = None
     # Unless given, the number depends on what is free: the misfit has a valley for each period by
@@ -271,6 +293,27 @@ class FitConfig(_Strict):
     """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
     several axes may be disturbed, all of them and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
+
+    @property
+    def by_instrument(self) -> tuple[str, ...] | None:
+        """`instrument` as a `Problem` has it: () for none, None where nothing is stated."""
+        if self.instrument == "none":
+            return ()
+        names = self.instrument
+        return (names,) if isinstance(names, str) else names and tuple(names)
+
+    @model_validator(mode="after")
+    def _another_start(self) -> "FitConfig":
+        if self.method == self.start.method:
+            raise ValueError(f"start: {self.method}: expected another method to fit by")
+        return self
+
+    @model_validator(mode="after")
+    def _other_methods(self) -> "FitConfig":
+        for i, method in enumerate(self.also):
+            if method == self.method or method in self.also[:i]:
+                raise ValueError(f"also: expected methods beside {self.method}, got {method} again")
+        return self
 
 
 class RLSConfig(_Strict):
@@ -324,6 +367,6 @@ class Config(_Strict):
     rls: RLSConfig | None = RLSConfig()
     disturbance: DisturbanceConfig | None = None
     frequency: FrequencyConfig | None = None
-    """of `heli-jax frf` (docs/frequency.md)"""
+    """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
     simulate: SimulateConfig | None = None
     sweep: SweepConfig | None = None

@@ -2,13 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from heli_jax import naming
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.schema import FitConfig
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free
+from heli_jax.identification.methods import METHODS, estimator_of
+from heli_jax.identification.problem import Problem
 
 if TYPE_CHECKING:
     from heli_jax.identification.equation_error.first_guess import EquationErrorStart
@@ -32,13 +36,14 @@ def first_guesses(
     # Before its start is asked for: of what the model does not have there is none.
     known = naming.names(experiment.model.Params)
     for name, f in free.items():
-        if name not in known and (config.start.method != "given" or math.isnan(f.start)):
+        if name not in known and (config.start.method == "equation-error" or math.isnan(f.start)):
             raise InputError(
                 f"{path}: fit.free: model {experiment.model.name} has no parameter {name!r}"
                 f"{nearest(name, known)}"
             )
     # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
-    if config.start.method == "given":
+    # In frequency a fit begins where it is told to; what it finds takes the place of that later.
+    if config.start.method != "equation-error":
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
             raise InputError(
@@ -63,3 +68,49 @@ def first_guesses(
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
+
+
+def instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:
+    """The inputs that a method takes by their instrument, as `Problem.instrument` has them.
+
+    Args:
+        config: whose `instrument` may be meant for the start, or for a method of `also`.
+        method: that the problem is for.
+    """
+    others = [m for m in (config.start.method, *config.also) if m in METHODS]
+    if estimator_of(method).by_instrument or not any(estimator_of(m).by_instrument for m in others):
+        return config.by_instrument
+    return None
+
+
+def started_in_frequency(experiment: Experiment, problem: Problem) -> Problem:
+    """The problem with the starts that `fit.start: frequency-error` finds; else as it is.
+
+    Args:
+        experiment: whose model is fitted in frequency without a disturbance.
+        problem: to be fitted in time.
+
+    Raises:
+        InputError: frequency error cannot solve it.
+    """
+    config = experiment.config.fit
+    if config is None or config.start.method != "frequency-error":
+        return problem
+    # Not before it is needed: it imports the optimiser, which takes a second.
+    from heli_jax.identification.frequency_start import frequency_error_start, started
+
+    known = naming.names(experiment.model.Params)
+    bare = {
+        "model": experiment.model,
+        "vehicle": experiment.vehicle.params,
+        "free": {n: f for n, f in problem.free.items() if n in known},
+        "method": "frequency-error",
+        "instrument": config.by_instrument,
+    }
+    whole = {"fixed_noise": (), "window": None, "continuity": None}
+    try:
+        base = replace(problem, **bare, **whole)
+        guess = frequency_error_start(base, max_steps=config.max_steps)
+    except ValueError as e:
+        raise InputError(f"{experiment.path}: fit.start: {e}") from e
+    return started(problem, guess)

@@ -1,6 +1,6 @@
 """A flight with gaps as several: nobody knows what lies in a gap, but what lies beside it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -40,3 +40,14 @@ def is_too_short(stretch: tuple[float, float], clocks: Sequence[np.ndarray]) -> 
     fastest = min(float(np.median(np.diff(seconds))) for seconds in clocks)
     length = stretch[1] - stretch[0]
     return length < SHORTEST or length < (FEWEST - 1.5) * fastest
+
+
+def spans(signals: Iterable[np.ndarray]) -> list[tuple[int, int]]:
+    """First sample, and that behind the last, of each stretch in which every signal has numbers.
+
+    Args:
+        signals: arrays (N,) of one grid, NaN where a sample is missing.
+    """
+    seen = np.all([np.isfinite(y) for y in signals], axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

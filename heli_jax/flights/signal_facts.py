@@ -38,6 +38,18 @@ _AT_REST = 1e-3
 _REGULAR = 0.9
 """part of the runs of equal samples that are no longer than usual: a slow motion in coarse steps
 has runs of any length"""
+_TURNS = 0.3
+"""part of a signal's moves that go back, from which on its noise is as large as its steps"""
+_TIMES = 5.0
+"""times the longest usual run of such a signal, from which on it is stuck"""
+_FAILURES = 20
+"""runs out of all proportion at most: of more it is the signal's way"""
+_DITHER = 0.01
+"""of a usual move, by which a frozen sensor may go to and fro"""
+_TRIFLE = 0.2
+"""of its usual deviation, by which another signal has to move while one is stuck"""
+_DROPS, DROP_SHARE = 5, 0.01
+"""visits of a value, and part of the samples at it, from which on they are dropouts"""
 _RUNS = 20
 """runs of equal samples, from which on their usual length is known"""
 
@@ -81,6 +93,14 @@ class Strays:
 
 
 @dataclass(frozen=True, eq=False)
+class Dropouts:
+    """A value to which a signal jumps again and again, and the times (K,) [s] of its samples."""
+
+    value: float
+    times: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class SignalFacts:
     """Of one signal as it was logged, in SI; times count from the flight's first sample.
 
@@ -92,7 +112,8 @@ class SignalFacts:
         levels: distinct values.
         moves: part of the samples that differ from the one before.
         usual: the usual time between samples [s].
-        stuck: the longest time at one value, of an output while other signals change.
+        stretches: times at one value, of an output while other signals move; the longest first.
+        dropouts: where an output jumps to one value from anywhere.
         marks: values that stand for none, such as -9999, as the log has them, and how many there
             were; they are missing in the flight.
         strays: samples that may stand for none, and are kept.
@@ -105,9 +126,20 @@ class SignalFacts:
     levels: int
     moves: float
     usual: float
-    stuck: Stuck | None = None
+    stretches: tuple[Stuck, ...] = ()
+    dropouts: Dropouts | None = None
     marks: Counts = ()
     strays: tuple[Strays, ...] = ()
+
+    @property
+    def stuck(self) -> Stuck | None:
+        """The longest time at one value."""
+        return self.stretches[0] if self.stretches else None
+
+    @property
+    def dropped(self) -> float:
+        """Of the samples that are dropouts, the part."""
+        return 0.0 if self.dropouts is None else self.dropouts.times.size / max(self.size, 1)
 
     @property
     def shares(self) -> tuple[float, float]:
@@ -123,15 +155,27 @@ class SignalFacts:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
             return replace(rail, times=times - begin)
 
-        stuck = self.stuck
-        if stuck is not None:
-            inside = (max(stuck.begin, begin) - begin, min(stuck.end, end) - begin)
-            longer = inside[1] - inside[0] >= STUCK_SECONDS
-            stuck = Stuck(*inside, stuck.value) if longer else None
+        stretches = []
+        for one in self.stretches:
+            inside = (max(one.begin, begin) - begin, min(one.end, end) - begin)
+            if inside[1] - inside[0] >= STUCK_SECONDS:
+                stretches.append(Stuck(*inside, one.value))
+        stretches.sort(key=lambda one: one.begin - one.end)
+        drops = self.dropouts
+        if drops is not None:
+            times = drops.times[(drops.times >= begin) & (drops.times <= end)]
+            drops = replace(drops, times=times - begin) if times.size else None
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
-        left = [inside for s in self.strays if (inside := s.within(begin, end)).times.size]
-        low, high, strays = cut(self.low), cut(self.high), tuple(left)
-        return replace(self, size=size, low=low, high=high, stuck=stuck, strays=strays)
+        strays = (s.within(begin, end) for s in self.strays)
+        return replace(
+            self,
+            size=size,
+            low=cut(self.low),
+            high=cut(self.high),
+            stretches=tuple(stretches),
+            dropouts=drops,
+            strays=tuple(s for s in strays if s.times.size),
+        )
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
@@ -177,43 +221,109 @@ def facts_of_all[K: Hashable](
     with np.errstate(over="ignore", invalid="ignore"):
         facts = {key: signal_facts(s, x) for key, (s, x) in signals.items()}
         for key in outputs:
-            stuck = _stuck(*signals[key], facts[key])
-            others = (one for other, one in signals.items() if other != key)
+            others = [one for other, one in signals.items() if other != key]
             # A machine that stands on the ground holds everything still, and no sensor is stuck.
-            if stuck is not None and any(_changes(*other, stuck) for other in others):
-                facts[key] = replace(facts[key], stuck=stuck)
+            stretches = tuple(
+                one
+                for one in _stretches(*signals[key], facts[key])
+                if any(_moves_as_usual(*other, one) for other in others)
+            )
+            dropouts = _dropouts(*signals[key])
+            facts[key] = replace(facts[key], stretches=stretches, dropouts=dropouts)
     return facts
 
 
-def _stuck(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> Stuck | None:
-    """The longest time at one value, where that is out of all proportion."""
+def _stretches(seconds: np.ndarray, x: np.ndarray, facts: SignalFacts) -> list[Stuck]:
+    """The times at one value that are out of all proportion, the longest first."""
     seen = np.isfinite(x)
     s, y = seconds[seen], x[seen]
-    begins = np.flatnonzero(np.r_[True, y[1:] != y[:-1]])
+    moves = np.abs(np.diff(y))
+    if not moves.any():
+        return []
+    usual = float(np.median(moves[moves > 0]))
+    # Once by equal samples, once with the last bit of a frozen sensor going to and fro.
+    found = _runs_out_of_proportion(s, y, facts, usual, 0.0)
+    return found or _runs_out_of_proportion(s, y, facts, usual, _DITHER * usual)
+
+
+def _runs_out_of_proportion(
+    s: np.ndarray, y: np.ndarray, facts: SignalFacts, usual: float, within: float
+) -> list[Stuck]:
+    """Runs of samples (N,) of which none moves by more than `within`, and that are too long."""
+    moves = np.diff(y)
+    begins = np.flatnonzero(np.r_[True, np.abs(moves) > within])
     lengths = np.diff(np.r_[begins, y.size])
     if lengths.size < _RUNS:
-        return None
-    usual = float(np.median(lengths))
-    if np.mean(lengths <= 1.5 * usual) < _REGULAR:
-        return None
+        return []
     # What rests at a rail is told as such.
     rails = [rail.value for rail in (facts.low, facts.high) if rail.times.size]
     lengths = np.where(np.isin(y[begins], rails), 0, lengths)
-    i = int(np.argmax(lengths))
-    begin, end = float(s[begins[i]]), float(s[begins[i] + max(lengths[i], 1) - 1])
-    if lengths[i] < _STUCK * usual or end - begin < STUCK_SECONDS:
+    least = _longest_by_itself(lengths, moves)
+    found = []
+    for i in np.flatnonzero(lengths >= least):
+        first, last = begins[i], begins[i] + lengths[i] - 1
+        begin, end = float(s[first]), float(s[last])
+        # A simulated signal without noise comes to rest within the last digit.
+        before = abs(moves[first - 1]) if first else np.inf
+        rests = before < max(_AT_REST * usual, 10.0 * within)
+        drifts = np.ptp(y[first : last + 1]) > within
+        if end - begin >= STUCK_SECONDS and not rests and not drifts:
+            found.append(Stuck(begin, end, float(y[first])))
+    return sorted(found, key=lambda one: one.begin - one.end)
+
+
+def _longest_by_itself(lengths: np.ndarray, moves: np.ndarray) -> float:
+    """The number of samples in a row from which on a signal does not stay at one value by itself;
+    inf where it may for any time."""
+    usual = float(np.median(lengths))
+    if np.mean(lengths <= 1.5 * usual) >= _REGULAR:
+        return _STUCK * usual
+    # A slow motion in coarse steps has runs of any length; noise as large as the steps turns back
+    # at every other one, and ends each run by chance.
+    ways = np.sign(moves[moves != 0])
+    if np.mean(ways[1:] != ways[:-1]) < _TURNS:
+        return np.inf
+    # The runs in which all but a hundredth of the time is spent, those that are stuck left out.
+    ordered = np.sort(lengths[lengths < _STUCK * usual])
+    spent = np.cumsum(ordered) / ordered.sum()
+    high = float(ordered[int(np.searchsorted(spent, 0.99))])
+    # Time in longer runs than that: a few sensors' failures, or the way in which the signal moves.
+    longer = int(np.count_nonzero(lengths >= _STUCK * usual))
+    return max(_STUCK * usual, _TIMES * high) if longer <= _FAILURES else np.inf
+
+
+def _moves_as_usual(seconds: np.ndarray, x: np.ndarray, stuck: Stuck) -> bool:
+    """Whether another signal moves while one is stuck, and not by a trifle."""
+    seen = np.isfinite(x)
+    inside = x[(seconds >= stuck.begin) & (seconds <= stuck.end) & seen]
+    return inside.size > 1 and float(np.std(inside)) >= _TRIFLE * float(np.std(x[seen]))
+
+
+def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
+    """The value to which a signal jumps from anywhere, again and again."""
+    seen = np.isfinite(x)
+    s, y = seconds[seen], x[seen]
+    levels, counts = np.unique(y, return_counts=True)
+    if levels.size < _RUNS:
         return None
-    # A simulated signal without noise comes to rest within the last digit.
+    k = int(np.argmax(counts))
+    if k in (0, levels.size - 1):  # a rail
+        return None
+    near = np.r_[counts[max(k - 5, 0) : k], counts[k + 1 : k + 6]]
+    gap = np.min(np.abs(np.diff(levels[max(k - 1, 0) : k + 2])))
+    at = y == levels[k]
+    into = np.flatnonzero(at[1:] & ~at[:-1])
+    # What comes to a value by itself comes by way of its neighbours.
+    jumps = np.abs(y[into] - levels[k])
+    # Once stuck there is no coming back: the longest visit does not count.
+    edges = np.flatnonzero(np.diff(np.r_[0, at.astype(int), 0]))
+    many = counts[k] - int(np.max(edges[1::2] - edges[::2]))
+    often = into.size >= _DROPS and many >= max(DROP_SHARE * y.size, 5.0 * near.max())
     moves = np.abs(np.diff(y))
-    before = moves[begins[i] - 1] if begins[i] else np.inf
-    if before < _AT_REST * np.median(moves[moves > 0]):
+    far = max(5.0 * float(gap), 0.3 * float(np.median(moves[moves > 0])))
+    if not often or float(np.median(jumps)) < far:
         return None
-    return Stuck(begin, end, float(y[begins[i]]))
-
-
-def _changes(seconds: np.ndarray, x: np.ndarray, stuck: Stuck) -> bool:
-    inside = x[(seconds >= stuck.begin) & (seconds <= stuck.end) & np.isfinite(x)]
-    return np.unique(inside).size > 1
+    return Dropouts(float(levels[k]), s[at])
 
 
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from heli_jax.identification.agreement import (
 from heli_jax.identification.estimation.arrival import unless_stuck
 from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
@@ -41,9 +42,13 @@ from heli_jax.identification.uncertainty.standard_errors import StandardErrors, 
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
-from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
+from heli_jax.identification.validation.closed_loop_trust import (
+    feedback_trust_notes,
+    moved_by_feedback,
+)
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -170,7 +175,11 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    adequacy = _adequacy(problem, params, signals, white, against, layout.determined)
+    moved = moved_by_feedback(solution) if bool(best.converged) else {}
+    by_instrument = data.flights[0].by_instrument is not None
+    responses = layout.estimator.response_agreement(layout, data, noise, best.z)
+    in_time = (problem, params, signals, white, against, layout.determined)
+    adequacy = by_responses(responses) or _adequacy(*in_time)
     notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
@@ -196,12 +205,22 @@ def assemble(
         whiteness=white,
         adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined]),
         coloured=errors.coloured,
+        responses=responses,
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(*notes, *closed_loop, *adequacy.sentences, *missing, *held.notes),
+        notes=(
+            *notes,
+            *closed_loop,
+            *feedback_trust_notes(moved, found),
+            *adequacy.sentences,
+            *missing,
+            *held.notes,
+        ),
         reached=solution,
         feedback=found,
+        moved_by_feedback=moved,
+        instruments=instruments_of(problem) if by_instrument else (),
         seed=run.seed,
         timing=run.timing,
     )

@@ -77,6 +77,7 @@ def _of(problem: Problem, disturbed: Model) -> Problem:
         model=disturbed,
         vehicle=disturbed.Params(**known),
         method="filter-error",
+        instrument=None,
         fixed_noise=(*fixed, *(n for n in problem.fixed_noise if n == "sigma_y")),
     )
 
@@ -95,6 +96,7 @@ def _none(problem: Problem, disturbed: Model) -> Problem:
         model=disturbed,
         vehicle=disturbed.Params(**known),
         method="filter-error",
+        instrument=None,
         fixed_noise=(d.sigma, d.tau, *kept),
     )
 

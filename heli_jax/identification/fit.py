@@ -1,5 +1,6 @@
 """fit and check: parameters with intervals and a verdict, from a Problem."""
 
+import dataclasses
 import time
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.identifiability.disturbances import of_disturbances
 from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -37,6 +39,7 @@ from heli_jax.identification.unknowns.layout import (
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
+from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -103,6 +106,9 @@ def check(problem: Problem) -> Check:
     """
     _require_problem(problem)
     guess = _first_guess(problem)
+    noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
+    if noise is not guess.noise:
+        guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     # At the start values, since nothing else is known yet: where these are far off, what is
     # determined there may differ from what is at the optimum, for which the fit asks again.
     verdict = verdict_of(problem, guess.layout, guess.e)
@@ -162,8 +168,14 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
         ValueError: the length fits no flight, no window may be used, or the simulation is not
             finite at the start values.
     """
+    if not estimator_of(problem.method).rows_by_flight:
+        # Which part says most is asked of the simulation, whatever the fit goes by.
+        problem = dataclasses.replace(problem, method="output-error", instrument=None)
     guess = _first_guess(problem)
-    return rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
+    return dataclasses.replace(ranking, record=tuple(f for f in found if f.severity != "ok"))
 
 
 def _starts(

@@ -10,7 +10,9 @@ import scipy.special
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, with_disturbance
 from heli_jax.dynamics.model import Model
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.fit import fit
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Problem
 from heli_jax.identification.result import Fit, Status
 
@@ -110,6 +112,7 @@ def _disturbed(problem: Problem, model: Model, axis: str, poles: int) -> Problem
         model=disturbed,
         vehicle=disturbed.Params(**known),
         method="filter-error",
+        instrument=None,
         fixed_noise=fixed,
     )
 
@@ -144,7 +147,16 @@ def choose(
         nested: names (small, large) of those to compare by a likelihood ratio.
         progress: called with a line of text before each fit.
         fit_options: go to `fit`.
+
+    Raises:
+        ValueError: a candidate is estimated by instrument.
     """
+    for name, problem in problems.items():
+        if estimator_of(problem.method).by_instrument and instruments_of(problem):
+            raise ValueError(
+                f"{name}: an estimate by instrument has no likelihood to be compared by, expected "
+                "instrument=() or method='filter-error'"
+            )
     report = progress or (lambda _: None)
     fits: dict[str, Fit] = {}
     for name, problem in problems.items():

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Model, needed_but_missing, require_linear
@@ -90,9 +91,15 @@ class Problem:
     continuity: float | None = None
     """with windows: standard deviation of the jump of each state from one window to the next, as a
     part of what the state does; None leaves them apart"""
+    instrument: tuple[str, ...] | None = None
+    """frequency-error: inputs that are taken by their instrument (`Flight.instruments`); None: all
+    that every flight holds one of; (): none"""
     # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
     first_guess: Any = None
     """how the starts were found, for the report; None where they were given"""
+    frequency: ResponseOptions = field(default_factory=ResponseOptions)
+    """frequency-response: band, windows, and the responses that are fitted; the same problem by
+    another method takes no notice of it"""
 
     def __post_init__(self) -> None:
         # The model first: all that follows asks it for names and units.
@@ -100,6 +107,9 @@ class Problem:
         check_arguments(self.model.Params, self.vehicle, self.flights, self.free)
         warn_of_degrees(self.model.Outputs, self.flights)
         object.__setattr__(self, "flights", tuple(self.flights))
+        if self.instrument is not None:
+            names = (self.instrument,) if isinstance(self.instrument, str) else self.instrument
+            object.__setattr__(self, "instrument", tuple(names))
         # All constants of a helicopter are of one sign; derivatives of an aircraft, say, are not.
         # So is what the model says is positive; delays and gains of devices around it are not.
         positive = set(self.model.positive)
@@ -205,6 +215,11 @@ class Problem:
 
 def _check_method(problem: Problem) -> None:
     model = problem.model
+    if problem.instrument and not estimator_of(problem.method).by_instrument:
+        raise ValueError(
+            f"instrument: method {problem.method} takes no input by an instrument, expected "
+            "frequency-error, or none"
+        )
     if not estimator_of(problem.method).process_noise:
         return
     if model.noise_intensity is None:

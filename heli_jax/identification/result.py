@@ -1,17 +1,20 @@
 """What a fit gives: plain data."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
-from heli_jax.identification.methods import METHODS
+from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
+from heli_jax.identification.validation.closed_loop_trust import Moved, untrusted
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
@@ -138,15 +141,28 @@ class Fit:
     """whether the model explains what was measured, judged against what"""
     coloured: bool = False
     """whether `sd` and the intervals allow for autocorrelated (coloured) residuals"""
+    responses: ResponseAgreement | None = None
+    """frequency-response: how the model's responses agree with the measured ones"""
     feedback: tuple[Feedback, ...] = ()
     """by flight and input, whether it follows the response"""
+    moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
+    """frequency error without an instrument: by parameter what feedback may have done to it"""
+    instruments: tuple[str, ...] = ()
+    """the inputs that were taken by their instrument"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
     @property
     def method_label(self) -> str:
         """The method as reports call it."""
-        return METHODS[self.method].label
+        label = METHODS[self.method].label
+        by = ", ".join(self.instruments)
+        return f"{label} by instrument ({by})" if by else label
+
+    @property
+    def untrusted(self) -> tuple[str, ...]:
+        """The parameters that feedback may have biased."""
+        return untrusted(self.moved_by_feedback, self.feedback)
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
@@ -187,7 +203,8 @@ class Fit:
     @property
     def overconfident(self) -> bool:
         """Whether the intervals are too narrow: coloured residuals that nothing allows for."""
-        return not self.white and not self.coloured
+        spectrum = estimator_of(self.method).noise_spectrum
+        return not self.white and not self.coloured and not spectrum
 
     @property
     def narrow(self) -> bool:

@@ -8,12 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from heli_jax.analysis.response_agreement import USUAL_J, ResponseAgreement
 from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.flights.write import stacked, write_table
 from heli_jax.identification.equation_error.baseline import Baseline
+from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Estimate, Fit, Signals
 from heli_jax.identification.identifiability.verdict import Verdict
+from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
@@ -23,6 +26,9 @@ from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEA
 from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report.card import card
+from heli_jax.report.fitted_responses import FittedResponses
+from heli_jax.report.handling_json import handling_json
+from heli_jax.report.method_content import frequency_start_content, methods_content
 from heli_jax.versions import versions
 
 
@@ -33,6 +39,10 @@ class SupplementaryAnalyses(NamedTuple):
     intervals: Intervals | None = None
     findings: tuple[Finding, ...] = ()
     """whether the log is enough, as it was before the fit"""
+    methods: MethodComparison | None = None
+    """further methods beside the fit's own"""
+    responses: FittedResponses | None = None
+    """of the model and of the flights, with their handling qualities"""
 
 
 def fit_json(
@@ -55,6 +65,7 @@ def fit_json(
             "status": fit.status,
             "model": fit.model,
             "method": fit.method,
+            "instruments": list(fit.instruments),
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
             "adequate": None if adequate_unjudged(fit) else fit.adequate,
@@ -72,6 +83,7 @@ def fit_json(
             **_metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],
             "models": _choice(supplementary.choice),
+            "methods": methods_content(supplementary.methods),
             "intervals": _intervals(supplementary.intervals),
             "record": [f._asdict() for f in supplementary.findings],
             "log_likelihood": fit.log_likelihood,
@@ -81,8 +93,13 @@ def fit_json(
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             **_residuals(fit),
+            "responses": _responses(fit.responses),
             "baseline_rls": _baseline(baseline),
+            "handling_qualities": handling_json(
+                supplementary.responses.handling if supplementary.responses else ()
+            ),
             "equation_error_start": _first_guess(problem),
+            "frequency_error_start": frequency_start_content(problem),
             "starts": [row._asdict() for row in fit.starts],
             "steps": fit.steps,
             "notes": list(fit.notes),
@@ -101,6 +118,20 @@ def _residuals(fit: Fit) -> dict[str, Any]:
     return {
         "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
+        "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
+        "untrusted": list(fit.untrusted),
+    }
+
+
+def _responses(agreement: ResponseAgreement | None) -> dict[str, Any] | None:
+    """Measured frequency responses and the model's, where these were fitted."""
+    if agreement is None:
+        return None
+    return {
+        **agreement._asdict(),
+        "averages": dict(agreement.averages),
+        "pairs": [p._asdict() for p in agreement.pairs],
+        "usual_J": USUAL_J,
     }
 
 
@@ -109,7 +140,7 @@ def _first_guess(problem: Problem) -> dict[str, Any] | None:
     guess = problem.first_guess
     # Not the fit's own `starts`: here stands how the first of them was found, with the noise's bias
     # that such values have.
-    if guess is None:
+    if not isinstance(guess, EquationErrorStart):
         return None
     selection = guess.selection
     return {
@@ -198,13 +229,16 @@ def whiteness_note(fit: Fit) -> str:
         return ""
     # By the correlation at one sample, which is the number that the sentence gives.
     worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
-    what = estimator_of(fit.method).errors
+    estimator = estimator_of(fit.method)
+    what, better = estimator.errors, fit.disturbable and not estimator.noise_spectrum
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
             "residuals' autocorrelation"
-            + (", which filter-error would use for a better estimate." if fit.disturbable else ".")
+            + (", which filter-error would use for a better estimate." if better else ".")
         )
+    elif estimator_of(fit.method).noise_spectrum:
+        consequence = "The intervals allow for it: the noise's spectrum is estimated."
     else:
         # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
         # samples.

@@ -15,6 +15,7 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.report import card, figures, style, tables
 from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import FittedFlight
 from heli_jax.report.page import filled
 from heli_jax.vehicle import Constant
@@ -30,6 +31,9 @@ _CAPTIONS = {
     "noise 99 % of the lags lie within the band.",
     "bode": "Magnitude and phase of the fitted model, of the recursive least squares where there "
     "are some, and of the record where its coherence allows.",
+    "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
+    "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
+    "did not notice (Wood and Hodgkinson, 1980).",
     "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
     "starts": "The misfit that each start of the optimiser reached, best first.",
     "rls": "Each coefficient while the record goes by: one to be trusted settles.",
@@ -56,6 +60,16 @@ class Picture(NamedTuple):
     title: str
     data: str
     """SVG in base64"""
+
+    @property
+    def alt(self) -> str:
+        """What a reader who does not see the figure is told."""
+        if self.name.startswith("match"):
+            return (
+                f"{self.title}: Bode plot of both with intervals, coherence, and the error between "
+                "them within the envelopes of mismatch"
+            )
+        return self.title
 
     @property
     def caption(self) -> str:
@@ -106,8 +120,9 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     model, drawings = problem.model, {}
     if supplementary.intervals is not None:
         drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
-    shown = fit.signals[:MOST_FLIGHTS]
-    for s, part in zip(shown, _parts([s.flight for s in fit.signals]), strict=False):
+    parts = _parts([s.flight for s in fit.signals])
+    for i in _drawn([s.hold_out for s in fit.signals]):
+        s, part = fit.signals[i], parts[i]
         for output in s.measured:
             drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
             # The fit did nothing to make the residuals of a flight held out white.
@@ -117,12 +132,23 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
                 )
     if fit.signals[0].inputs:
         drawings["bode"] = _bode(fit, problem, baseline)
+    for pair in supplementary.responses.pairs if supplementary.responses else ():
+        drawings[f"match_{pair.output}-{pair.input}"] = _match(pair, analysis)
     if len(fit.verdict.names) > 1:
         drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
     drawings["starts"] = _drawing(figures.waterfall, fit.starts)
     if baseline is not None:
         drawings["rls"] = _drawing(figures.rls_history, baseline)
     return drawings
+
+
+def _drawn(hold_out: list[bool]) -> list[int]:
+    """Which flights get figures: where there are too many, not only the fitted ones, which come
+    first, but half of them held out."""
+    held = [i for i, out in enumerate(hold_out) if out][: MOST_FLIGHTS // 2]
+    fitted = [i for i, out in enumerate(hold_out) if not out][: MOST_FLIGHTS - len(held)]
+    rest = [i for i in range(len(hold_out)) if i not in {*held, *fitted}]
+    return sorted([*fitted, *held, *rest[: MOST_FLIGHTS - len(held) - len(fitted)]])
 
 
 def _parts(flights: list[str]) -> list[str]:
@@ -158,6 +184,15 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     return _drawing(figures.bode, flight, baseline)
 
 
+def _match(pair: FittedPair, analysis: Analysis) -> Draw:
+    responses = analysis.supplementary.responses
+    assert responses is not None
+    about = f"model linearised about {responses.about}" if responses.about else "continuous model"
+    note = f"{about}; data without the hold of the input, flights together"
+    unit = figures.bode_unit(analysis.problem.model, pair.output, pair.input)
+    return _drawing(figures.match, pair, unit, note)
+
+
 def render(
     analysis: Analysis,
     title: str,
@@ -191,17 +226,20 @@ def render(
         nuisances=tables.nuisances(fit),
         combinations=tables.combinations(fit),
         agreement=tables.agreement(fit, baseline),
+        fitted_to=tables.responses(fit),
         supplementary=supplementary,
         choice=tables.choice(supplementary.choice) if supplementary.choice else None,
         intervals=tables.intervals(supplementary.intervals, fit)
         if supplementary.intervals
         else None,
+        methods=tables.methods(supplementary.methods) if supplementary.methods else None,
         acceptance=tables.acceptance(lines),
         summary=card.summary(lines),
         residuals=tables.residuals(fit, problem),
         verdict=tables.verdict(fit),
         starts=tables.starts(fit),
         guess=problem.first_guess,
+        guess_method=tables.start_method(problem.first_guess) if problem.first_guess else "",
         first_guess=tables.first_guess(problem.first_guess) if problem.first_guess else None,
         selection=tables.selection_steps(problem.first_guess) if problem.first_guess else None,
         ratios=tables.baseline_ratios(fit, baseline) if baseline else None,
@@ -210,6 +248,13 @@ def render(
         constants=tables.constants(problem, vehicle_constants),
         versions=tables.pairs(versions()),
         timing=tables.pairs(fit.timing, " s"),
+        responses=supplementary.responses,
+        handling=tables.handling(
+            supplementary.responses.handling if supplementary.responses else ()
+        ),
+        handling_sentences=tables.handling_sentences(
+            supplementary.responses.handling if supplementary.responses else ()
+        ),
         unshown=max(0, len(fit.signals) - MOST_FLIGHTS),
         pictures={group: [p for p in pictures if p.name.startswith(group)] for group in _GROUPS},
         NOT_DETERMINED=tables.NOT_DETERMINED,

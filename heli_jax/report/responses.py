@@ -3,12 +3,13 @@
 import base64
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.flight_responses import FlightResponses, Pair, Wanted
 from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.flights.write import write_table
@@ -17,27 +18,39 @@ from heli_jax.numbers import number
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.responses import draw_response
+from heli_jax.report.handling_json import handling_json
 from heli_jax.report.page import filled
+from heli_jax.report.tables.handling import handling as handling_table
+from heli_jax.report.tables.handling import handling_sentences
 
 _DB = 20.0 / np.log(10.0)
 
 
 def write_responses(
-    directory: Path, found: FlightResponses, units: Mapping[str, str], title: str
+    directory: Path,
+    found: FlightResponses,
+    units: Mapping[str, str],
+    title: str,
+    handling: Sequence[Handling] = (),
 ) -> None:
-    """Write responses.nc, responses.csv, transfer_functions.json, figures/ and responses.html.
+    """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json,
+    figures/ and responses.html.
 
     Args:
         directory: exists.
         found: the responses.
         units: SI, of inputs and outputs by name.
         title: of the page.
+        handling: what the data say of handling qualities.
     """
     write_table(directory / "responses.csv", table(found))
     _write_netcdf(directory / "responses.nc", found, units)
     fits = [_content(*fit) for fit in found.fits]
     (directory / "transfer_functions.json").write_text(
         json.dumps(fits, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
+    (directory / "handling_qualities.json").write_text(
+        json.dumps(handling_json(handling), indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
     (directory / "figures").mkdir()
     pictures = []
@@ -59,6 +72,8 @@ def write_responses(
             for w, fit in found.fits
         ],
         window=f"{found.window:g}",
+        handling=handling_table(handling),
+        handling_sentences=handling_sentences(handling),
     )
     (directory / "responses.html").write_text(page, encoding="utf-8")
 

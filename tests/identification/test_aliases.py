@@ -51,3 +51,10 @@ def test_an_aliased_optimum_is_neither_determined_nor_adequate():
     [rate, *_] = judged_again(asked, (), found.params, found.reached.noise.sd)
     assert rate.severity == "refuse"
     assert "cannot show it" in rate.sentence
+
+
+def test_a_swing_far_past_the_samples_is_not_excused_for_being_over_within_one():
+    far = {"k": 1e8, "d": 3.0 / DT, "b": 1e8}
+    every = {n: Free(v) for n, v in ALIAS.items()}
+    [mode] = fast_modes(problem(flight(), **every), far, SD)
+    assert mode.undetermined == ("k",)

@@ -85,7 +85,9 @@ def test_three_parameters_are_no_more_identifiable_by_another_method(differences
 
 def test_an_unknown_method_is_refused_with_the_known_ones():
     with pytest.raises(
-        ValueError, match=r"expected one of output-error, filter-error, frequency-error, got 'x'"
+        ValueError,
+        match="expected one of output-error, filter-error, frequency-error, frequency-response, "
+        "got 'x'",
     ):
         Problem(
             models.roll_on_stand, vehicle(BENCH), [record(BENCH, seed=3, n=1500)],

@@ -1,13 +1,30 @@
 """Frequency error: the identity it rests on, estimates and intervals, and what it refuses."""
 
+import dataclasses
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 
-from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
-from heli_jax.identification.estimation.frequency_error import smoothed
-from tests.identification.bench import BENCH, record, vehicle
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models, naming, simulate
+from heli_jax.dynamics.linearised import point
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_records import cut_notes
+from heli_jax.identification.estimation.frequency_spectrum import smoothed
+from heli_jax.identification.estimation.linearised_flights import linear_drive
+from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.estimation.simulated_flights import Drive
+from heli_jax.identification.frequency_start import _value, frequency_error_start, started
+from heli_jax.identification.method_comparison import MethodComparison, MethodResult, _why_none
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import layout_of
+from heli_jax.report.method_content import methods_content
+from heli_jax.report.tables import first_guess, methods
+from tests.identification.bench import BENCH, denominators, record, steps, vehicle
 
 DT = 0.02
 FALLING = """
@@ -56,13 +73,20 @@ def test_the_identity_holds_for_stable_and_unstable_machines(growth, hold):
     np.testing.assert_allclose(left, X, atol=1e-12 * np.max(np.abs(X)) * n)
 
 
-def test_estimates_are_those_of_output_error_in_white_noise():
+FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
+
+
+@pytest.fixture(scope="module")
+def by():
+    """The same record by two methods."""
     flight = record(BENCH, seed=3, n=3000)
-    free = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
-    by = {
-        method: fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], free, method=method))
+    return {
+        method: fit(Problem(models.roll_on_stand, vehicle(BENCH), [flight], FREE, method=method))
         for method in ("output-error", "frequency-error")
     }
+
+
+def test_estimates_are_those_of_output_error_in_white_noise(by):
     assert by["frequency-error"].status == "converged"
     for name, one in by["frequency-error"].estimates.items():
         other = by["output-error"].estimates[name]
@@ -122,16 +146,175 @@ def test_the_noise_spectrum_of_two_outputs_is_found():
     np.testing.assert_allclose(S[middle, 1, 1].real, slow[middle], rtol=0.25)
 
 
-def test_what_it_cannot_do_is_refused_with_what_can():
-    flight = record(BENCH, seed=3, n=1500)
+def with_holes(flight: Flight, *holes: slice, **more) -> Flight:
     roll = flight.outputs["roll"].copy()
-    roll[7] = np.nan
-    gap = Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, name="first")
-    with pytest.raises(ValueError, match="first: output roll has 1 missing samples"):
-        Problem(
-            models.roll_on_stand, vehicle(BENCH), [gap], {"Ixx": Free(0.03)},
-            method="frequency-error",
-        )  # fmt: skip
+    for hole in holes:
+        roll[hole] = np.nan
+    return Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll}, **more)
+
+
+def problem_of(*flights: Flight, nuisance: Nuisance = Nuisance(), **free: Free) -> Problem:
+    frees = free or {"Ixx": Free(0.035), "kappa": Free(7.0)}
+    return Problem(
+        models.roll_on_stand, vehicle(BENCH), flights, frees, nuisance, method="frequency-error"
+    )
+
+
+HOLES = slice(700, 701), slice(1200, 1260), slice(1290, 1500)
+
+
+def test_a_flight_is_cut_at_its_missing_samples():
+    """Of SciPy's noiseless record the model's error is nothing but rounding in each part."""
+    exact = with_holes(record(BENCH, seed=3, n=1500, noise=0.0), *HOLES)
+    still = Nuisance(initial_state=False, bias=False)
+    problem = problem_of(exact, nuisance=still, Ixx=Free(BENCH["Ixx"]))
+    layout = layout_of(problem, problem.training)
+    assert layout.of_flights[0].parts == ((0, 700), (701, 1200))
+    data, noise = data_of(problem, problem.training, layout), first_noise(problem, [exact])
+    at_truth = start_vector(layout, data, problem)
+    lines = errors_of_lines(layout, data, noise, at_truth)
+    assert [len(one) for one in lines] == [349, 249]
+    np.testing.assert_allclose(np.concatenate(lines), 0.0, atol=1e-10)
+    [note] = cut_notes(layout, data)
+    assert "23.98 of 30 s are used, in 2 parts" in note
+
+
+@pytest.mark.slow
+def test_estimates_of_a_flight_that_was_cut():
+    noisy = with_holes(record(BENCH, seed=3, n=1500), *HOLES)
+    found = fit(problem_of(noisy, with_holes(noisy, slice(3, 500, 2), hold_out=True)))
+    assert found.status == "converged"
+    assert any("23.98 of 30 s" in note for note in found.notes)
+    for name, one in found.estimates.items():
+        assert one.lower95 < BENCH[name] < one.upper95
+    # A flight held out is predicted in time, with an initial state and a bias of its own.
+    assert found.validation["roll"].vaf > 0.999
+
+
+def test_an_output_that_is_sparse_throughout_is_refused():
+    whole = record(BENCH, seed=3, n=1500)
+    sparse = with_holes(whole, *(slice(k, None, 5) for k in range(1, 5)), name="first")
+    with pytest.raises(ValueError, match=r"first: output roll lacks 80 % .* lower flights\[\]"):
+        problem_of(sparse)
+
+
+def test_a_fit_in_time_begins_at_the_estimate_in_frequency():
+    """A stand that swings 60 times in the record, every start four times too small: by itself the
+    simulation loses count."""
+    swinging = {**BENCH, "zeta": 0.02, "kappa": 40.0}
+    free = {n: Free(0.25 * swinging[n]) for n in FREE}
+    flight = record(swinging, seed=3, n=3000)
+    problem = Problem(models.roll_on_stand, vehicle(swinging), [flight], free)
+    guess = frequency_error_start(problem)
+    begun = started(problem, guess)
+    for name, value in guess.values.items():
+        assert value.origin == "frequency error"
+        assert value.value == pytest.approx(swinging[name], rel=0.01)
+        assert begun.free[name].start == value.value
+    found = fit(begun)
+    assert found.status == "converged"
+    assert found.starts[0].steps < 5
+    assert "Start by frequency error of Ixx, If, kappa" in guess.sentences[0]
+    assert [row[3] for row in first_guess(guess).rows] == ["frequency error"] * 3
+    # What is not determined begins as it was stated.
+    assert _value(found.estimates["Ixx"]._replace(sd=None), "not-identifiable", 0.5).value == 0.5
+
+
+def test_methods_are_laid_side_by_side(by):
+    main, other = by["output-error"], by["frequency-error"]
+    stuck = dataclasses.replace(main, status="not-converged", notes=("The optimiser stopped.",))
+    results = (
+        MethodResult("output-error", main, "", 1.0),
+        MethodResult("frequency-error", other, "", 0.5),
+        MethodResult("filter-error", None, "there is no disturbance", 0.0),
+    )
+    compared = MethodComparison(results)
+    a, b = main.estimates["If"], other.estimates["If"]
+    apart = (b.value - a.value) / (a.sd**2 + b.sd**2) ** 0.5
+    assert compared.difference(results[1], "If") == pytest.approx(apart, rel=1e-12)
+    assert compared.sentences == (
+        "filter error has no numbers: there is no disturbance",
+        "frequency error and output error agree within 2 joint standard deviations in Ixx, If, "
+        "kappa.",
+    )
+    rows = methods(compared).rows
+    assert [row[0] for row in rows] == ["Ixx", "If", "kappa", "verdict", "time"]
+    assert rows[3] == ("verdict", "converged, adequate", "converged, adequate", "", "refused", "")
+    assert rows[0][4:] == ("–", "–")
+    written = methods_content(compared)["results"]
+    assert written["frequency-error"]["difference_joint_sd"]["If"] == pytest.approx(apart)
+    assert written["filter-error"]["reason"] == "there is no disturbance"
+    moved = {**other.estimates, "If": b._replace(value=a.value + 5.0 * (a.sd**2 + b.sd**2) ** 0.5)}
+    away = results[1]._replace(fit=dataclasses.replace(other, estimates=moved))
+    assert "differ in If by 5.0 joint" in MethodComparison((results[0], away)).sentences[0]
+    assert _why_none(stuck) == "The optimiser stopped."
+
+
+def hardening(p, s, u):
+    """The stand's spring with a cubic part."""
+    rates = models.roll_on_stand.vector_field(p, s, u)
+    return naming.replace(rates, dphi=rates.dphi - p.kappa * CUBIC * s.phi**3)
+
+
+CUBIC = 20.0
+HARD = dataclasses.replace(
+    models.roll_on_stand, name="hard spring", vector_field=hardening, linear=False
+)
+
+
+def deflected(kappa: float, moment: float) -> float:
+    """The angle at which a spring kappa (phi + CUBIC phi^3) holds a moment."""
+    roots = np.roots([kappa * CUBIC, 0.0, kappa, -moment])
+    return float(roots[np.abs(roots.imag) < 1e-9].real[0])
+
+
+def stuck_out(seed: int) -> Problem:
+    """A record about the deflection that the mean of the stick makes."""
+    rng = np.random.default_rng(seed)
+    stick = 0.8e-6 + steps(rng, 1500, DT, 0.1e-6)
+    begin = HARD.State(phi=deflected(4.0, held(stick)), dphi=0.0, beta_roll=0.0, dbeta_roll=0.0)
+    inputs = HARD.Inputs(x_roll=jnp.asarray(stick))
+    run = simulate(HARD, vehicle(BENCH), inputs, dt=DT, initial_state=begin)
+    roll = np.asarray(run.outputs.roll) + 1e-3 * rng.standard_normal(1500)
+    flight = Flight(dt=DT, inputs={"x_roll": stick}, outputs={"roll": roll})
+    # An offset of the stick would move the point, and with it the stiffness: no line tells the two.
+    known = Nuisance(input_offset=False)
+    free = {"Ixx": Free(0.03), "kappa": Free(5.0)}
+    return Problem(HARD, vehicle(BENCH), [flight], free, known, method="frequency-error")
+
+
+def held(stick: np.ndarray) -> float:
+    """The moment over the inertia that the mean of the stick makes at rest."""
+    return denominators(BENCH, True)[0][2] / BENCH["Omega"] ** 2 * float(stick.mean())
+
+
+def test_the_point_of_linearisation_moves_with_the_parameters():
+    problem = stuck_out(3)
+    layout, stick = layout_of(problem, problem.training), problem.flights[0].inputs["x_roll"]
+
+    def angle(kappa):
+        params = naming.replace(vehicle(BENCH), kappa=kappa)
+        drive = Drive(params, HARD.Inputs(x_roll=jnp.asarray(stick)), DT, None)
+        _, drive, rest = linear_drive(layout, drive, None)
+        return point(HARD, drive.params)[0].phi, rest
+
+    (phi, rest), slope = jax.jvp(eqx.filter_jit(angle), (jnp.asarray(4.0),), (jnp.asarray(1.0),))
+    assert rest
+    assert float(phi) == pytest.approx(deflected(4.0, held(stick)), rel=1e-6)
+    by_hand = (deflected(4.001, held(stick)) - deflected(3.999, held(stick))) / 0.002
+    assert float(slope[0]) == pytest.approx(by_hand, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_model_that_is_not_linear_is_linearised_where_it_flies():
+    found = fit(stuck_out(3))
+    assert found.status == "converged"
+    for name, one in found.estimates.items():
+        assert one.lower95 < BENCH[name] < one.upper95
+    said = " ".join(found.notes)
+    assert "linearised about the equilibrium at the mean of its inputs" in said
+    assert "What the linear model leaves out moves" in said, said
+    assert "doubtful" not in said, said
 
 
 @pytest.mark.slow

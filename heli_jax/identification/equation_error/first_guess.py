@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple
 
 from heli_jax.identification.equation_error.stepwise import Selection
 
-Origin = Literal["equation error", "as stated", "vehicle", "not selected"]
+Origin = Literal["equation error", "frequency error", "as stated", "vehicle", "not selected"]
 
 
 class StartValue(NamedTuple):
@@ -12,11 +12,12 @@ class StartValue(NamedTuple):
 
     value: float
     sd: float | None
-    """standard error of the regression, without its bias; None where the value is not from it"""
+    """standard error of the regression, without its bias, or that of frequency error; None where
+    the value is from neither"""
     unit: str
     origin: Origin
     reason: str
-    """why it is not from the regression; empty where it is"""
+    """why it is not from the regression or from frequency error; empty where it is"""
 
 
 class Equation(NamedTuple):

@@ -7,6 +7,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.initial_guess import start_vector
@@ -33,6 +34,8 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     def column(values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
 
+    by = estimator_of(problem.method).instrumented(problem, flights)
+    follows = [None] * len(flights) if by is None else by
     numbers = Data(
         base={n: np.asarray(v, dtype) for n, v in naming.asdict(problem.vehicle).items()},
         sign=column([coordinates.sign_or_scale(f) for f in frees]),
@@ -42,7 +45,9 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
         # An infinite sd in place of a missing prior: its row is zero, and problems that differ in
         # their priors share one compiled program.
         prior_sd=column([f.prior.sd if f.prior else np.inf for f in frees]),
-        flights=tuple(_flight_data(problem, f, dtype) for f in flights),
+        flights=tuple(
+            _flight_data(problem, f, dtype, u) for f, u in zip(flights, follows, strict=True)
+        ),
         push_scales={n: np.asarray(v, dtype) for n, v in sorted(problem.push_scales.items())},
     )
     # Once, instead of with every call of a compiled program.
@@ -52,9 +57,16 @@ def data_of(problem: Problem, flights: tuple[Flight, ...], layout: Layout | None
     return _with_state_scales(problem, layout or layout_of(problem, flights), numbers)
 
 
-def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightData:
+def _flight_data(
+    problem: Problem, flight: Flight, dtype: np.dtype, follows: dict[str, np.ndarray] | None
+) -> FlightData:
+    """`follows`: by input what of it follows the instruments."""
     model = problem.model
-    inputs = {n: np.asarray(flight.inputs[n], dtype) for n in naming.names(model.Inputs)}
+
+    def arrays(by_name: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {n: np.asarray(by_name[n], dtype) for n in naming.names(model.Inputs)}
+
+    inputs = arrays(flight.inputs)
     # By name, as JAX orders them in everything that is compiled.
     outputs = {n: np.asarray(y, dtype) for n, y in sorted(flight.outputs.items())}
     return FlightData(
@@ -70,6 +82,7 @@ def _flight_data(problem: Problem, flight: Flight, dtype: np.dtype) -> FlightDat
             n: np.asarray(10.0 * _size(y[np.isfinite(y)]), dtype) for n, y in outputs.items()
         },
         offset_scale={n: np.asarray(10.0 * _motion(u), dtype) for n, u in inputs.items()},
+        by_instrument=None if follows is None else model.Inputs(**arrays(follows)),
     )
 
 

@@ -9,12 +9,13 @@ rows are something else says what follows from them.
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.simulated_flights import Run
@@ -40,6 +41,8 @@ class Evaluation(NamedTuple):
     """values of the named unknowns, in their units"""
     slopes: np.ndarray
     """their derivatives by their own coordinates"""
+    z: np.ndarray
+    """(q,) where it is"""
 
 
 class Residuals(NamedTuple):
@@ -69,10 +72,22 @@ class Estimator(abc.ABC):
     rows_are_samples: ClassVar[bool] = True
     """whether the first rows are the samples in time of every signal, flight after flight and
     output after output: then their autocorrelation can be allowed for"""
+    rows_by_flight: ClassVar[bool] = True
+    """whether each row of the measurements is of one flight"""
+    noise_spectrum: ClassVar[bool] = False
+    """whether the noise's spectrum is estimated, so that intervals hold where residuals in time are
+    not white; rows are then numbers at frequencies, of no sample and maybe of no flight"""
+    fits_responses: ClassVar[bool] = False
+    """whether frequency responses are what is fitted, as `Problem.frequency` says"""
+    nuisances_in_rows: ClassVar[bool] = True
+    """whether initial states and biases have a part in the rows: else the simulation in time has
+    them found by themselves"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
+    by_instrument: ClassVar[bool] = False
+    """whether it can take inputs by their instrument (`Problem.instrument`)"""
 
     @abc.abstractmethod
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -108,6 +123,26 @@ class Estimator(abc.ABC):
         """
         return None
 
+    def of_flights(self, problem: Problem, flights: Sequence[Flight]) -> tuple[Any, ...]:
+        """By flight what the method has to know of it before anything is traced; hashable.
+
+        Args:
+            problem: what is fitted.
+            flights: those of a layout, in its order.
+        """
+        return ()
+
+    def instrumented(
+        self, problem: Problem, flights: Sequence[Flight]
+    ) -> tuple[dict[str, np.ndarray], ...] | None:
+        """By flight and input what of it follows the instruments (N,), SI; None without any.
+
+        Args:
+            problem: says which instruments are used.
+            flights: those of a layout, in its order.
+        """
+        return None
+
     def prepared(self, noise: Noise, flights: Sequence[Flight]) -> Noise:
         """The first guess of the noise as the method needs it.
 
@@ -116,6 +151,26 @@ class Estimator(abc.ABC):
             flights: those fitted.
         """
         return noise
+
+    def as_it_ends(self, data: Data, noise: Noise) -> Noise:
+        """The noise to ask at the start values what a fit may determine, where a search begins by
+        other equations than it ends with.
+
+        Args:
+            data: the numbers of the problem.
+            noise: to begin with.
+        """
+        return noise
+
+    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """`prepared` where the method asks more of the problem than its flights.
+
+        Args:
+            problem: what is fitted.
+            noise: standard deviations by flight and output.
+            flights: those fitted, or those held out.
+        """
+        return self.prepared(noise, flights)
 
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level about which the likelihood is laid out in rows.
@@ -254,6 +309,16 @@ class Estimator(abc.ABC):
             at += y.shape[0]
         return total
 
+    def numbers(self, layout: Layout, data: Data, noise: Noise) -> int:
+        """How many independent numbers the noise is estimated from.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: that the rows are divided by.
+        """
+        return measured_count(data)
+
     @abc.abstractmethod
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """By flight and output what is measured but for bias and noise, (N,), or (runs, N) where
@@ -290,6 +355,19 @@ class Estimator(abc.ABC):
             sd: of the measurement noise, SI, by 'flight/output'.
         """
         return False
+
+    def response_agreement(
+        self, layout: Layout, data: Data, noise: Noise, z: Array
+    ) -> ResponseAgreement | None:
+        """How model and measured frequency responses agree, where these are what is fitted.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: at the optimum.
+            z: the unknowns.
+        """
+        return None
 
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool

@@ -28,13 +28,16 @@ def evaluate(layout: Layout, data: Data, noise: Noise, z: Float[Array, " q"]) ->
     # Output error has simulated on its way; a filter predicts one step ahead, which is no run.
     outputs = simulated_at(layout, data, z) if at.simulated is None else at.simulated
     # Fetched all at once: every fetch by itself would wait for the device.
-    outputs, *rest = jax.device_get((outputs, at.innovations, at.r, at.J, *_named(layout, data, z)))
+    outputs, innovations, r, J, named, slopes = jax.device_get(
+        (outputs, at.innovations, at.r, at.J, *_named(layout, data, z))
+    )
     simulated = with_biases(layout, outputs)
     raw = tuple(
         {n: np.asarray(flight.outputs[n]) - v for n, v in run.items()}
         for flight, run in zip(data.flights, simulated, strict=True)
     )
-    return Evaluation(simulated, raw, outputs.state_rms, *rest)
+    rms = outputs.state_rms
+    return Evaluation(simulated, raw, rms, innovations, r, J, named, slopes, np.asarray(z))
 
 
 def simulated_outputs(

@@ -215,7 +215,7 @@ class Search:
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i in range(points.shape[0]):
-            optimum = optimise(layout, self.data, noise, points[i], self.max_steps)
+            optimum = optimise(layout, self.data, noise, points[i], self.max_steps, held=self._held)
             # z stays on the device, from where the next program takes it.
             run = jax.device_get(optimum)._replace(z=optimum.z)
             if not bool(run.converged) and layout.estimator.least_squares:
@@ -226,6 +226,16 @@ class Search:
             if progress is not None and points.shape[0] > 1:
                 progress(f"{i + 1} of {points.shape[0]} starts done")
         return runs
+
+    @property
+    def _held(self) -> np.ndarray | None:
+        """What the optimiser leaves where it is."""
+        layout = self.layout
+        # Their weak priors alone would lead the initial states to zero: for a machine that is not
+        # linear, with a rotor that stands still, a place from which no search in time comes back.
+        if layout.model.linear or layout.estimator.nuisances_in_rows:
+            return None
+        return np.arange(layout.size) >= layout.first_nuisance
 
     def _arrived(self, layout: Layout, noise: Noise, run: Optimum) -> Optimum:
         """A run with several disturbances, gone on with until no step would gain anything.

@@ -99,7 +99,8 @@ def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:
         {n: np.asarray(flight.sd.get(n) or guess[n], dtype) for n in sorted(flight.outputs)}
         for flight, guess in zip(flights, guesses, strict=True)
     )
-    return estimator_of(problem.method).prepared(Noise(sd, np.zeros((), dtype)), flights)
+    noise = Noise(sd, np.zeros((), dtype))
+    return estimator_of(problem.method).prepared_for(problem, noise, flights)
 
 
 def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> RelaxedOptimum:

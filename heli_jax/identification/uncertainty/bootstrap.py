@@ -46,6 +46,11 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     at = fit.reached
     if at.layout.shift:
         raise ValueError("bootstrap: not available with a free time shift")
+    if at.layout.estimator.noise_spectrum:
+        raise ValueError(
+            f"bootstrap: not available with method {fit.method}, which estimates the noise's "
+            "spectrum"
+        )
     if fit.not_identifiable:
         raise ValueError(f"bootstrap: the data do not determine {', '.join(fit.not_identifiable)}")
     rng = np.random.default_rng(seed)

@@ -9,7 +9,6 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
 from heli_jax.identification.identifiability.sensitivity import verdict_of
 from heli_jax.identification.identifiability.verdict import Z95, Verdict
 from heli_jax.identification.problem import Problem
@@ -57,13 +56,15 @@ def standard_errors(
     usable = bool(np.all(np.isfinite(e.J)))
     verdict = verdict_of(problem, layout, e, aliased=aliased) if usable else before
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
-    freedom = max(measured_count(at.data) - layout.determined, 1)
+    freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
     quantiles = np.full(layout.size, quantile)
     # Rows that are dependent under white noise too say nothing by the residuals' whiteness.
     white = white and estimator.rows_are_white
     if white or not (usable and estimator.rows_are_samples):
-        return StandardErrors(verdict, np.ones(layout.size), quantiles, False)
+        # Weighed by the noise's own spectrum, the bound allows for it as it stands.
+        allowed = usable and not white and estimator.noise_spectrum
+        return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
     errors = sandwich(layout, at.data, e, residual_curvature(layout, at.data, at.noise, at.z))
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)

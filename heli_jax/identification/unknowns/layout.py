@@ -53,6 +53,8 @@ class FlightData(NamedTuple):
     """sd of the weak prior on the bias"""
     offset_scale: dict[str, Any]
     """sd of the weak prior on the offset of each input"""
+    by_instrument: Any = None
+    """the model's Inputs, arrays (N,): what of the inputs follows the instruments; None without"""
 
 
 class Data(NamedTuple):
@@ -106,6 +108,8 @@ class Layout(eqx.Module):
     """by flight what each of the model's inputs does between samples (`Flight.hold`)"""
     one_covariance: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     """filter error: groups of flights that share the covariances of one Kalman filter"""
+    of_flights: tuple[Any, ...] = eqx.field(static=True, default=())
+    """by flight what the method takes of it before anything is traced (`Estimator.of_flights`)"""
 
     @property
     def of_interest(self) -> tuple[str, ...]:
@@ -175,7 +179,10 @@ class Noise(NamedTuple):
     the likelihood is laid out in rows, so that they have variance 1; frequency error: likewise the
     mean over all lines of log det(spectrum)"""
     whitening: Any = ()
-    """frequency error: by flight (K, p, p) what makes white noise of that at its lines; () else"""
+    """frequency error: by record (K, p, p) what makes white noise of that at its lines; () else"""
+    by_instrument: Any = ()
+    """frequency error: 1 where instruments weigh the errors, 0 where the model's own response does,
+    as it does until the search by instrument has somewhere to begin"""
 
 
 class Solution(NamedTuple):
@@ -237,6 +244,7 @@ def layout_of(problem: Problem, flights: tuple[Flight, ...]) -> Layout:
         continuity=problem.continuity,
         holds=tuple(_holds(problem.model, flight) for flight in flights),
         one_covariance=_one_covariance(problem, flights),
+        of_flights=estimator.of_flights(problem, flights),
     )
 
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
@@ -65,6 +66,9 @@ class Adequacy(NamedTuple):
     advice: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     """what looks bad and is as expected"""
+    unexplained: tuple[str, ...] = ()
+    """the outputs of which the model explains no more than chance does of noise, though their
+    residuals are white and others carry the fit"""
     doubts: tuple[str, ...] = ()
     """what forbids to call it adequate, however well it fits"""
 
@@ -87,7 +91,10 @@ class Adequacy(NamedTuple):
         """`yes`, `in size only (the residuals of p are not white)`, or
         `no (VAF of p is -586, less than its mean)`."""
         if self.adequate:
-            return f"in size only ({'; '.join(self._left_over)})" if self.coloured else "yes"
+            words = f"in size only ({'; '.join(self._left_over)})" if self.coloured else "yes"
+            if self.unexplained:
+                words += f", but nothing of {' and '.join(self.unexplained)} is explained"
+            return words
         bad = [output for output in self.judged if not output.adequate]
         words = list(self.doubts) + [
             f"VAF of {output.output} is {output.vaf:.3g}"
@@ -154,6 +161,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     bad = [output for output in outputs if not output.adequate]
     if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
         return _nothing_shown(outputs)
+    unexplained = [o for o in outputs if not disturbed and o.adequate and _of_noise(o, evidence)]
     doubted = [*bad, *(output for output in outputs if output.doubtful)]
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
     apart = len(doubted) < len(outputs)
@@ -169,8 +177,25 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         outputs,
         tuple(_reason(output) for output in bad),
         tuple(dict.fromkeys(advice)),
-        tuple(_as_expected(outputs)),
+        (*_as_expected(outputs), *(_unexplained(output) for output in unexplained)),
+        tuple(output.output for output in unexplained),
     )
+
+
+def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
+    """Whether a model is adequate to measured frequency responses: by the squared errors over their
+    variance, which gusts do not change, while a simulation in time knows nothing of gusts.
+
+    Args:
+        agreement: of the model's responses with the measured ones; None where none were fitted.
+    """
+    if agreement is None:
+        return None
+    misfit = (agreement.misfit,) if agreement.misfit else ()
+    if agreement.doubt:
+        remarks, doubts = agreement.sentences, (agreement.doubt,)
+        return Adequacy(False, False, (), misfit, remarks=remarks, doubts=doubts)
+    return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:
@@ -189,20 +214,30 @@ _BY_CHANCE = 1e-3
 
 
 def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool:
-    """Whether the response of some output stands out of the noise: a likelihood ratio of the model
-    against a constant (Wilks, 1938)."""
+    """Whether the response of some output stands out of the noise."""
+    # One output that stands out is enough: the others may be ones that these inputs do not move.
+    return not outputs or not all(_of_noise(output, evidence) for output in outputs)
+
+
+def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
+    """Whether of an output no more is explained than of noise alone: a likelihood ratio of the
+    model against a constant (Wilks, 1938)."""
     unknowns = evidence.unknowns
-    for output in outputs:
-        measured = _of_all_flights(output.output, evidence.records)
-        n = int(np.isfinite(measured).sum())
-        # Twice the gain in log-likelihood of white noise with unknown variance: n log(1/(1 - VAF)),
-        # which noise alone makes chi-squared with one degree of freedom an unknown.
-        gain = -n * np.log(max(1.0 - output.vaf, 1e-300))
-        # One output that stands out is enough: the others may be ones that these inputs do not
-        # move.
-        if unknowns < 1 or scipy.special.chdtrc(unknowns, max(gain, 0.0)) < _BY_CHANCE:
-            return True
-    return not outputs
+    if unknowns < 1 or not np.isfinite(output.vaf):
+        return False
+    n = int(np.isfinite(_of_all_flights(output.output, evidence.records)).sum())
+    # Twice the gain in log-likelihood of white noise with unknown variance: n log(1/(1 - VAF)),
+    # which noise alone makes chi-squared with one degree of freedom an unknown.
+    gain = -n * np.log(max(1.0 - output.vaf, 1e-300))
+    return bool(scipy.special.chdtrc(unknowns, max(gain, 0.0)) >= _BY_CHANCE)
+
+
+def _unexplained(output: OutputAdequacy) -> str:
+    return (
+        f"The model explains nothing of {output.output} (VAF {output.vaf:.2g}), no more than as "
+        "many unknowns explain of noise alone; the other outputs carry the fit. Its residuals are "
+        "white: either the inputs do not move it, or what the log has there is no measurement."
+    )
 
 
 def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
@@ -221,6 +256,7 @@ def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
             "as much of noise alone.",
         ),
         ("Use larger or more inputs, a longer record, or an output with less noise.",),
+        doubts=("what is said to be determined is so at an optimum of chance",),
     )
 
 

@@ -24,6 +24,9 @@ _MOVED = 1e-6
 _TURNED = 0.2
 """the same of its frequency from which on a parameter can take the mode to an alias; a frequency
 that goes with the parameter's root has 0.5"""
+_SWINGS = 10.0
+"""frequency over decay of a mode that is called a swing, however soon it is over: its cycle is lost
+between the samples, and any other frequency past them fits as well"""
 _STEP = 1e-4
 """relative step of the parameters for these changes"""
 SHOWS = 3.0
@@ -180,8 +183,12 @@ def _of_flight(
         and not _known_otherwise(problem, n)
         and any(
             abs(slope[k].imag) > _TURNED
-            # What is gone within a sample swings in none, under any alias.
-            and -modes.eigenvalues[k].real * flight.dt < 1.0
+            # What is gone within a sample swings in none, under any alias, unless it swings many
+            # times before it is gone: then its frequency was told by nothing.
+            and (
+                -modes.eigenvalues[k].real * flight.dt < 1.0
+                or abs(modes.eigenvalues[k].imag) > -modes.eigenvalues[k].real * _SWINGS
+            )
             and modes.strongest(k, problem, flight, noise)[0] >= SHOWS
             for k in past
         )

@@ -149,6 +149,22 @@ def _tested(flight: Flight, earlier: Mapping[str, float]) -> _Tested | str:
     return _Tested(free, innovations, tuple(inputs), tuple(outputs), steps, dt)
 
 
+def innovations_of(flight: Flight) -> Float[np.ndarray, "N p"] | None:
+    """What a record's own past cannot foretell of its outputs (N, p), 0 where that is not known;
+    None where the record is too short to tell.
+
+    Args:
+        flight: inputs and outputs as measured.
+    """
+    tested = _tested(flight, {})
+    if isinstance(tested, str):
+        return None
+    # Back at the flight's own rate, and before the past is long enough.
+    every = round(tested.dt / flight.dt)
+    values = np.repeat(np.nan_to_num(tested.innovations), every, axis=0)[: flight.n_samples]
+    return np.pad(values, ((0, flight.n_samples - len(values)), (0, 0)))
+
+
 def why_untested(problem: Problem) -> str:
     """Why nothing was tested of any flight, in words; `STEPS` where inputs move in no other way."""
     reasons = {

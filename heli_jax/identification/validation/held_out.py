@@ -10,8 +10,10 @@ from jaxtyping import Array
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate, simulated_outputs
+from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.levenberg_marquardt import optimise
 from heli_jax.identification.estimation.noise_covariance import first_noise
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, layout_of
@@ -48,6 +50,9 @@ def validate(
     """
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
+    # What no line of a spectrum knows, the initial states and biases, shows in time alone.
+    if not other.estimator.rows_are_samples:
+        other = replace(other, estimator=estimator_of("output-error"))
     data = data_of(problem, held, other)
     # From any point a linear model's are found in one step, so zero, the middle of their weak
     # priors, will do.
@@ -57,7 +62,9 @@ def validate(
     full = jnp.concatenate([z[: layout.first_nuisance], begin])
     their_noise = _noise_of(problem, layout, noise, held)
     converged = True
-    if other.size > layout.first_nuisance:
+    if not layout.estimator.nuisances_in_rows:
+        full = in_time(other, data, their_noise, full)
+    elif other.size > layout.first_nuisance:
         adjust = _linear if problem.model.linear else _damped
         full, converged = adjust(other, data, their_noise, full)
     e = evaluate(other, data, their_noise, full)

@@ -177,26 +177,6 @@ def _answer(e: np.ndarray, drive: np.ndarray, lags: int) -> np.ndarray:
     return np.abs(cross_correlation(x, y, lags))
 
 
-def answers(y: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray | None:
-    """Size (2 k + 1,) of the correlation of an output with an input so much before, from -k samples
-    to k, both whitened; None where nothing can be told.
-
-    Args:
-        y: the output (N,), NaN where nothing is measured.
-        u: the input (N,).
-        dt: [s].
-    """
-    lags = _lags(dt)
-    if not np.isfinite(y).all() or y.size < _FEWEST * (lags + _ORDER):
-        return None
-    e, drive = y - y.mean(), u - u.mean()
-    if not (np.std(e) > 0 and np.std(drive) > 0):
-        return None
-    c = _answer(e, drive, lags)
-    by_chance = _BY_CHANCE_AT_MOST / np.sqrt(y.size)
-    return np.where(c > by_chance, c, 0.0)
-
-
 def _lags(dt: float) -> int:
     return max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
 

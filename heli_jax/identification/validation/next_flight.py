@@ -132,6 +132,11 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     # A filter of a nonlinear model would be compiled for every candidate by itself.
     if not (at.layout.estimator.rows_are_samples or at.layout.model.linear):
         return None
+    # Rows that weigh all flights together do not say what one more would add, and those at
+    # frequencies are none of samples.
+    estimator = at.layout.estimator
+    if not estimator.rows_by_flight or estimator.noise_spectrum:
+        return None
     # Of a simulation that diverges there is nothing to compare with.
     if not np.isfinite(e.J).all():
         return None

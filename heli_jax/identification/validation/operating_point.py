@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.analysis.linear import modes
+from heli_jax.analysis.mean_flight import flown, mean_condition
 from heli_jax.analysis.trim import HOVER, Condition, is_full_nonlinear, trim
 from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
@@ -22,9 +23,6 @@ from heli_jax.simulation.simulate import simulate
 from heli_jax.vehicle import of_helicopter
 
 # params, state and inputs are Any: records of a model, whose classes may be a user's own.
-
-_SLOW = 0.5
-"""m/s: a record of less mean speed is of hover"""
 
 
 class OperatingPoint(NamedTuple):
@@ -70,7 +68,7 @@ def operating_point(
     # A trim is a place where the machine can stay; the mean of a record is none, and its matrices
     # would hold accelerations that were only passing.
     if is_full_nonlinear(quiet):
-        at_trim = _trimmed(quiet, params, _condition(outputs, dt))
+        at_trim = _trimmed(quiet, params, mean_condition(outputs, dt))
         if at_trim is not None:
             return at_trim._replace(state=_extended(model, at_trim.state))
     return _mean(model, params, inputs, dt, substeps)
@@ -99,49 +97,13 @@ def modes_of_flight(
 
 def _trimmed(model: Model, params: Any, condition: Condition) -> OperatingPoint | None:
     """The trim at a condition, else in hover; None where there is neither."""
-    for flown in dict.fromkeys((condition, HOVER)):
+    for flight in dict.fromkeys((condition, HOVER)):
         try:
-            steady = trim(model, params, flown)
+            steady = trim(model, params, flight)
         except ValueError:  # the vehicle cannot fly so
             continue
-        return OperatingPoint(steady.state, steady.inputs, f"the trim {_words(flown)}")
+        return OperatingPoint(steady.state, steady.inputs, f"the trim {flown(flight)}")
     return None
-
-
-def _condition(outputs: Mapping[str, np.ndarray], dt: float) -> Condition:
-    """The mean motion of a record; hover where it is slow or nothing tells."""
-    dx, dy, dz = (_mean_rate(outputs, axis, dt) for axis in "xyz")
-    heading = outputs.get("yaw")
-    # A circular mean: headings on either side of south are near one another, and far in numbers.
-    psi = float(np.angle(np.nanmean(np.exp(1j * heading)))) if heading is not None else 0.0
-    # From the axes of the ground to those of the heading, which a trim speaks of.
-    forward, lateral = dx * np.cos(psi) + dy * np.sin(psi), dy * np.cos(psi) - dx * np.sin(psi)
-    # Records of hover drift: their trim would be called one of forward flight.
-    forward, lateral, up = (float(v) if abs(v) >= _SLOW else 0.0 for v in (forward, lateral, dz))
-    return Condition(forward, lateral, up, psi) if forward or lateral or up else HOVER
-
-
-def _mean_rate(outputs: Mapping[str, np.ndarray], axis: str, dt: float) -> float:
-    """Mean velocity along an axis [m/s], from what was measured of it."""
-    # A measured velocity tells more than two noisy positions at the ends of the record.
-    if f"d{axis}" in outputs:
-        return float(np.nanmean(outputs[f"d{axis}"]))
-    if axis in outputs:
-        seen = np.flatnonzero(np.isfinite(outputs[axis]))
-        if seen.size > 1:
-            first, last = seen[0], seen[-1]
-            return float((outputs[axis][last] - outputs[axis][first]) / ((last - first) * dt))
-    return 0.0
-
-
-def _words(condition: Condition) -> str:
-    named = (
-        ("ahead", condition.forward_speed),
-        ("to the right", condition.lateral_speed),
-        ("up", condition.climb),
-    )
-    parts = [f"{v:.2g} m/s {n}" for n, v in named if v]
-    return f"at {', '.join(parts)}" if parts else "in hover"
 
 
 def _mean(

@@ -31,6 +31,7 @@ from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, layout_of
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.chosen_windows import Choice, Window, chosen
+from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.usable_windows import Exclusions
 from heli_jax.identification.validation.window_states import (
     begins_on_record,
@@ -72,6 +73,8 @@ class Ranking:
     """sd by `flight/output`, SI"""
     notes: tuple[str, ...] = ()
     """on how the windows were compared"""
+    record: tuple[Finding, ...] = ()
+    """what speaks against the whole record, as `check` says it: rates, and what inputs excite"""
 
 
 def window_samples(problem: Problem, length: float | None = None) -> int:
@@ -133,6 +136,11 @@ def rank_windows(
     Raises:
         ValueError: the length fits no flight, or no window may be used.
     """
+    if at.layout.estimator.noise_spectrum:
+        raise ValueError(
+            f"windows: method {problem.method} has no rows in time to rank them by, expected "
+            "output-error or filter-error"
+        )
     samples = window_samples(problem, length)
     if at.layout.estimator.rows_are_samples:
         s, spans, notes = _simulated(problem, at, e, samples)

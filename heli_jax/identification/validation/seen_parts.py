@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.parts import spans
 
 _BRIDGED = 5
 """samples in a row at most that a straight line bridges: far fewer than a segment of a spectrum"""
@@ -82,15 +83,10 @@ def _bridged(y: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], int]:
 
 def _whole(flight: Flight, outputs: dict[str, np.ndarray]) -> list[Part]:
     """The runs of samples in which every output has a number."""
-    seen = np.ones(flight.n_samples, bool)
-    for y in outputs.values():
-        seen &= np.isfinite(y)
-    edges = np.diff(np.concatenate([[0], seen.astype(int), [0]]))
-    spans = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
     return [
         Part(
             {n: u[first:last] for n, u in flight.inputs.items()},
             {n: y[first:last] for n, y in outputs.items()},
         )
-        for first, last in spans
+        for first, last in spans([np.zeros(flight.n_samples), *outputs.values()])
     ]

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.marks import mark_words, stray_words
 from heli_jax.flights.signal_facts import (
+    DROP_SHARE,
     RAIL_SHARE,
     STUCK_SECONDS,
     SignalFacts,
@@ -115,7 +116,14 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
                 words = f"{label}: {name} has {mark_words(facts.marks, size)}: "
                 words += "taken as missing; look "
                 found.append((0.0, f"{words}at what the log says of such values."))
-            if (at := facts.stuck) is not None:
+            if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
+                words = (
+                    f"{label}: {name} jumps to {facts.dropouts.value:.4g} and back, in "
+                    f"{100 * facts.dropped:.2g} % of the samples: dropouts that are taken for "
+                    "measurements; leave these parts out, or the value empty in the log."
+                )
+                found.append((facts.dropped * facts.size * facts.usual, words))
+            for at in facts.stretches:
                 length = at.end - at.begin
                 words = (
                     f"{label}: {name} stays at {at.value:.4g} for {length:.3g} s from "

@@ -3,6 +3,7 @@
 import numpy as np
 
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.signal_facts import DROP_SHARE
 from heli_jax.identification.validation.signal_quality import facts_of
 
 _RAILS = 0.05
@@ -36,6 +37,9 @@ class Exclusions:
             if facts.stuck is not None:
                 length = facts.stuck.end - facts.stuck.begin
                 return f"{name} stuck at one value for {length:.2g} s"
+            if facts.dropped >= DROP_SHARE and facts.dropouts is not None:
+                words = f"jumps to {facts.dropouts.value:.4g} and back"
+                return f"{name} {words}, in {100 * facts.dropped:.2g} % of the samples"
             share = sum(facts.shares)
             if share >= _RAILS:
                 return f"{name} at an end of its range in {100 * share:.0f} % of the samples"

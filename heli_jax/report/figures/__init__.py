@@ -5,7 +5,8 @@ within `matplotlib.rc_context(style.STYLE)` to get the report's look.
 """
 
 from heli_jax.report.figures.estimates import correlation_matrix, intervals, waterfall
-from heli_jax.report.figures.frequency_domain import bode
+from heli_jax.report.figures.frequency_domain import bode, bode_unit
+from heli_jax.report.figures.match import match
 from heli_jax.report.figures.panels import Panels
 from heli_jax.report.figures.residuals import residual_correlation
 from heli_jax.report.figures.time_domain import response, rls_history
@@ -13,8 +14,10 @@ from heli_jax.report.figures.time_domain import response, rls_history
 __all__ = [
     "Panels",
     "bode",
+    "bode_unit",
     "correlation_matrix",
     "intervals",
+    "match",
     "residual_correlation",
     "response",
     "rls_history",

@@ -67,7 +67,7 @@ def bode(
         note = f"the model cannot be linearised about {at.words or 'zero'}; {note}"
     elif at.words:
         note = f"linearised about {at.words}; {note}"
-    _finish_bode(axes, nyquist, limits, _bode_unit(model, output, input), note)
+    _finish_bode(axes, nyquist, limits, bode_unit(model, output, input), note)
     return axes
 
 
@@ -166,7 +166,7 @@ def _draw_record(
     return note + ("; other inputs taken as uncorrelated" if others_move else "")
 
 
-def _bode_unit(model: Model, output: str, input: str) -> str:
+def bode_unit(model: Model, output: str, input: str) -> str:
     """`dB re rad/m`; plain dB where a unit is missing, or is a quotient and would need brackets."""
     out, into = naming.unit(model.Outputs, output), naming.unit(model.Inputs, input)
     if into == "1":

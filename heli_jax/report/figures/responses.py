@@ -32,7 +32,7 @@ def draw_response(
     Args:
         names: of the input and the output.
         omega: (k,) [rad/s]
-        pair: with H, sd, coherence and picture, (k,) each (`heli_jax.log_responses.Pair`).
+        pair: with H, sd, coherence and picture, (k,) each (`flight_responses.Pair`).
         unit: of output over input.
         note: below the title.
         fits: transfer functions, each a label and its response (k,).

@@ -1,6 +1,6 @@
 """What the report's page says, as words and as rows of text; the page itself is the template."""
 
-from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals
+from heli_jax.report.tables.agreement import acceptance, agreement, choice, residuals, responses
 from heli_jax.report.tables.baseline import baseline_facts, baseline_ratios
 from heli_jax.report.tables.estimates import (
     Nuisances,
@@ -12,7 +12,8 @@ from heli_jax.report.tables.estimates import (
     starts,
     verdict,
 )
-from heli_jax.report.tables.first_guess import first_guess, selection_steps
+from heli_jax.report.tables.first_guess import first_guess, selection_steps, start_method
+from heli_jax.report.tables.handling import handling, handling_sentences
 from heli_jax.report.tables.headline import (
     Headline,
     adequate,
@@ -22,6 +23,7 @@ from heli_jax.report.tables.headline import (
     warnings,
 )
 from heli_jax.report.tables.meanings import meanings
+from heli_jax.report.tables.methods import methods
 from heli_jax.report.tables.provenance import Origin, constants, origins
 from heli_jax.report.tables.table import NOT_DETERMINED, Table, pairs
 
@@ -41,9 +43,12 @@ __all__ = [
     "constants",
     "first_guess",
     "further_sentences",
+    "handling",
+    "handling_sentences",
     "headline",
     "intervals",
     "meanings",
+    "methods",
     "model_remark",
     "nuisances",
     "origins",
@@ -51,7 +56,9 @@ __all__ = [
     "parameters",
     "prior_note",
     "residuals",
+    "responses",
     "selection_steps",
+    "start_method",
     "starts",
     "verdict",
     "warnings",

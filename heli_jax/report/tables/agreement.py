@@ -1,6 +1,7 @@
 """Tables of the agreement: metrics, model selection, the acceptance card, residuals."""
 
 from heli_jax import naming
+from heli_jax.analysis.response_agreement import USUAL_J
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
@@ -41,6 +42,32 @@ def agreement(fit: Fit, baseline: Baseline | None) -> Table:
 def _agreement(output: str, of: str, m: Metrics) -> tuple[str, ...]:
     fit_percent = percent(m.nrmse_fit_percent / 100)
     return (output, of, percent(m.vaf, 3), fit_percent, number(m.rmse), number(m.tic, 3))
+
+
+def responses(fit: Fit) -> Table | None:
+    """The model's frequency responses against the measured ones, where these were fitted."""
+    agreement = fit.responses
+    if agreement is None:
+        return None
+    usual = f"J (usual: < {USUAL_J:g})"
+    head = ("response", "Hz", "lines", "coherence", "chi-squared", usual, "model")
+    rows = [
+        (
+            f"{p.input} to {p.output}",
+            f"{number(p.low, 2)} to {number(p.high, 2)}",
+            f"{p.lines}/{p.of}",
+            number(p.coherence, 2),
+            number(p.chi_squared, 2),
+            number(p.J, 3),
+            "in windows" if p.simulated else "by line",
+        )
+        for p in agreement.pairs
+        if p.lines
+    ]
+    between = f"{number(agreement.lower95, 2)} to {number(agreement.upper95, 2)}"
+    rows.append(("all together", "", "", "", number(agreement.chi_squared, 2), "", ""))
+    rows.append(("expected", "", "", "", between, "", ""))
+    return Table(head, rows)
 
 
 def choice(selection: Choice) -> Table:

@@ -1,11 +1,19 @@
-"""Tables of starts that equation error found."""
+"""Tables of starts that equation error or frequency error found."""
 
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
+from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.numbers import NOTHING, number, with_sd
 from heli_jax.report.tables.table import Table
 
+type Start = EquationErrorStart | FrequencyErrorStart
 
-def first_guess(start: EquationErrorStart) -> Table:
+
+def start_method(start: Start) -> str:
+    """What found the starts, in words."""
+    return "equation error" if isinstance(start, EquationErrorStart) else "frequency error"
+
+
+def first_guess(start: Start) -> Table:
     """Where each free parameter begins, and by what."""
     rows = []
     for name, v in start.values.items():
@@ -17,7 +25,7 @@ def first_guess(start: EquationErrorStart) -> Table:
     return Table(("parameter", "start", "unit", "from", "F-ratio"), rows)
 
 
-def selection_steps(start: EquationErrorStart) -> Table:
+def selection_steps(start: Start) -> Table:
     """The steps of a stepwise selection of terms; no rows where there was none."""
     steps = () if start.selection is None else start.selection.steps
     rows = [

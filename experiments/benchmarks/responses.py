@@ -1,0 +1,108 @@
+"""All responses of a flight with five windows beside the same by loops over SciPy.
+
+    .venv/bin/python experiments/benchmarks/responses.py [MINUTES]
+
+4 inputs that move together, 9 outputs, 10 minutes at 100 Hz. SciPy's loop goes over outputs and
+windows: csd of every pair among the four inputs and the output (15), and the responses solved for
+at each frequency; where spectra of inputs are kept for all outputs it is the lean loop. Neither
+makes the composite, coherences or errors. On one thread, the best of some runs each, in turn.
+The target: 0.5 s warm and 1/20 of the loop.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import jax
+import numpy as np
+import scipy.signal
+
+from heli_jax import Flight
+from heli_jax.analysis.flight_responses import Settings, flight_responses
+
+jax.config.update("jax_enable_x64", True)
+signal: Any = scipy.signal
+RATE, INPUTS, OUTPUTS, WINDOW, RUNS = 100.0, 4, 9, 20.0, 5
+LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
+
+
+def flight(minutes: float) -> Flight:
+    rng = np.random.default_rng(0)
+    N = round(60.0 * minutes * RATE)
+    u = rng.standard_normal((INPUTS, N))
+    u[1:] += 0.4 * u[:-1]
+    b, a = signal.butter(2, 5.0, fs=RATE)
+    mixed = rng.standard_normal((OUTPUTS, INPUTS)) @ u
+    y = signal.lfilter(b, a, mixed) + 0.1 * rng.standard_normal((OUTPUTS, N))
+    inputs = {f"u{i}": v for i, v in enumerate(u)}
+    return Flight(dt=1.0 / RATE, inputs=inputs, outputs={f"y{i}": v for i, v in enumerate(y)})
+
+
+def by_scipy(record: Flight, omega: np.ndarray, lean: bool) -> np.ndarray:
+    """H (windows, k, outputs, inputs)."""
+    u, y = list(record.inputs.values()), list(record.outputs.values())
+    found = []
+    for length in LENGTHS:
+        n = round(length * WINDOW * RATE)
+
+        def csd(a: np.ndarray, b: np.ndarray, n: int = n) -> np.ndarray:
+            hz, S = signal.csd(a, b, fs=RATE, nperseg=n, noverlap=n // 2, detrend="constant")
+            w = 2.0 * np.pi * hz
+            return np.interp(omega, w, S.real) + 1j * np.interp(omega, w, S.imag)
+
+        of_inputs, each = np.zeros(0), []
+        for output in y:
+            if not lean or not each:
+                of_inputs = spectra(u, csd)
+            Suy = np.array([csd(a, output) for a in u])
+            if not lean:
+                csd(output, output)
+            each.append(np.linalg.solve(np.moveaxis(of_inputs, 2, 0), Suy.T[:, :, None])[:, :, 0])
+        found.append(np.stack(each, axis=1))
+    return np.stack(found)
+
+
+def spectra(u: list[np.ndarray], csd: Callable[..., np.ndarray]) -> np.ndarray:
+    """(m, m, k) of every pair of inputs, each pair once."""
+    m = len(u)
+    half = {(i, j): csd(u[i], u[j]) for i in range(m) for j in range(i, m)}
+    rows = [[half[i, j] if i <= j else half[j, i].conj() for j in range(m)] for i in range(m)]
+    return np.array(rows)
+
+
+def seconds(do: Callable[[], Any]) -> tuple[float, Any]:
+    begin = time.perf_counter()
+    done = do()
+    return time.perf_counter() - begin, done
+
+
+def main(minutes: float) -> None:
+    record, settings = flight(minutes), Settings(window=WINDOW)
+    cold, found = seconds(lambda: flight_responses([record], settings))
+    ours, theirs, lean, loop, omega = [], [], [], np.zeros(0), found.omega
+    for _ in range(RUNS):
+        took, found = seconds(lambda: flight_responses([record], settings))
+        ours.append(took)
+        took, loop = seconds(lambda: by_scipy(record, omega, lean=False))
+        theirs.append(took)
+        lean.append(seconds(lambda: by_scipy(record, omega, lean=True))[0])
+    # The middle window is the one that intervals are taken from.
+    H = np.array([[p.H for p in o.pairs.values()] for o in found.outputs.values()])
+    middle = np.moveaxis(loop[2], 0, -1)
+    seen = np.isfinite(H)
+    off = np.median(np.abs(H - middle)[seen] / np.abs(H)[seen])
+    best = min(ours)
+    print(f"cold {cold:.2f} s, warm {best:.3f} s")
+    for name, loops in (("loop", theirs), ("lean loop", lean)):
+        print(f"SciPy's {name} {min(loops):.2f} s: 1/{min(loops) / best:.1f} of it")
+    print(f"responses differ by {100 * off:.1f} % (median; SciPy has its own frequencies, between")
+    print("which the loop interpolates)")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)

@@ -1,0 +1,255 @@
+"""The R-50 in closed loop in the frequency domain: by instrument, direct, and by filter error.
+
+    .venv/bin/python experiments/closed_loop_frequency.py [RUNS] [METHODS]
+
+Each of RUNS (40) runs has four records of 90 s: a pilot who only just keeps the hover, a sweep of
+0.05 to 4 Hz that is added to one cyclic stick and logged, gusts on six axes. 14 derivatives of the
+attitude, 6 of the speed and the delays of both sticks are free and start up to a factor of 1.5 off.
+The records are made with SciPy's matrix exponentials. The folder of --out keeps a line a fit, so
+that a run that was stopped goes on where it was.
+"""
+
+import functools
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import scipy.linalg
+import scipy.signal
+from r50_record import AXES, NOISE, SIGMA, truth, turbulent
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, naming, simulate
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.onboard.delays import with_delays
+
+jax.config.update("jax_enable_x64", True)
+DT, SECONDS, SWEEP, BAND = 0.02, 90.0, 0.15, (0.05, 4.0)
+ATTITUDE = ("Lb", "Ma", "tau_f", "Ab", "Ac", "Alat", "Alon", "Ba", "Bd", "Blat", "Blon")
+ATTITUDE = (*ATTITUDE, "tau_s", "Clon", "Dlat")
+SPEED = ("Xu", "Yv", "Lu", "Lv", "Mu", "Mv")
+DELAYS = {"delay_lat": 0.033, "delay_lon": 0.047}
+OUTPUTS = ("u", "v", "p", "q", "phi", "theta")
+GUSTS = 1.0
+"""factor of the turbulence of r50_record.py"""
+
+
+class Step(NamedTuple):
+    """One sample of the flight: x+ = A x + now u[k-d] + before u[k-d-1] + L noise."""
+
+    A: np.ndarray
+    now: np.ndarray
+    before: np.ndarray
+    whole: np.ndarray
+    """d of each input"""
+    L: np.ndarray
+
+
+@functools.cache
+def step() -> Step:
+    model, params = turbulent(), truth()
+    A, B, _, _ = (np.asarray(m) for m in jacobians(model, params))
+    n, m = B.shape
+
+    def held(h: float) -> tuple[np.ndarray, np.ndarray]:
+        E = scipy.linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * h)
+        return E[:n, :n], E[:n, n:]
+
+    late = {"lat": DELAYS["delay_lat"], "lon": DELAYS["delay_lon"], "ped": float(params.tau_ped)}
+    samples = np.array([late.get(name, 0.0) for name in naming.names(model.Inputs)]) / DT
+    whole, (Ad, now) = np.floor(samples).astype(int), held(DT)
+    before = np.zeros_like(B)
+    for j, rest in enumerate((samples - whole) * DT):
+        (_, early), (after, rest_of) = held(rest), held(DT - rest)
+        before[:, j], now[:, j] = after @ early[:, j], rest_of[:, j]
+    assert model.noise_intensity is not None
+    g = np.array([float(v) for v in naming.asdict(model.noise_intensity(params)).values()])
+    # Van Loan (1978): the covariance that the noise adds in one sample.
+    E = scipy.linalg.expm(np.block([[-A, np.diag(g**2)], [np.zeros((n, n)), A.T]]) * DT)
+    values, vectors = np.linalg.eigh(E[n:, n:].T @ E[:n, n:])
+    return Step(Ad, now, before, whole, vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+@functools.cache
+def pilot() -> np.ndarray:
+    """Gains (4, 13) of a quadratic regulator to which sticks are dear: it mirrors what is unstable
+    and leaves the rest nearly as it is."""
+    one = step()
+    A, B = one.A[:13, :13], (one.now + one.before)[:13]
+    weights = {"phi": 1.0, "theta": 1.0, "p": 0.05, "q": 0.05, "u": 0.01, "v": 0.01}
+    Q = np.diag([weights.get(n, 1e-4) for n in naming.names(turbulent().State)[:13]])
+    R = 10.0 * np.diag([10.0, 10.0, 10.0, 3.0])
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+
+def sweep(N: int) -> np.ndarray:
+    t = DT * np.arange(N)
+    fade = np.minimum(1.0, np.minimum(t, t[::-1]) / 2.0)
+    # From a sine, so that it begins at zero.
+    return SWEEP * fade * scipy.signal.chirp(t, BAND[0], t[-1], BAND[1], "logarithmic", -90)
+
+
+def record(seed: int, stick: str) -> Flight:
+    """A flight in closed loop with a sweep on one stick, logged as that stick's instrument."""
+    model, one, rng = turbulent(), step(), np.random.default_rng(seed)
+    N, n, names = round(SECONDS / DT), step().A.shape[0], naming.names(turbulent().Inputs)
+    added = np.zeros((N, 4))
+    added[:, names.index(stick)] = sweep(N)
+    x, sticks, states = np.zeros(n), np.zeros((N, 4)), np.zeros((N, n))
+    x[13:] = GUSTS * rng.standard_normal(6) * [SIGMA[a] for a in AXES]
+    columns = np.arange(4)
+    for k in range(N):
+        states[k] = x
+        sticks[k] = added[k] - pilot() @ x[:13]
+        # The first sample stays before the record begins, as the package has it.
+        now = sticks[np.maximum(k - one.whole, 0), columns]
+        before = sticks[np.maximum(k - one.whole - 1, 0), columns]
+        x = one.A @ x + one.now @ now + one.before @ before
+        x += GUSTS * one.L @ rng.standard_normal(n)
+    at = naming.names(model.State)
+    return Flight(
+        dt=DT,
+        inputs=dict(zip(names, sticks.T, strict=True)),
+        outputs={o: states[:, at.index(o)] + NOISE[o] * rng.standard_normal(N) for o in OUTPUTS},
+        instruments={o: added[:, names.index(o)] for o in ("lat", "lon")},
+        name=f"{stick}-{seed}",
+    )
+
+
+@functools.cache
+def models() -> tuple[Any, Any]:
+    """Without and with a disturbance on each axis."""
+    bare = with_delays(linear_model("r50-hover").model, inputs=["lat", "lon"])
+    return bare, with_disturbance(bare, ["p", "q", "u", "v"])
+
+
+def truths() -> dict[str, float]:
+    values = naming.asdict(linear_model("r50-hover").vehicle().params)
+    return {n: float(values[n]) for n in (*ATTITUDE, *SPEED)} | DELAYS
+
+
+def problem(seed: int, method: str, **more: Any) -> Problem:
+    rng = np.random.default_rng(10_000 + seed)
+    flights = [record(100 * seed + i, ("lat", "lon")[i % 2]) for i in range(4)]
+    model = models()[1 if method == "filter-error" else 0]
+    values = naming.asdict(linear_model("r50-hover").vehicle().params) | DELAYS
+    free = {
+        n: Free(v * float(np.exp(rng.uniform(-1, 1) * np.log(1.5)))) for n, v in truths().items()
+    }
+    return Problem(
+        model,
+        model.Params(**values),
+        flights,
+        free,
+        Nuisance(initial_state=False, bias=False, input_offset=False),
+        method=method,
+        **more,
+    )
+
+
+METHODS: dict[str, dict[str, Any]] = {
+    "by instrument": {"method": "frequency-error"},
+    "direct": {"method": "frequency-error", "instrument": ()},
+    "filter error": {"method": "filter-error"},
+}
+
+
+def doublet_tic(found: dict[str, float]) -> float:
+    """Theil's coefficient of a doublet on each cyclic stick in turn, without gusts; the worse."""
+    model, vehicle = models()[0], naming.asdict(linear_model("r50-hover").vehicle().params)
+    N, worst = round(4.0 / DT), 0.0
+    for stick in ("lat", "lon"):
+        u = np.zeros(N)
+        u[25:50], u[50:75] = 0.1, -0.1
+        inputs = model.Inputs(
+            **{n: u if n == stick else np.zeros(N) for n in naming.names(model.Inputs)}
+        )
+        y = [
+            np.stack([np.asarray(getattr(run.outputs, n)) / NOISE[n] for n in OUTPUTS])
+            for values in (truths(), found)
+            for run in [simulate(model, model.Params(**{**vehicle, **values}), inputs, dt=DT)]
+        ]
+        rms = [np.sqrt(np.mean(v**2)) for v in (y[0] - y[1], y[0], y[1])]
+        worst = max(worst, float(rms[0] / (rms[1] + rms[2])))
+    return worst
+
+
+def one_fit(seed: int, method: str) -> dict[str, Any]:
+    """Relative errors, errors in units of the stated sd, and what the fit says of itself."""
+    asked = problem(seed, **METHODS[method])
+    begin = time.perf_counter()
+    found = fit(asked, starts=1)
+    values = {n: e.value for n, e in found.estimates.items()}
+    return {
+        "seed": seed,
+        "method": method,
+        "status": found.status,
+        "steps": found.steps,
+        "seconds": found.timing["fit"],
+        "all_seconds": time.perf_counter() - begin,
+        "tic": doublet_tic(values),
+        "untrusted": list(found.untrusted),
+        "moved": found.moved_by_feedback,
+        "error": {n: values[n] - t for n, t in truths().items()},
+        "z": {n: (values[n] - t) / (found.estimates[n].sd or np.nan) for n, t in truths().items()},
+    }
+
+
+def table(fits: list[dict[str, Any]]) -> str:
+    head = "method | runs | attitude: RMSE, covered | speed: RMSE, covered | delays: RMSE [ms], "
+    head += "covered | TIC of a doublet, largest | fit [s]"
+    lines = [f"| {head} |", "|---" * 7 + "|"]
+    size = {n: abs(t) for n, t in truths().items()}
+    for method in METHODS:
+        those = [f for f in fits if f["method"] == method]
+        if not those:
+            continue
+        cells = [method, str(len(those))]
+        for names, unit in ((ATTITUDE, size), (SPEED, size), (tuple(DELAYS), {})):
+            e = np.array([[f["error"][n] / unit.get(n, 1e-3) for n in names] for f in those])
+            z = np.array([[f["z"][n] for n in names] for f in those], float)
+            rmse = np.median(np.sqrt(np.mean(e**2, axis=0))) * (100 if unit else 1)
+            covered = 100 * np.mean(np.abs(z) < 1.959963984540054)
+            cells.append(f"{rmse:.2g}{' %' if unit else ''}, {covered:.0f} %")
+        cells.append(f"{max(f['tic'] for f in those):.3f}")
+        cells.append(f"{np.median([f['seconds'] for f in those]):.2f}")
+        lines.append("| " + " | ".join(cells) + " |")
+    direct = [f for f in fits if f["method"] == "direct"]
+    if direct:
+        share = {n: np.mean([n in f["untrusted"] for f in direct]) for n in size}
+        flagged = ", ".join(f"{n} {100 * v:.0f}" for n, v in share.items())
+        lines.append(f"\nDirect: said to be untrusted, % of {len(direct)} runs: {flagged}.")
+    return "\n".join(lines)
+
+
+def main(runs: int, out: Path, methods: list[str]) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    lines = out / "fits.jsonl"
+    done = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    known = {(f["seed"], f["method"]) for f in done}
+    for seed in range(1, runs + 1):
+        for method in methods:
+            if (seed, method) in known:
+                continue
+            done.append(one_fit(seed, method))
+            with lines.open("a") as file:
+                file.write(json.dumps(done[-1]) + "\n")
+            print(f"{seed} {method} {done[-1]['status']} {done[-1]['seconds']:.2f} s", flush=True)
+    print(table([f for f in done if f["seed"] <= runs]))
+
+
+if __name__ == "__main__":
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "an hour",
+        Size("runs", 40, 2, "of four records each"),
+        Size("methods", ",".join(METHODS), "by instrument,direct", "with commas between"),
+        out="runs/closed-loop-frequency",
+    )
+    main(options.runs, options.out, options.methods.split(","))

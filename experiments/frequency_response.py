@@ -1,0 +1,135 @@
+"""Fits in the frequency domain on the disturbed bench, over the Cramér-Rao bound.
+
+    .venv/bin/python experiments/frequency_response.py [RUNS] [WINDOW]
+
+Records of 120 s made with SciPy alone, moved by pilot steps or by a chirp, with gusts as large as
+the stick's response and with none; Ixx, If and kappa start 1.3 times off. `frequency-response` (in
+windows of WINDOW, 10 s) and `frequency-error` fit the same records. The bound is that of an
+estimator that knows the gusts' spectrum and the noise: the sensitivities of the response through
+the Kalman filter that makes them white.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+import scipy.linalg
+import scipy.signal
+from coverage_cases.disturbed import matrices, response
+from frequency_error import DT, NAMES, NOISE, SAMPLES, TAU, VEHICLE, steps
+
+from heli_jax import Flight, Free, Problem, fit, models, naming
+from heli_jax.analysis.response_options import ResponseOptions
+
+jax.config.update("jax_enable_x64", True)
+Z95 = 1.959963984540054
+METHODS = ("frequency-response", "frequency-error")
+
+
+def chirp(rng: np.random.Generator) -> np.ndarray:
+    """From 0.1 to 5 Hz, an octave in the same time as any other, from a random phase."""
+    t = DT * np.arange(SAMPLES)
+    hz = 0.1 * 50.0 ** (t / t[-1])
+    return 1.7e-6 * np.sin(2.0 * np.pi * (np.cumsum(hz) * DT + rng.uniform()))
+
+
+def still(v, u: np.ndarray) -> np.ndarray:
+    """Roll (N,) without gusts."""
+    A, B = matrices(v)
+    M = np.zeros((5, 5))
+    M[:4, :4], M[:4, 4] = A, B
+    E = scipy.linalg.expm(M * DT)
+    num, den = scipy.signal.ss2tf(E[:4, :4], E[:4, 4:], np.eye(4)[:1], np.zeros((1, 1)))
+    return np.asarray(scipy.signal.lfilter(num[0], den, u))
+
+
+def bound(u: np.ndarray, sigma: float) -> np.ndarray:
+    """Relative Cramér-Rao standard deviations (3,) for gusts and noise that are known."""
+    rows, h = [], 1e-4
+    for name in NAMES:
+        value = float(getattr(VEHICLE, name))
+        up, down = (
+            still(naming.replace(VEHICLE, **{name: value * (1 + s * h)}), u) for s in (1, -1)
+        )
+        rows.append((up - down) / (2 * h))
+    white = whitened(np.array(rows).T, sigma)
+    return np.sqrt(np.diag(np.linalg.inv(white.T @ white)))
+
+
+def whitened(s: np.ndarray, sigma: float) -> np.ndarray:
+    """Signals (N, q) by the filter that makes gusts and noise white, over its innovations' sd."""
+    A = np.zeros((5, 5))
+    A[:4, :4] = matrices(VEHICLE)[0]
+    A[1, 4], A[4, 4] = 1.0, -1.0 / TAU
+    G = np.zeros((5, 5))
+    G[4, 4] = 2.0 * sigma**2 / TAU
+    both = scipy.linalg.expm(np.block([[-A, G], [np.zeros((5, 5)), A.T]]) * DT)
+    Ad, Q = both[5:, 5:].T, both[5:, 5:].T @ both[:5, 5:]
+    P, x, out = np.diag([0.0, 0.0, 0.0, 0.0, sigma**2]), np.zeros((5, s.shape[1])), np.empty_like(s)
+    for k, row in enumerate(s):
+        S = P[0, 0] + NOISE**2
+        K = P[:, 0] / S
+        out[k] = (row - x[0]) / S**0.5
+        x = Ad @ (x + np.outer(K, row - x[0]))
+        P = Ad @ (P - np.outer(K, P[0])) @ Ad.T + Q
+    return out
+
+
+def one_run(
+    seed: int, move: Callable, sigma: float, window: float
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
+    """By method relative errors, errors over the stated sd, the bound, the time, and whether
+    chi-squared lies in the interval that is expected of it (NaN where there is none)."""
+    rng = np.random.default_rng(seed)
+    u = move(rng)
+    roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
+    roll = roll + NOISE * rng.standard_normal(SAMPLES)
+    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
+    truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
+    least, out = bound(u, sigma), []
+    for method in METHODS:
+        free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
+        options = ResponseOptions(window=window if method == METHODS[0] else None)
+        problem = Problem(
+            models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
+        )
+        began = time.perf_counter()
+        found = fit(problem)
+        took = time.perf_counter() - began
+        error = np.array([found.estimates[n].value for n in NAMES]) - truth
+        sd = np.array([found.estimates[n].sd or np.nan for n in NAMES])
+        inside = np.nan
+        if (responses := found.responses) is not None:
+            inside = responses.lower95 < responses.chi_squared < responses.upper95
+        out.append((error / truth, error / sd, least, took, float(inside)))
+    return out
+
+
+def main(runs: int, window: float) -> None:
+    print(
+        "| stick | gusts [rad/s^2] | method | " + " | ".join(NAMES) + " | time [s] | chi2 inside |"
+    )
+    print("|---|---|---|" + "---|" * (len(NAMES) + 2))
+    for sigma in (1.04, 0.0):
+        for move in (steps, chirp):
+            each = [one_run(seed, move, sigma, window) for seed in range(runs)]
+            for k, method in enumerate(METHODS):
+                of_method = zip(*(run[k] for run in each), strict=True)
+                error, z, least, took, inside = (np.array(v) for v in of_method)
+                rmse = np.sqrt(np.mean(error**2, axis=0))
+                ratio = np.sqrt(np.mean((error / least) ** 2, axis=0))
+                covered = np.mean(np.abs(z) < Z95, axis=0)
+                cells = [
+                    f"{100 * a:.3g} %, {b:.2f} of the bound, covered {100 * c:.0f} %"
+                    for a, b, c in zip(rmse, ratio, covered, strict=True)
+                ]
+                name = f"{move.__name__} | {sigma:g} | {method}"
+                times = f"{np.median(took):.2f} | {100 * np.mean(inside):.0f} %"
+                print(f"| {name} | {' | '.join(cells)} | {times} |", flush=True)
+
+
+if __name__ == "__main__":
+    arguments = dict(enumerate(sys.argv[1:]))
+    main(int(arguments.get(0, 60)), float(arguments.get(1, 10.0)))

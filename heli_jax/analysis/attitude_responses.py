@@ -1,0 +1,97 @@
+"""Which responses of a model handling qualities are read off, and those of flights."""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.flight_responses import FlightResponses
+from heli_jax.analysis.handling_qualities import (
+    HandlingQualities,
+    Kind,
+    handling_qualities,
+)
+from heli_jax.analysis.response_curves import (
+    Curve,
+    integrated,
+    measured_curve,
+    times,
+    without_hold,
+)
+from heli_jax.dynamics.model import Model, axes_of
+
+_ATTITUDES = {"roll": "p", "pitch": "q", "yaw": "r"}
+"""axes by name, and what an output with the rate about each is usually called"""
+
+
+class HandlingPair(NamedTuple):
+    """A response that handling qualities are read off."""
+
+    input: str
+    output: str
+    kind: Kind = "rate"
+    integrated: bool = False
+    """whether the output is a rate, whose response is divided by i omega"""
+    gain: float = 1.0
+    """of an open loop"""
+
+    @property
+    def words(self) -> str:
+        """`lat to p, integrated`"""
+        return f"{self.input} to {self.output}" + (", integrated" if self.integrated else "")
+
+
+class Handling(NamedTuple):
+    """What model and data say of one pair; in words why one says nothing, None where not asked."""
+
+    pair: HandlingPair
+    model: HandlingQualities | str | None
+    data: HandlingQualities | str | None
+
+
+def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair, ...]:
+    """By axis of roll, pitch and yaw its stick with the angle, or else the rate, among the outputs.
+
+    Args:
+        model: any.
+        outputs: those of the model's that were logged.
+    """
+    inputs = naming.names(model.Inputs)
+    pairs = []
+    for axis in axes_of(model):
+        if axis.name not in _ATTITUDES or axis.stick not in inputs:
+            continue
+        # Outputs have the names of states, or their own: roll for phi.
+        stick = str(axis.stick)
+        angles = [n for n in (axis.angle, axis.name) if n in outputs]
+        rates = [n for n in (axis.rate, _ATTITUDES[axis.name]) if n in outputs]
+        if angles:
+            pairs.append(HandlingPair(stick, str(angles[0])))
+        elif rates:
+            pairs.append(HandlingPair(stick, rates[0], integrated=True))
+    return tuple(pairs)
+
+
+def prepared(pair: HandlingPair, curve: Curve) -> Curve:
+    """The curve of an attitude, or of an open loop with its gain."""
+    curve = integrated(curve) if pair.integrated else curve
+    return times(curve, pair.gain) if pair.gain != 1.0 else curve
+
+
+def measured_handling(found: FlightResponses, pair: HandlingPair) -> HandlingQualities | str:
+    """Handling qualities of a measured response, or why there are none in words.
+
+    Args:
+        found: the responses of some flights.
+        pair: which of them.
+    """
+    output = found.outputs.get(pair.output)
+    response = None if output is None else output.pairs.get(pair.input)
+    if response is None:
+        return "the flights have no such response"
+    with np.errstate(all="ignore"):
+        H = without_hold(found.omega, response.H, found.holds[pair.input])
+        sd = response.sd * np.abs(H / response.H)
+    curve = measured_curve(found.omega, H, sd, response.coherence, found.window)
+    return curve if isinstance(curve, str) else handling_qualities(prepared(pair, curve), pair.kind)

@@ -1,0 +1,173 @@
+"""How a model's frequency responses agree with measured ones: chi-squared, and Tischler's J."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+from jaxtyping import Bool, Complex, Float
+
+from heli_jax.analysis.windowed import Windowed
+
+USUAL_J = 100.0
+"""at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
+_POINTS = 20
+"""frequencies, equally spaced in the logarithm, that J is usually taken over"""
+_MISFIT = 2.0
+"""times what random errors let expect, from which on squared errors speak against the model"""
+
+
+class PairAgreement(NamedTuple):
+    """One response."""
+
+    input: str
+    output: str
+    low: float
+    high: float
+    """first and last frequency that takes part [Hz]; NaN where none does"""
+    lines: int
+    """frequencies that take part"""
+    of: int
+    """and of all in the band"""
+    coherence: float
+    """mean partial coherence over those that take part"""
+    J: float
+    """Tischler's cost over about twenty of them; NaN where none takes part"""
+    chi_squared: float
+    """squared errors over their variance, in the mean; 1 is expected"""
+    simulated: bool
+    """whether the model was simulated and sent through the windows of the measurement; else its
+    response at each frequency was taken"""
+
+
+APART = (
+    "Too few windows hold all outputs to say how their errors go together: these are taken as "
+    "independent, and intervals are too narrow where they are not. A shorter window has more."
+)
+
+
+class ResponseAgreement(NamedTuple):
+    """All responses together."""
+
+    pairs: tuple[PairAgreement, ...]
+    chi_squared: float
+    """squared errors per degree of freedom, between all outputs and inputs"""
+    lower95: float
+    upper95: float
+    """what random errors let expect of it with 95 % probability"""
+    freedom: float
+    """degrees of freedom: independent numbers less unknowns"""
+    window: float
+    """[s]"""
+    averages: tuple[tuple[str, float], ...]
+    """independent ones by output"""
+    instruments: tuple[str, ...]
+    """inputs whose responses are taken by an excitation that was logged"""
+    notes: tuple[str, ...]
+
+    @property
+    def doubt(self) -> str:
+        """Why the model does not explain the responses, in a few words; empty where it does."""
+        if self.chi_squared > max(self.upper95, _MISFIT):
+            return (
+                f"squared errors of the responses are {self.chi_squared:.2g} times what their "
+                "random errors let expect"
+            )
+        return ""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What takes no part."""
+        words = list(self.notes)
+        left = [f"{p.input} to {p.output}" for p in self.pairs if not p.lines]
+        if left:
+            words.append(f"Responses that take no part: {', '.join(left)}.")
+        some = sum(p.of - p.lines for p in self.pairs if p.lines)
+        if some:
+            total = sum(p.of for p in self.pairs if p.lines)
+            words.append(
+                f"{some} of {total} lines of the responses take no part: outside of a band, below "
+                "a coherence, or of no more power than the window's sidelobes."
+            )
+        return tuple(words)
+
+    @property
+    def misfit(self) -> str:
+        """What chi-squared says where it lies above its interval; empty elsewhere."""
+        if not self.chi_squared > self.upper95:
+            return ""
+        return (
+            f"Squared errors of the responses are {self.chi_squared:.3g} times what their random "
+            f"errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the model lacks "
+            "something, the machine is not linear, or an input follows the outputs."
+        )
+
+
+def pair_agreements(
+    w: Windowed,
+    used: Bool[np.ndarray, "k p m"],
+    H: Complex[np.ndarray, "k p m"],
+    E: Complex[np.ndarray, "k p m"],
+    variance: Float[np.ndarray, "k p m"],
+    coherence: Float[np.ndarray, "k p m"],
+    simulated: tuple[bool, ...],
+) -> tuple[PairAgreement, ...]:
+    """Response by response.
+
+    Args:
+        w: the flights in windows.
+        used: which take part at which frequencies.
+        H: measured.
+        E: measured less the model's.
+        variance: of E.
+        coherence: partial.
+        simulated: by output how the model's response was made.
+    """
+    out = []
+    for j, output in enumerate(w.outputs):
+        for i, input in enumerate(w.inputs):
+            at = used[:, j, i]
+            some = bool(at.any())
+            hz = w.hz[at]
+            errors = np.abs(E[at, j, i]) ** 2 / variance[at, j, i]
+            out.append(
+                PairAgreement(
+                    input,
+                    output,
+                    float(hz[0]) if some else np.nan,
+                    float(hz[-1]) if some else np.nan,
+                    int(at.sum()),
+                    int(at.size),
+                    float(np.mean(coherence[at, j, i])) if some else np.nan,
+                    _J(w, at, (H[:, j, i], E[:, j, i], coherence[:, j, i])),
+                    float(np.mean(errors)) if some else np.nan,
+                    simulated[j],
+                )
+            )
+    return tuple(out)
+
+
+def _J(w: Windowed, used: np.ndarray, of_pair: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Over frequencies about equally spaced in the logarithm, as it is usually taken."""
+    # Here: it brings SciPy's optimiser, which takes longer to import than this to run.
+    from heli_jax.analysis.transfer_fit import Measured, mismatch
+
+    if not used.any():
+        return float("nan")
+    hz = w.hz[used]
+    spaced = np.geomspace(hz[0], hz[-1], _POINTS)
+    at = np.unique(np.argmin(np.abs(np.log(hz[:, None] / spaced)), axis=0))
+    H, E, coherence = (v[used][at] for v in of_pair)
+    omega = 2.0 * np.pi * hz[at]
+    return mismatch(Measured(omega, H, np.abs(H), w.seconds, coherence), H - E)
+
+
+def expected_interval(freedom: float, of_noise: float) -> tuple[float, float]:
+    """What chi-squared over its degrees of freedom lies in with 95 % probability, where the noise
+    was estimated from what no response explains: Fisher's F.
+
+    Args:
+        freedom: degrees of freedom.
+        of_noise: those of the noise.
+    """
+    low, high = scipy.special.fdtri(freedom, max(of_noise, 1.0), np.array([0.025, 0.975]))
+    return float(low), float(high)

@@ -1,0 +1,318 @@
+"""Frequency responses as smooth curves with errors: of a measured response, and of a model.
+
+Both know at every frequency gain and phase, how steep they are, and how they hang on what the
+response rests on: the random errors of bins, or the parameters of a fit with their covariance.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax import naming
+from heli_jax.analysis.transfer_fit import Hold, images
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import Model
+
+_HALF_OCTAVE = 0.5 * np.log(2.0)
+"""logarithm of how far a local fit to a measured response reaches to either side"""
+_PRECISE = 0.03
+"""relative random error of bins up to which it is so; with larger ones it reaches further, to an
+octave"""
+_LEAST_BINS = 7
+"""in a local fit, which reaches further where there are fewer"""
+_COHERENT = 0.6
+"""mean coherence over an octave from which on a response is taken for the input's: Tischler and
+Remple, Aircraft and Rotorcraft System Identification (2012)"""
+
+
+class Point(NamedTuple):
+    """A response at k frequencies, and what it hangs on: q numbers of unit variance."""
+
+    log_gain: Float[np.ndarray, " k"]
+    """natural logarithm"""
+    phase: Float[np.ndarray, " k"]
+    """[rad], on any branch"""
+    gain_slope: Float[np.ndarray, " k"]
+    """by the logarithm of the frequency"""
+    phase_slope: Float[np.ndarray, " k"]
+    """[rad] likewise"""
+    gain_gradient: Float[np.ndarray, "k q"]
+    """of the logarithm of the gain; NaN where no error is known"""
+    phase_gradient: Float[np.ndarray, "k q"]
+    """[rad]"""
+
+    @property
+    def response(self) -> Complex[np.ndarray, " k"]:
+        """The response itself."""
+        return np.exp(self.log_gain + 1j * self.phase)
+
+    @property
+    def gain_sd(self) -> Float[np.ndarray, " k"]:
+        """Of the logarithm of the gain."""
+        return np.linalg.norm(self.gain_gradient, axis=1)
+
+    @property
+    def phase_sd(self) -> Float[np.ndarray, " k"]:
+        """[rad]"""
+        return np.linalg.norm(self.phase_gradient, axis=1)
+
+
+class Curve(NamedTuple):
+    """A response at any frequency of a band."""
+
+    at: Callable[[Float[np.ndarray, " k"]], Point]
+    """by frequency [rad/s]"""
+    band: tuple[float, float]
+    """[rad/s]"""
+
+
+def integrated(curve: Curve) -> Curve:
+    """The response of an angle, from that of its rate."""
+
+    def at(omega: np.ndarray) -> Point:
+        p = curve.at(omega)
+        return p._replace(
+            log_gain=p.log_gain - np.log(omega),
+            phase=p.phase - 0.5 * np.pi,
+            gain_slope=p.gain_slope - 1.0,
+        )
+
+    return Curve(at, curve.band)
+
+
+def times(curve: Curve, gain: float) -> Curve:
+    """The response with a positive gain that is known, such as a loop's."""
+
+    def at(omega: np.ndarray) -> Point:
+        p = curve.at(omega)
+        return p._replace(log_gain=p.log_gain + np.log(gain))
+
+    return Curve(at, curve.band)
+
+
+def without_hold(
+    omega: Float[np.ndarray, " k"], H: Complex[np.ndarray, " k"], hold: Hold
+) -> Complex[np.ndarray, " k"]:
+    """A sampled record's response without what the input does between samples.
+
+    The images about multiples of the rate stay in it; an attitude hardly has any.
+    """
+    _, share = images(omega, hold)
+    return H / share[:, share.shape[1] // 2]
+
+
+def octave_mean(
+    omega: Float[np.ndarray, " k"], coherence: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Mean coherence (k,) over an octave; zero where there is none.
+
+    Single frequencies that reach a limit by chance have too large a gain, by the same chance.
+    """
+    octaves = np.log2(omega)
+    near = np.abs(octaves[:, None] - octaves[None, :]) <= 0.5
+    seen = np.isfinite(coherence)
+    count = near @ seen.astype(float)
+    mean = near @ np.where(seen, coherence, 0.0) / np.maximum(count, 1.0)
+    return np.where(seen, mean, 0.0)
+
+
+def measured_curve(
+    omega: Float[np.ndarray, " k"],
+    H: Complex[np.ndarray, " k"],
+    sd: Float[np.ndarray, " k"],
+    coherence: Float[np.ndarray, " k"],
+    window: float,
+) -> Curve | str:
+    """A measured response by local quadratics in logarithms, or why there is none in words.
+
+    Gain and phase are fitted over half an octave to either side, up to an octave where errors are
+    large, each bin by its random error.
+    Errors of bins that one window hardly tells apart are correlated: independent ones are 1.95
+    lines of the window apart. The band is the widest one of coherence 0.6 in the mean over an
+    octave.
+
+    Args:
+        omega: (k,) [rad/s], rising.
+        H: (k,) NaN where it is not known.
+        sd: (k,) of its real and of its imaginary part.
+        coherence: (k,) partial.
+        window: length of the Hann windows [s].
+    """
+    known = (octave_mean(omega, coherence) >= _COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
+    run = _widest(np.log(omega), known)
+    if run.size < _LEAST_BINS:
+        return f"its coherence stays below {_COHERENT} in the mean over an octave"
+    w, H, relative = omega[run], H[run], sd[run] / np.abs(H[run])
+    x = np.log(w)
+    y = np.stack([np.log(np.abs(H)), np.unwrap(np.angle(H))], axis=1)
+    root = _root(w, relative, window)
+
+    def at(query: np.ndarray) -> Point:
+        value, slope = _local(x, np.log(query), relative)
+        gradient, nothing = value @ root, np.zeros((query.size, run.size))
+        # What phase rests on are other numbers than what gain does: both errors are independent.
+        log, steep = value @ y, slope @ y
+        return Point(
+            log[:, 0],
+            log[:, 1],
+            steep[:, 0],
+            steep[:, 1],
+            np.concatenate([gradient, nothing], axis=1),
+            np.concatenate([nothing, gradient], axis=1),
+        )
+
+    return Curve(at, (float(w[0]), float(w[-1])))
+
+
+def _widest(x: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Indices of the longest stretch of x without a gap."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    runs = [np.arange(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return max(runs, key=lambda r: x[r[-1]] - x[r[0]], default=np.zeros(0, int))
+
+
+def _root(omega: np.ndarray, relative: np.ndarray, window: float) -> np.ndarray:
+    """(k, k) R with R R' the covariance of the relative errors of the bins."""
+    lines = (omega[:, None] - omega[None, :]) * window / (2.0 * np.pi)
+    # The transform of the squared Hann window; two bins share the square of that.
+    shares = ((0.0, 3.0 / 8.0), (1.0, 0.25), (-1.0, 0.25), (2.0, 1.0 / 16.0), (-2.0, 1.0 / 16.0))
+    shared = sum(c * np.sinc(lines - m) for m, c in shares) / (3.0 / 8.0)
+    covariance = relative[:, None] * relative[None, :] * shared**2
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _local(x: np.ndarray, query: np.ndarray, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (l, k) that make of values at x those of local quadratics at the queries, and their
+    slopes."""
+    d = x[None, :] - query[:, None]
+    # Further where errors are larger, as the least mean squared error of local quadratics asks.
+    size = np.interp(query, x, octave_mean(np.exp(x), relative))
+    reach = _HALF_OCTAVE * np.clip((size / _PRECISE) ** (2.0 / 7.0), 1.0, 2.0)
+    reach = np.maximum(reach, 1.01 * np.sort(np.abs(d), axis=1)[:, _LEAST_BINS - 1])
+    d = d / reach[:, None]
+    # By the errors too, but not so that one bin has it all.
+    precise = 1.0 / (relative**2 + np.median(relative) ** 2)
+    weights = np.maximum(1.0 - d**2, 0.0) ** 2 * precise
+    X = np.stack([np.ones_like(d), d, d**2], axis=2)
+    normal = np.einsum("lka,lk,lkb->lab", X, weights, X)
+    rows = np.linalg.solve(normal, np.swapaxes(X * weights[:, :, None], 1, 2))
+    return rows[:, 0], rows[:, 1] / reach[:, None]
+
+
+class LinearResponses(NamedTuple):
+    """A model's matrices about a point, and their derivatives by q parameters.
+
+    The arrays are NumPy's: derivatives have the parameters first.
+    """
+
+    model: Model
+    matrices: tuple[np.ndarray, ...]
+    """A, B, C, D"""
+    derivatives: tuple[np.ndarray, ...]
+    """(q, ...) of each"""
+    delays: dict[str, tuple[float, np.ndarray]]
+    """[s] of inputs, and its derivative (q,)"""
+
+
+# Parameters, state and inputs are records of the model's own classes: Any.
+
+
+def linear_responses(
+    model: Model, params: Any, names: Sequence[str], state: Any = None, inputs: Any = None
+) -> LinearResponses:
+    """The model's matrices at a point with their derivatives by some parameters.
+
+    The point stays where it is: of a model that is not linear, how it moves with the parameters
+    is left out.
+
+    Args:
+        model: with n states.
+        params: its parameters, SI.
+        names: of those that derivatives are taken by.
+        state: the model's initial state unless given.
+        inputs: zeros unless given.
+    """
+    late = dict(model.delays)
+
+    def of(values: Array) -> tuple[Any, Any]:
+        here = naming.replace(params, **dict(zip(names, values, strict=True)))
+        matrices = tuple(jacobians(model, here, state, inputs))
+        delays = {n: jnp.asarray(getattr(here, p), float) for n, p in late.items()}
+        return (matrices, delays), (matrices, delays)
+
+    values = jnp.stack([jnp.asarray(getattr(params, n), float) for n in names] or [jnp.zeros(())])
+    if names:
+        slopes, (matrices, delays) = jax.jacfwd(of, has_aux=True)(values)
+    else:
+        (matrices, delays), _ = of(values[:0])
+        slopes = jax.tree.map(lambda v: jnp.zeros((*v.shape, 0)), (matrices, delays))
+    matrices, delays, slopes = jax.device_get((matrices, delays, slopes))
+    first = tuple(np.moveaxis(np.asarray(d), -1, 0) for d in slopes[0])
+    by_input = {n: (float(v), np.asarray(slopes[1][n])) for n, v in delays.items()}
+    return LinearResponses(model, tuple(np.asarray(M) for M in matrices), first, by_input)
+
+
+class Acting(NamedTuple):
+    """What an input does before it acts on the model, and the derivatives by q parameters."""
+
+    gain: float = 1.0
+    late: float = 0.0
+    """[s]"""
+    by_gain: np.ndarray | None = None
+    by_late: np.ndarray | None = None
+
+
+def modelled_curve(
+    of: LinearResponses,
+    pair: tuple[str, str],
+    root: Float[np.ndarray, "q r"],
+    band: tuple[float, float],
+    acting: Acting = Acting(),
+) -> Curve:
+    """A model's continuous response, delays included, with errors by those of its parameters.
+
+    Args:
+        of: the matrices.
+        pair: input and output.
+        root: (q, r) R with R R' the covariance of the parameters; NaN where it is not known.
+        band: [rad/s]
+        acting: gain and delay of the input that were estimated.
+    """
+    j = naming.names(of.model.Inputs).index(pair[0])
+    i = naming.names(of.model.Outputs).index(pair[1])
+    (A, B, C, D), (dA, dB, dC, dD) = of.matrices, of.derivatives
+    q, zero = dA.shape[0], np.zeros(dA.shape[0])
+    late, by_late = of.delays.get(pair[0], (0.0, zero))
+    late = late + acting.late
+    by_late = by_late + (zero if acting.by_late is None else acting.by_late)
+    by_gain = zero if acting.by_gain is None else acting.by_gain / acting.gain
+    # A parameter that is not known only matters where the response hangs on it.
+    known = np.isfinite(root).all(axis=1)
+    certain = np.where(known[:, None], root, 0.0)
+
+    def gradient(by: np.ndarray) -> np.ndarray:
+        open_ = np.any((np.abs(by) > 1e-12) & ~known[None, :], axis=1)
+        return np.where(open_[:, None], np.nan, by @ certain)
+
+    def at(omega: np.ndarray) -> Point:
+        s = 1j * omega[:, None, None] * np.eye(A.shape[0])
+        x = np.linalg.solve(s - A, B[None, :, j : j + 1].astype(complex))[:, :, 0]
+        y = np.linalg.solve(s - A.T, C[i][None, :, None].astype(complex))[:, :, 0]
+        H = x @ C[i] + D[i, j]
+        by = np.einsum("km,qmn,kn->kq", y, dA, x, optimize=True) if q else np.zeros((omega.size, 0))
+        by = by + x @ dC[:, i].T + y @ dB[:, :, j].T + dD[:, i, j]
+        with np.errstate(all="ignore"):
+            relative = by / H[:, None] + by_gain - 1j * omega[:, None] * by_late
+            steep = omega * (-1j * np.sum(y * x, axis=1) / H - 1j * late)
+            log = np.log(H * acting.gain) - 1j * omega * late
+        return Point(
+            log.real, log.imag, steep.real, steep.imag,
+            gradient(relative.real), gradient(relative.imag),
+        )  # fmt: skip
+
+    return Curve(at, band)

@@ -1,0 +1,285 @@
+"""Errors of frequency responses between inputs and outputs together: covariance and whitening.
+
+With Z, U, E the transforms of instruments, inputs and errors in each window, the response that is
+left in the errors is dH = S_zu^-1 S_ze. Given the inputs, its covariance between outputs i and j is
+
+    P_i V_ij P_j^H S_ij,    P = S_zu^-1,
+
+with S the noise's spectral matrix and V_ij the sum of conj(Z) Z over windows that both outputs
+have, overlapping ones by their correlation: exact for a chirp too, whose power at one frequency is
+in one window.
+
+Sources: Bendat and Piersol, Random Data (2010), chapter 9; Pintelon and Schoukens (2012), chapter
+2, for the estimate by instrument.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from heli_jax.analysis.response_curves import octave_mean
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.spectral import inverse
+from heli_jax.analysis.windowed import PER_AVERAGE, Windowed, hann
+
+_LEAST, _PART = 2.0, 0.08
+"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines of the window at
+least, and as a part of the frequency"""
+_NEIGHBOURS = 3
+"""lines to either side with which a line is correlated in Hann windows"""
+_ROUNDING = 1e-14
+"""of a signal's density, below which noise is not taken to fall"""
+_SMALLEST = 1e-9
+"""eigenvalue of the noise's matrix of coherences: outputs that were computed from one another have
+none of their own"""
+
+
+class Averages(NamedTuple):
+    """What the inputs alone say of the responses' errors; p outputs, m inputs, k lines."""
+
+    P: np.ndarray
+    """(p, k, m, m) inverses of the cross-spectra from instruments to inputs, of the windows that
+    each output has; NaN where inputs move as one"""
+    V: np.ndarray
+    """(p, p, k, m, m) covariance of the cross-spectra over the density of the noise"""
+    share: np.ndarray
+    """(p, k, m) of each error how much of an independent one it is: errors at neighbouring lines
+    are correlated, and responses are smooth"""
+    power: np.ndarray
+    """(k,) of white noise in a window over its density: less than 1 at the first line, of which the
+    mean takes a part"""
+
+
+class _Correlations(NamedTuple):
+    """Of the transforms of white noise at each line with those at the d-th line after it, (k,)."""
+
+    same: np.ndarray
+    """in one window"""
+    before: np.ndarray
+    """in the window half a length after it"""
+    after: np.ndarray
+    """in the window half a length before it"""
+
+
+def averages(w: Windowed) -> Averages:
+    """Of flights in windows."""
+    p, m, k = len(w.outputs), len(w.inputs), len(w.numbers)
+    P, share, V = [], [], np.zeros((p, p, k, m, m), complex)
+    turns = np.outer(w.lines, np.arange(w.length)) / w.length
+    g = hann(w.length) * np.exp(-2j * np.pi * turns)
+    g = g - np.mean(g, axis=1, keepdims=True)
+    near = [_correlations(g, d) for d in range(min(_NEIGHBOURS + 1, k))]
+    # Most outputs miss samples in the same windows, or nowhere: each case once.
+    inverses: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    spreads: dict[tuple[bytes, bytes], np.ndarray] = {}
+    keys = [w.seen[:, j].tobytes() for j in range(p)]
+    for i, first in enumerate(keys):
+        seen = w.seen[:, i]
+        for j, second in enumerate(keys):
+            if (first, second) not in spreads:
+                spreads[first, second] = _spread(w, seen, w.seen[:, j], near[0])
+            V[i, j] = spreads[first, second]
+        if first not in inverses:
+            S = _cross(seen, w.Z, w.U)
+            z, u = (_cross(seen, v, v) for v in (w.Z, w.U))
+            of_case = inverse(S, *(np.real(np.einsum("kaa->ka", v)) for v in (z, u)))
+            inverses[first] = of_case, _share(w, seen, np.nan_to_num(of_case), near)
+        P.append(inverses[first][0])
+        share.append(inverses[first][1])
+    return Averages(np.stack(P), V, np.stack(share), np.real(near[0].same))
+
+
+def _cross(seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, m, m) mean over the windows seen of conj(a) b."""
+    return np.einsum("w,wkx,wky->kxy", seen, np.conj(a), b, optimize=True) / np.sum(seen)
+
+
+def _correlations(g: np.ndarray, d: int) -> _Correlations:
+    """Of windows times the turning of each line (k, samples), less their means."""
+    half, size = g.shape[1] // 2, np.sum(hann(g.shape[1]) ** 2)
+    a, b = g[: len(g) - d], np.conj(g[d:])
+    same = np.sum(a * b, axis=1)
+    before = np.sum(a[:, half:] * b[:, :half], axis=1)
+    after = np.sum(a[:, :half] * b[:, half:], axis=1)
+    return _Correlations(same / size, before / size, after / size)
+
+
+def _spread(w: Windowed, first: np.ndarray, second: np.ndarray, c: _Correlations) -> np.ndarray:
+    """(k - d, m, m) covariance of two means of conj(Z) E of white noise E of density 1, the second
+    at the d-th line after the first."""
+    d = len(w.numbers) - len(c.same)
+    a = first[:, None, None] * w.Z[:, : len(c.same)]
+    b = second[:, None, None] * w.Z[:, d:]
+    both = w.follows
+
+    def summed(x: np.ndarray, y: np.ndarray, correlation: np.ndarray) -> np.ndarray:
+        products = np.einsum("wkx,wky->kxy", np.conj(x), y, optimize=True)
+        return correlation[:, None, None] * products
+
+    total = summed(a, b, c.same) + summed(a[:-1][both], b[1:][both], c.before)
+    total = total + summed(a[1:][both], b[:-1][both], c.after)
+    return total / (np.sum(first) * np.sum(second))
+
+
+def _share(w: Windowed, seen: np.ndarray, P: np.ndarray, near: list[_Correlations]) -> np.ndarray:
+    """(k, m) one over the sum of an error's correlations with those at the lines around it."""
+    size, total = np.ones(P.shape[:2]), np.ones(P.shape[:2])
+    for d, c in enumerate(near):
+        k = len(c.same)
+        V = _spread(w, seen, seen, c)
+        C = np.real(np.einsum("kxa,kab,kxb->kx", P[:k], V, np.conj(P[d:]), optimize=True))
+        if d == 0:
+            size = np.sqrt(np.maximum(C, 1e-300))
+            continue
+        # Where they alternate nothing is gained: no response moves that fast.
+        rho = np.maximum(C / (size[:k] * size[d:]), 0.0)
+        total[:k] += rho
+        total[d:] += rho
+    return 1.0 / total
+
+
+def response_of(
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+) -> Complex[np.ndarray, "k p m"]:
+    """The response dH from the inputs that errors have; NaN where inputs move as one.
+
+    Args:
+        w: the flights in windows.
+        at: of these.
+        E: errors, or the outputs themselves; zero in windows that an output does not have.
+    """
+    S = np.einsum("wkz,wkp->kpz", np.conj(w.Z), E, optimize=True)
+    S = S / np.sum(w.seen, axis=0)[None, :, None]
+    return np.einsum("pkmz,kpz->kpm", at.P, S)
+
+
+def noise_density(
+    w: Windowed, at: Averages, E: Complex[np.ndarray, "W k p"]
+) -> Complex[np.ndarray, "k p p"]:
+    """The spectral matrix of what no response explains of the errors, smoothed over frequency.
+
+    Args:
+        w: the flights in windows.
+        at: of these.
+        E: errors (W, k, p); zero in windows that an output does not have.
+    """
+    own = np.real(np.einsum("kii->ki", _left(w, E, w.seen)))
+    power = np.mean(np.abs(w.Y) ** 2, axis=(0, 1))
+    floor = np.maximum(_ROUNDING * power, 1e-300)
+    if not w.together:
+        return _definite(own[:, :, None] * np.eye(own.shape[1]), floor) / at.power[:, None, None]
+    # Coherences from windows that all outputs have: those of pairs would contradict one another,
+    # and the noise that seems to be left of several outputs with a common one would be anything.
+    S = _left(w, E, np.repeat(w.common[:, None], own.shape[1], axis=1))
+    size = np.sqrt(np.maximum(own, floor) / np.maximum(np.real(np.einsum("kii->ki", S)), floor))
+    return _definite(S * size[:, :, None] * size[:, None, :], floor) / at.power[:, None, None]
+
+
+def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(k, p, p) smooth spectral matrix of what the inputs leave of errors in the windows seen
+    (W, p); of outputs with other windows than one another only the diagonal is sound."""
+    P = []
+    for mask in seen.T:
+        z, u = (np.real(np.einsum("kaa->ka", _cross(mask, v, v))) for v in (w.Z, w.U))
+        P.append(np.nan_to_num(inverse(_cross(mask, w.Z, w.U), z, u)))
+    S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
+    dH = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
+    D = (E - np.einsum("wkm,kpm->wkp", w.U, dH, optimize=True)) * seen[:, None, :]
+    # Each input takes one of the independent averages for its own response.
+    freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
+    S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
+    S = S / np.sqrt(freedom[:, None] * freedom[None, :])
+    width = np.maximum(_LEAST, _PART * w.lines)
+    kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
+    return np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
+
+
+def _definite(S: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """A spectral matrix (k, p, p) that has an inverse; `floor` (p,) of its diagonal."""
+    power = np.maximum(np.real(np.einsum("kii->ki", S)), floor)
+    scale = np.sqrt(power)
+    rho = S / (scale[:, :, None] * scale[:, None, :])
+    # Of more outputs than averages, or of some that were computed from others, none is left.
+    values, vectors = np.linalg.eigh(0.5 * (rho + np.conj(np.swapaxes(rho, 1, 2))))
+    rho = np.einsum("kia,ka,kja->kij", vectors, np.maximum(values, _SMALLEST), np.conj(vectors))
+    return rho * scale[:, :, None] * scale[:, None, :]
+
+
+def covariance(at: Averages, S: Complex[np.ndarray, "k p p"]) -> Complex[np.ndarray, "k p m p m"]:
+    """Of the errors of all responses at one frequency.
+
+    Args:
+        at: what the inputs say.
+        S: the noise's spectral matrix.
+    """
+    P = np.nan_to_num(at.P)
+    return np.einsum("ikxa,ijkab,jkyb,kij->kixjy", P, at.V, np.conj(P), S, optimize=True)
+
+
+def whitening(
+    at: Averages, S: Complex[np.ndarray, "k p p"], used: Bool[np.ndarray, "k p m"]
+) -> Complex[np.ndarray, "k r r"]:
+    """What makes rows of variance 1 of the errors of the responses that are used, independent of
+    one another at a line; the rows of the others are zero. r = p m.
+
+    Args:
+        at: what the inputs say.
+        S: the noise's spectral matrix.
+        used: which responses at which frequencies.
+    """
+    k, p, m = used.shape
+    taken = used.reshape(k, -1)
+    C = covariance(at, S).reshape(k, p * m, p * m)
+    size = np.sqrt(np.real(np.einsum("krr->kr", C)))
+    # A response that is not used is one of variance 1 that goes with no other.
+    scale = np.where(taken & (size > 0), size, 1.0)
+    both = taken[:, :, None] & taken[:, None, :]
+    C = np.where(both, C / (scale[:, :, None] * scale[:, None, :]), 0.0)
+    C = C + np.eye(p * m) * ~taken[:, None, :]
+    return np.linalg.inv(np.linalg.cholesky(C)) / scale[:, None, :] * taken[:, :, None]
+
+
+def partial_coherence(w: Windowed, at: Averages) -> Float[np.ndarray, "k p m"]:
+    """Of each output with each input, what the others explain taken out; 0 where inputs move as
+    one."""
+    H = response_of(w, at, w.Y)
+    left = (w.Y - np.einsum("wkm,kpm->wkp", w.U, np.nan_to_num(H))) * w.seen[:, None, :]
+    density = np.sum(np.abs(left) ** 2, axis=0) / np.sum(w.seen, axis=0)
+    spread = [
+        np.einsum("kxa,kab,kxb->kx", P, _cross(w.seen[:, j], w.Z, w.Z), np.conj(P), optimize=True)
+        for j, P in enumerate(at.P)
+    ]
+    error = density[:, :, None] * np.real(np.stack(spread, axis=1))
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(np.abs(H) ** 2 / (np.abs(H) ** 2 + error))
+
+
+def pairs_used(
+    w: Windowed,
+    options: ResponseOptions,
+    coherence: Float[np.ndarray, "k p m"],
+    sound: Bool[np.ndarray, "k p m"],
+) -> Bool[np.ndarray, "k p m"]:
+    """Which responses take part at which frequencies.
+
+    Args:
+        w: the flights in windows.
+        options: pairs, bands and coherences asked for.
+        coherence: partial.
+        sound: where there is a response at all.
+    """
+    used = np.zeros(sound.shape, bool)
+    omega = 2.0 * np.pi * w.hz
+    everything = tuple(PairOptions(i, o) for i in w.inputs for o in w.outputs)
+    for pair in options.pairs or everything:
+        if pair.input not in w.inputs or pair.output not in w.outputs:
+            continue
+        at = (slice(None), w.outputs.index(pair.output), w.inputs.index(pair.input))
+        low, high = pair.band or (0.0, np.inf)
+        least = options.coherence if pair.coherence is None else pair.coherence
+        # The mean over an octave: a single frequency that reaches a limit by chance has too large
+        # a gain by the same chance.
+        enough = octave_mean(omega, coherence[at]) >= least
+        used[at] = sound[at] & enough & (w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))
+    return used

@@ -1,0 +1,197 @@
+r"""Instruments: excitations that were added to inputs and logged, and that no feedback reaches.
+
+What of an input follows them, $\hat U = S_{ur} S_{rr}^{-1} R$, knows nothing of gusts and noise,
+also where a pilot or an autopilot brings both into the input itself.
+
+Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 9; Stock and Yogo
+(2005) for what is a weak instrument.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.errors import nearest
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
+
+PART = 0.05
+"""sd of the Gaussian that smooths the inputs' spectra, as a part of the frequency"""
+_ALONE = 1e-9
+"""of the instruments' power, below which two of them move as one"""
+_STRONG = 16.4
+"""F of the inputs' regression on the instruments from which on an interval of 95 % holds in 90 % of
+all cases at least"""
+
+
+def instruments_of(problem: Problem) -> tuple[str, ...]:
+    """The inputs that are taken by their instrument: those asked for, or all that have one.
+
+    Args:
+        problem: its flights hold the instruments.
+    """
+    if problem.instrument is not None:
+        return tuple(problem.instrument)
+    known = naming.names(problem.model.Inputs)
+    return tuple(n for n in known if _lacks(problem.training, n) is None)
+
+
+def _lacks(flights: Sequence[Flight], name: str) -> str | None:
+    """Why flights have no instrument of an input, in words; None where they have."""
+    for flight in flights:
+        if name not in flight.instruments:
+            return f"{flight.name or 'a flight'} holds none (signals.instruments)"
+    if not any(np.ptp(f.instruments[name]) > 0 for f in flights):
+        return "it moves in no flight"
+    return None
+
+
+def absent_instrument(problem: Problem) -> str | None:
+    """Which instrument that was asked for is not there; None where all are.
+
+    Args:
+        problem: its flights hold the instruments.
+    """
+    known = naming.names(problem.model.Inputs)
+    for name in problem.instrument or ():
+        if name not in known:
+            return (
+                f"instrument {name!r}: model {problem.model.name} has no such input"
+                f"{nearest(name, known)}"
+            )
+        why = _lacks(problem.training, name)
+        if why is not None:
+            return f"instrument of {name}: {why}; expected one in every flight, or instrument: none"
+    return None
+
+
+def instrumented_inputs(
+    problem: Problem, flights: Sequence[Flight]
+) -> tuple[dict[str, np.ndarray], ...] | None:
+    """By flight and input what of it follows the instruments (N,), SI; the input itself where it
+    has none. None where no input has one.
+
+    Args:
+        problem: says which are used.
+        flights: those of a layout, in its order.
+    """
+    names = instruments_of(problem)
+    if not names or any(n not in f.instruments for f in flights for n in names):
+        return None
+    r = [np.stack([f.instruments[n] for n in names], axis=1) for f in flights]
+    return following(flights, names, r)
+
+
+def following(
+    flights: Sequence[Flight], names: Sequence[str], signals: Sequence[Float[np.ndarray, "N r"]]
+) -> tuple[dict[str, np.ndarray], ...]:
+    """By flight and input what of it follows signals (N,): of the named inputs, others as they are.
+
+    Args:
+        flights: with the inputs.
+        names: the inputs in question.
+        signals: by flight the signals, the same ones in each.
+    """
+    U = [_lines(np.stack([f.inputs[n] for n in names], axis=1)) for f in flights]
+    R = [_lines(r) for r in signals]
+    m, out = len(names), []
+    spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
+    for flight, S, lines in zip(flights, spectra, R, strict=True):
+        size = np.sqrt(np.real(np.einsum("kii->ki", S[:, m:, m:])))
+        size = np.where(size > 0, size, 1.0)
+        # In coherences, so that units do not count; two signals that move as one share an effect.
+        shared = S[:, m:, m:] / (size[:, :, None] * size[:, None, :])
+        shared = shared + _ALONE * np.eye(shared.shape[1])
+        part = np.linalg.solve(shared, (lines / size)[:, :, None])[:, :, 0]
+        estimate = np.einsum("kur,kr->ku", S[:, :m, m:] / size[:, None, :], part)
+        columns = _in_time(estimate, flight.n_samples)
+        by_name = {n: columns[:, j] + np.mean(flight.inputs[n]) for j, n in enumerate(names)}
+        out.append({**flight.inputs, **by_name})
+    return tuple(out)
+
+
+def _lines(v: Float[np.ndarray, "N c"]) -> np.ndarray:
+    """At the frequencies between zero and Nyquist's."""
+    N = len(v)
+    return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + (N - 1) // 2] / np.sqrt(N)
+
+
+def _in_time(lines: np.ndarray, N: int) -> Float[np.ndarray, "N c"]:
+    whole = np.zeros((N // 2 + 1, lines.shape[1]), complex)
+    whole[1 : 1 + len(lines)] = lines * np.sqrt(N)
+    return np.fft.irfft(whole, N, axis=0)
+
+
+class Strength(NamedTuple):
+    """What the instruments tell of one unknown."""
+
+    share: float
+    """of the information that the inputs hold, the part that follows the instruments: their
+    coherence where that information lies"""
+    F: float
+    """of a regression with that coherence; below 16.4 an instrument is weak"""
+
+
+def strengths(at: Solution) -> dict[str, Strength]:
+    """By unknown of interest what the instruments tell of it.
+
+    Args:
+        at: where a fit by instrument ended.
+    """
+    layout, data, noise, z = at
+
+    def sds(by: float) -> np.ndarray:
+        # The same program either way, and the same weights.
+        J = evaluate(layout, data, noise._replace(by_instrument=np.asarray(by)), z).J
+        return deviations(J)[: len(layout.of_interest)]
+
+    with np.errstate(all="ignore"):
+        shares = np.clip(np.nan_to_num((sds(0.0) / sds(1.0)) ** 2), 0.0, 1.0)
+    # Each instrument takes its part of them.
+    n = AVERAGES * len(data.flights) / max(len(_by_instrument(data)), 1)
+    return {
+        name: Strength(float(share), float(n * share / max(1.0 - share, 1e-12)))
+        for name, share in zip(layout.of_interest, shares, strict=True)
+    }
+
+
+def _by_instrument(data: Data) -> tuple[str, ...]:
+    """The inputs that are taken by their instrument."""
+    first = data.flights[0]
+    inputs, by = naming.asdict(first.inputs), naming.asdict(first.by_instrument)
+    return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
+
+
+def instrument_notes(layout: Layout, data: Data, noise: Noise, z: np.ndarray) -> list[str]:
+    """Of which unknowns the instruments tell too little, and what a likelihood is then.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: at the optimum.
+        z: the unknowns there.
+    """
+    if data.flights[0].by_instrument is None:
+        return []
+    notes = [
+        f"By instrument ({', '.join(_by_instrument(data))}): the estimates solve equations and "
+        "have no likelihood, so that there is no AIC or BIC; a profile is that of the equations' "
+        "sum of squares, which has the same limits."
+    ]
+    weak = {n: s for n, s in strengths(Solution(layout, data, noise, z)).items() if s.F < _STRONG}
+    if weak:
+        words = ", ".join(f"{n} ({100.0 * s.share:.2g} %)" for n, s in weak.items())
+        notes.insert(
+            0,
+            "Weak instrument: of what the inputs tell of these parameters only a small part "
+            f"follows the excitation ({words}; F below {_STRONG:g}): their estimates lean towards "
+            "the direct one and intervals may be too narrow. Remedy: a stronger excitation at the "
+            "frequencies that they act at, or longer records.",
+        )
+    return notes

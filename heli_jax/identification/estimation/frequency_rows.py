@@ -1,0 +1,106 @@
+r"""The rows that frequency error makes small: as many as unknowns, and one for what is left.
+
+With whitened errors $e$, their derivatives $J$ by the unknowns and instruments $Z$, the estimate
+solves $Z^T e = 0$. The rows $r = R^{-T} Z^T e$ with $R^T R = Z^T Z$ have the identity as their
+covariance, and their derivative $R^{-T} Z^T J$ the information of the estimate,
+$M^T (Z^T Z)^{-1} M$ with $M = Z^T J$. Directly $Z = J$, and with the row $|e - J J^+ e|$ beside
+them the sum of squares is that of all errors: maximum likelihood, in a few rows. By instrument $Z$
+are the derivatives of the response to what of the inputs follows the instruments.
+
+Sources: Söderström and Stoica (1983) for estimates by instrument and their covariance; Pintelon and
+Schoukens (2012), chapter 9.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from heli_jax.identification.estimation.frequency_lines import all_lines
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+
+_NOTHING = 100.0
+"""times the machine's precision: what of the information, of columns of one size, is rounding"""
+
+
+def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Float[Array, " r"]:
+    """Those rows, with the derivative that a step of Gauss and Newton needs.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: with the whitening of each record, and whether instruments are used.
+        u: the unknowns, in the units of the model.
+    """
+    v = _vector(layout, u)
+    at, rest = jax.lax.stop_gradient((v, u))
+
+    def rows(v: Array) -> _Rows:
+        lines = all_lines(layout, data, noise, _with(layout, rest, v))
+        return _Rows(*(jnp.concatenate([one[i] for one in lines]) for i in range(1, 5)))
+
+    def along(direction: Array) -> Any:
+        return jax.jvp(rows, (at,), (direction,))
+
+    e, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(v.size, dtype=v.dtype))
+    Z, Z_ends = slopes.errors, slopes.ends
+    if slopes.by.shape[1]:
+        # One program for both: the direct estimate is where the search by instrument begins.
+        by = noise.by_instrument > 0.5
+        Z, Z_ends = jnp.where(by, slopes.by, Z), jnp.where(by, slopes.by_ends, Z_ends)
+    r, M = _weighed(_Rows(e.errors, e.ends, Z, Z_ends), slopes)
+    left = jnp.sum(e.errors**2) - jnp.sum(e.ends**2) - jnp.sum(r**2)
+    left = jnp.where(noise.by_instrument > 0.5, 0.0, jnp.sqrt(jnp.maximum(left, 0.0)))
+    r, M, left = jax.lax.stop_gradient((r, M, left))
+    # The derivative is exactly M, whatever else moves with the unknowns.
+    return jnp.append(r + M @ (v - at), left)
+
+
+class _Rows(NamedTuple):
+    """Whitened errors and instruments with their components along what the ends of the records may
+    add, or the derivatives of all of them, an unknown a row."""
+
+    errors: Float[Array, "... n"]
+    ends: Float[Array, "... m"]
+    by: Float[Array, "... n"]
+    by_ends: Float[Array, "... m"]
+
+
+def _weighed(e: _Rows, J: _Rows) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T, all without what the ends may add; zero along
+    what is no direction of Z.
+
+    Args:
+        e: the errors (n,), and Z (q, n).
+        J: their derivatives (q, n).
+    """
+    # Z P e and Z P J^T with the projection P: only the small products change (Kaufman).
+    information = e.by @ e.by.T - e.by_ends @ e.by_ends.T
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 0.0))
+    # Of one size: units do not decide what is rounding.
+    over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(information * over[:, None] * over[None, :])
+    kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
+    along = root[:, None] * vectors.T * over[None, :]
+    r = e.by @ e.errors - e.by_ends @ e.ends
+    return along @ r, along @ (e.by @ J.errors.T - e.by_ends @ J.ends.T)
+
+
+def _vector(layout: Layout, u: Unknowns) -> Float[Array, " q"]:
+    """The unknowns that lines depend on: all but initial states, biases and offsets."""
+    params, gains = [u.params[n] for n in layout.free], [u.gains[n] for n in layout.gains]
+    shift = [] if u.shift is None else [u.shift]
+    return jnp.stack([jnp.asarray(v) for v in (*params, *gains, *shift)])
+
+
+def _with(layout: Layout, u: Unknowns, v: Float[Array, " q"]) -> Unknowns:
+    """The unknowns with those of a vector in place."""
+    # By the layout's order: JAX sorts the names in every dictionary that it has taken apart.
+    values = dict(zip((*layout.free, *layout.gains), v, strict=False))
+    return u._replace(
+        params={n: values[n] for n in layout.free},
+        gains={n: values[n] for n in layout.gains},
+        shift=None if u.shift is None else v[-1],
+    )

@@ -1,0 +1,89 @@
+"""Spectra of records at their own frequencies, smoothed over frequency and over records.
+
+Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012), chapter 10.
+"""
+
+import functools
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+LEAST, PART = 6.0, 0.08
+"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines at least, and as a
+part of the frequency. Narrower ones follow the noise itself: intervals are then too narrow"""
+AVERAGES = 2.0 * np.pi**0.5 * LEAST
+"""independent lines of one record in a smoothed spectrum, at least: (sum w)^2 / sum w^2"""
+_ROUNDING = 1e-10
+"""of the mean over all frequencies, below which a spectrum is not taken to fall"""
+_KNOTS = 4.0
+"""in one sd of the Gaussian: between two of them a smoothed spectrum is a straight line to a
+hundredth"""
+
+
+def smoothed(
+    lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART
+) -> list[Complex[np.ndarray, "K p p"]]:
+    """By record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
+
+    Args:
+        lines: by record at its own frequencies, those of N samples K = (N - 1) // 2.
+        part: sd of the Gaussian as a part of the frequency; six lines at least.
+    """
+    # Records of one length have one spectrum and one kernel: their powers are added first.
+    powers: dict[int, np.ndarray] = {}
+    for v in lines:
+        product = v[:, :, None] * np.conj(v[:, None, :])
+        powers[len(v)] = powers[len(v)] + product if len(v) in powers else product
+    counts = {K: sum(len(v) == K for v in lines) for K in powers}
+    spectra = {}
+    for K in powers:
+        knots, between = _knots(K, part)
+        total, weight = 0.0, 0.0
+        for other, power in powers.items():
+            kernel = _kernel(K, other, part)
+            flat = np.ascontiguousarray(power.reshape(other, -1))
+            total = total + (kernel @ flat.view(float)).view(complex)
+            weight = weight + counts[other] * kernel.sum(axis=1)
+        at_knots = (total / np.asarray(weight)[:, None]).reshape(len(knots), *power.shape[1:])
+        low, share = between
+        S = at_knots[low] + share[:, None, None] * (at_knots[low + 1] - at_knots[low])
+        floor = _ROUNDING * np.mean(np.real(np.einsum("kii->ki", S)), axis=0)
+        spectra[K] = S + np.diag(floor)[None]
+    return [spectra[len(v)] for v in lines]
+
+
+@functools.lru_cache(maxsize=16)
+def _knots(K: int, part: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
+    and how far it is on the way to the next."""
+    knots = [0]
+    while knots[-1] < K - 1:
+        width = max(LEAST, part * (knots[-1] + 1))
+        knots.append(min(knots[-1] + max(1, int(width / _KNOTS)), K - 1))
+    at = np.array(knots if K > 1 else [0, 0])
+    low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
+    share = (np.arange(K) - at[low]) / np.maximum(at[low + 1] - at[low], 1)
+    return at, (low, share)
+
+
+@functools.lru_cache(maxsize=16)
+def _kernel(K: int, other: int, part: float) -> Float[np.ndarray, "knots other"]:
+    """Weights that the lines of a record of `other` lines have at the knots of one of K."""
+    # In parts of the rate, which all records have in common.
+    f, first = (_knots(K, part)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
+    g = first * np.arange(1, other + 1)
+    width = np.maximum(LEAST * first, part * f)
+    return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
+
+
+def without_shared(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
+    """Spectra without what signals share."""
+    return S * np.eye(S.shape[1])
+
+
+def whitening_of(
+    spectra: Iterable[Complex[np.ndarray, "K p p"]],
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record L^-1, where S = L L^H: L^-1 e is white."""
+    return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)

@@ -1,0 +1,241 @@
+"""What the fit of frequency responses weighs its errors by."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Complex
+
+from heli_jax import naming
+from heli_jax.analysis.response_errors import (
+    Averages,
+    averages,
+    covariance,
+    noise_density,
+    pairs_used,
+    partial_coherence,
+    response_of,
+    whitening,
+)
+from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.windowed import Windowed, windowed
+from heli_jax.dynamics.jacobians import jacobians
+from heli_jax.dynamics.model import zeros
+from heli_jax.errors import nearest
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.linear_machine import forgets
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.input_offsets import offset_inputs
+
+# Numbers of these classes are arrays, NumPy's or JAX's once they are traced: Any or Array.
+
+
+class ResponseWeights(NamedTuple):
+    """Flights in windows, and the whitening of the errors of their responses."""
+
+    windows: Windowed
+    averages: Averages
+    """with zeros in place of what is not determined"""
+    asked: Any
+    """(k, p, m) which responses are asked for and coherent enough"""
+    coherence: Any
+    """(k, p, m) partial"""
+    simulated: tuple[bool, ...]
+    """by output whether the model is simulated and sent through the windows"""
+    used: Any
+    """(k, p, m) which take part"""
+    density: Any
+    """(k, p, p) the noise's spectral matrix, per Hz"""
+    whitening: Any
+    """(k, r, r), r = p m: rows whose squares count for as much as a line is independent"""
+    share: Any
+    """(k,) of each line how much of an independent one it is"""
+    begun: Any
+    """by flight the initial States (None where they are the model's own) and the inputs' offsets by
+    name, as they suit the record in time best; zero before these are known"""
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the whitening of the responses that take part, lines by their share."""
+        r = np.arange(self.whitening.shape[1])
+        diagonal = np.real(np.asarray(self.whitening)[:, r, r])
+        taken = np.asarray(self.used).reshape(diagonal.shape)
+        share = np.asarray(self.share)[:, None]
+        logs = np.log(np.where(taken, diagonal / np.sqrt(share), 1.0))
+        return float(np.sum(share * logs))
+
+    @property
+    def numbers(self) -> float:
+        """Independent complex ones that take part."""
+        return float(np.sum(np.asarray(self.share)[:, None, None] * np.asarray(self.used)))
+
+    @property
+    def numbers_of_noise(self) -> float:
+        """Independent real ones that the noise's spectrum is taken from."""
+        averages = np.maximum(self.windows.averages - len(self.windows.inputs), 1.0)
+        seen = np.any(np.asarray(self.used), axis=2)
+        return float(np.sum(2.0 * np.asarray(self.share)[:, None] * seen * averages))
+
+    def variance(self) -> np.ndarray:
+        """(k, p, m) of the complex error of each response"""
+        C = covariance(Averages(*(np.asarray(v) for v in self.averages)), np.asarray(self.density))
+        return np.real(np.einsum("kixix->kix", C))
+
+
+def first_weights(
+    problem: Problem, flights: Sequence[Flight], simulated: tuple[bool, ...] | None = None
+) -> ResponseWeights:
+    """Of what is measured alone: the noise is what no response explains of the outputs.
+
+    Args:
+        problem: says which responses.
+        flights: those fitted.
+        simulated: by output of the model; by the model at its start values unless given.
+
+    Raises:
+        ValueError: windows, band or pairs do not fit the flights, or too little is left.
+    """
+    options = problem.frequency
+    _require_names(problem, options)
+    w = windowed(flights, options)
+    at = averages(w)
+    sound = np.isfinite(response_of(w, at, w.Y))
+    coherence = partial_coherence(w, at)
+    at = at._replace(P=np.nan_to_num(at.P))
+    asked = pairs_used(w, options, coherence, sound)
+    _require_lines(w, options, asked)
+    forgetful = forgetful_outputs(problem, flights, w) if simulated is None else simulated
+    density = noise_density(w, at, w.Y)
+    begun = _at_rest(problem, len(flights))
+    weights = ResponseWeights(w, at, asked, coherence, forgetful, asked, density, None, None, begun)
+    weights = weighed(weights, forgetful, density)
+    _require_numbers(problem, weights)
+    return weights
+
+
+def _at_rest(problem: Problem, flights: int) -> tuple[tuple[Any, ...], tuple[dict, ...]]:
+    """Initial states and offsets of zero, in the form in which they are found later."""
+    # The same form from the beginning: another one would be compiled anew.
+    state = zeros(problem.model.State) if problem.nuisance.initial_state else None
+    offsets = {n: jnp.zeros(()) for n in offset_inputs(problem)}
+    return (state,) * flights, (offsets,) * flights
+
+
+def weighed(
+    weights: ResponseWeights, simulated: tuple[bool, ...], density: Complex[np.ndarray, "k p p"]
+) -> ResponseWeights:
+    """The same with another spectrum of the noise.
+
+    Args:
+        weights: so far.
+        simulated: by output whether the model goes through the windows.
+        density: of the noise.
+    """
+    w = weights.windows
+    # What goes through the same windows as the record may be of their sidelobes: so is the other.
+    # A response at one frequency is not told from the window's shape by less than two periods.
+    through = np.asarray(simulated, bool)[None, :, None]
+    own = np.asarray(w.own) & (w.lines >= 2)[:, None, None]
+    used = np.asarray(weights.asked) & (through | own)
+    at = Averages(*(np.asarray(v) for v in weights.averages))
+    each = np.moveaxis(at.share, 0, 1)
+    share = np.sum(each * used, axis=(1, 2)) / np.maximum(np.sum(used, axis=(1, 2)), 1)
+    share = np.where(share > 0, share, 1.0)
+    W = whitening(at, density, used) * np.sqrt(share)[:, None, None]
+    return weights._replace(
+        simulated=simulated, used=used, density=density, whitening=W, share=share
+    )
+
+
+def forgetful_outputs(problem: Problem, flights: Sequence[Flight], w: Windowed) -> tuple[bool, ...]:
+    """By output in windows whether the model at its start values may be simulated.
+
+    Args:
+        problem: model and start values.
+        flights: those fitted.
+        w: in windows.
+    """
+    start = problem.start_params()
+    parameters = [naming.asdict(naming.replace(start, **f.known)) for f in flights]
+    return outputs_that_forget(problem.model, parameters, [f.inputs for f in flights], w)
+
+
+# model is a Model and parameters are by name: records of any model.
+def outputs_that_forget(
+    model: Any,
+    parameters: Sequence[dict[str, Any]],
+    inputs: Sequence[dict[str, np.ndarray]],
+    w: Windowed,
+) -> tuple[bool, ...]:
+    """By output in windows whether the model may be simulated over every flight.
+
+    Args:
+        model: linear.
+        parameters: by flight, by name, SI.
+        inputs: by flight, by name, (N,).
+        w: the flights in windows.
+    """
+    fine = np.ones(len(w.outputs), bool)
+    rows = [naming.names(model.Outputs).index(n) for n in w.outputs]
+    for values, u in zip(parameters, inputs, strict=True):
+        sizes = np.array([np.std(np.asarray(u[n])) for n in naming.names(model.Inputs)])
+        matrices = jacobians(model, model.Params(**values))
+        samples = len(next(iter(u.values())))
+        fine &= forgets(matrices, w.dt, sizes, w.length, samples)[rows]
+    return tuple(bool(v) for v in fine)
+
+
+def _require_names(problem: Problem, options: ResponseOptions) -> None:
+    for i, pair in enumerate(options.pairs):
+        for role, record in (("input", problem.model.Inputs), ("output", problem.model.Outputs)):
+            name, known = getattr(pair, role), naming.names(record)
+            if name not in known:
+                raise ValueError(
+                    f"frequency.pairs[{i}].{role}: model {problem.model.name} has no {role} "
+                    f"{name!r}{nearest(name, known)}"
+                )
+
+
+def _require_lines(w: Windowed, options: ResponseOptions, asked: Bool[np.ndarray, "k p m"]) -> None:
+    for i, pair in enumerate(options.pairs):
+        place = f"frequency.pairs[{i}] ({pair.input} to {pair.output})"
+        if pair.input not in w.inputs:
+            raise ValueError(f"{place}: {pair.input} does not move, expected an input that does")
+        if pair.output not in w.outputs:
+            why = [n for n in w.notes if n.startswith(f"{pair.output}:")] or ["it is not measured"]
+            raise ValueError(f"{place}: no response of {pair.output}; {why[0]}")
+        low, high = pair.band or (0.0, np.inf)
+        if not np.any((w.hz >= low * (1 - 1e-9)) & (w.hz <= high * (1 + 1e-9))):
+            raise ValueError(
+                f"{place}: expected a band that holds a line of the window within {w.hz[0]:.3g} to "
+                f"{w.hz[-1]:.3g} Hz, got {low:g} to {high:g} Hz"
+            )
+    if not asked.any():
+        raise ValueError(
+            "frequency: no response is left, expected one with the coherence asked for "
+            f"({options.coherence:g}) in the mean over an octave"
+        )
+
+
+def _require_numbers(problem: Problem, weights: ResponseWeights) -> None:
+    nuisance = problem.nuisance
+    unknowns = len(problem.free) + nuisance.time_shift
+    unknowns += len(naming.names(problem.model.Inputs)) if nuisance.input_gain else 0
+    numbers = 2.0 * weights.numbers
+    if numbers <= unknowns:
+        raise ValueError(
+            f"frequency: expected more independent numbers than the {unknowns} unknowns, got "
+            f"{numbers:.2g} of the responses; a wider band, a longer window or a lower coherence"
+        )
+
+
+def on_device(weights: ResponseWeights) -> ResponseWeights:
+    """The same, what a trace needs of it as JAX's arrays: copied once, not with every call."""
+    return jax.tree.map(lambda v: jax.device_put(v) if isinstance(v, np.ndarray) else v, weights)
+
+
+def back(weights: ResponseWeights) -> ResponseWeights:
+    """The same in NumPy."""
+    return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, weights)

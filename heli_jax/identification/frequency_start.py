@@ -1,0 +1,104 @@
+"""A first guess of a problem's parameters by frequency error, for a fit in time.
+
+The misfit in time has valleys and plateaus far from its optimum, and an unstable machine's
+simulation overflows there; the one in frequency simulates nothing.
+"""
+
+import dataclasses
+import time
+from typing import NamedTuple
+
+from heli_jax.identification.equation_error.first_guess import StartValue
+from heli_jax.identification.fit import fit
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate, Status
+
+METHOD = "frequency-error"
+
+
+class FrequencyErrorStart(NamedTuple):
+    """First guesses, and how they were found."""
+
+    values: dict[str, StartValue]
+    status: Status
+    """of the fit in frequency"""
+    seconds: float
+    """that it took"""
+    notes: tuple[str, ...]
+    """of the fit in frequency"""
+    selection: None = None
+    """no stepwise selection of terms"""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was taken from where."""
+        taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
+        said = [
+            f"Start by frequency error of {', '.join(taken) or 'nothing'} ({self.status}, "
+            f"{self.seconds:.2g} s): the fit begins there, they are not its result."
+        ]
+        grouped: dict[str, list[str]] = {}
+        for name, v in self.values.items():
+            if v.reason:
+                grouped.setdefault(v.reason, []).append(f"{name} {v.value:.4g}")
+        said += [f"Start: {', '.join(v)}, as stated: {why}." for why, v in grouped.items()]
+        return tuple(said)
+
+
+def frequency_error_start(problem: Problem, *, max_steps: int = 200) -> FrequencyErrorStart:
+    """First guesses of the free parameters, by a fit of the same flights in frequency.
+
+    Gains and time shifts are not among them: a fit in time searches these by itself.
+
+    Args:
+        problem: with starts of its own; its method and its windows do not matter. Without a
+            disturbance, whose states a spectrum of the noise stands for.
+        max_steps: of the optimiser.
+
+    Raises:
+        ValueError: frequency error cannot solve it; the sentence says why.
+    """
+    began = time.perf_counter()
+    in_frequency = dataclasses.replace(
+        problem,
+        # Flights held out are predicted by the fit that follows.
+        flights=problem.training,
+        method=METHOD,
+        fixed_noise=(),
+        window=None,
+        continuity=None,
+        first_guess=None,
+    )
+    found = fit(in_frequency, max_steps=max_steps)
+    values = {
+        name: _value(estimate, found.status, problem.free[name].start)
+        for name, estimate in found.estimates.items()
+    }
+    return FrequencyErrorStart(values, found.status, time.perf_counter() - began, found.notes)
+
+
+def started(problem: Problem, guess: FrequencyErrorStart) -> Problem:
+    """The problem with the guess for its starts.
+
+    Args:
+        problem: to be fitted in time.
+        guess: of the same free parameters.
+    """
+    free = {
+        n: f._replace(start=guess.values[n].value) if n in guess.values else f
+        for n, f in problem.free.items()
+    }
+    return dataclasses.replace(problem, free=free, first_guess=guess)
+
+
+def _value(estimate: Estimate, status: Status, stated: float) -> StartValue:
+    reason = ""
+    if status == "not-converged":
+        reason = "frequency error did not converge"
+    elif estimate.sd is None:
+        reason = "the spectra do not determine them"
+    elif estimate.at_bound:
+        reason = "frequency error ended at their bounds"
+    if reason:
+        return StartValue(stated, None, estimate.unit, "as stated", reason)
+    return StartValue(estimate.value, estimate.sd, estimate.unit, "frequency error", "")

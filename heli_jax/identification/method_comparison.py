@@ -1,0 +1,133 @@
+"""One problem by several methods, their estimates side by side."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from heli_jax.identification.fit import fit
+from heli_jax.identification.methods import METHODS
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Fit
+
+APART = 2.0
+"""joint standard deviations from which on two estimates differ"""
+
+
+class MethodResult(NamedTuple):
+    """What one method makes of the problem."""
+
+    method: str
+    fit: Fit | None
+    """None where the method refuses the problem"""
+    reason: str
+    """why there are no numbers; empty where there are"""
+    seconds: float
+
+    @property
+    def label(self) -> str:
+        """The method as reports call it."""
+        return METHODS[self.method].label
+
+    @property
+    def word(self) -> str:
+        """Its verdicts in short."""
+        if self.fit is None:
+            return "refused"
+        if self.fit.status == "not-converged":
+            return "not converged"
+        words = [] if self.fit.status == "converged" else ["not identifiable"]
+        words += [] if self.fit.adequate else ["not adequate"]
+        words += ["intervals too narrow"] if self.fit.overconfident else []
+        return ", ".join(words) or "converged, adequate"
+
+
+class MethodComparison(NamedTuple):
+    """Methods side by side; the first is the fit's own."""
+
+    results: tuple[MethodResult, ...]
+
+    def difference(self, other: MethodResult, name: str) -> float | None:
+        """A free parameter's estimate less the main method's, in their joint standard deviations.
+
+        The two are taken as independent. Both come from the same records, so that they differ by
+        less than this where both are right: a difference that it shows is one.
+
+        Args:
+            other: one of the results.
+            name: of the parameter.
+        """
+        first = self.results[0]
+        if first.fit is None or other.fit is None or first.reason or other.reason:
+            return None
+        a, b = first.fit.estimates[name], other.fit.estimates[name]
+        if a.sd is None or b.sd is None or a.sd == b.sd == 0.0:
+            return None
+        return (b.value - a.value) / math.hypot(a.sd, b.sd)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What of the comparison has to be known."""
+        main, *others = self.results
+        said = [f"{r.label} has no numbers: {r.reason}" for r in self.results if r.reason]
+        if main.fit is None:
+            return tuple(said)
+        for other in others:
+            differences = {n: self.difference(other, n) for n in main.fit.estimates}
+            known = {n: d for n, d in differences.items() if d is not None}
+            apart = [f"{n} by {abs(d):.1f}" for n, d in known.items() if abs(d) > APART]
+            if apart:
+                said.append(
+                    f"{other.label} and {main.label} differ in {', '.join(apart)} joint standard "
+                    "deviations: what one of them takes for granted does not hold of this record."
+                )
+            elif known:
+                said.append(
+                    f"{other.label} and {main.label} agree within {APART:g} joint standard "
+                    f"deviations in {', '.join(known)}."
+                )
+        return tuple(said)
+
+
+def compare_methods(
+    main: Fit,
+    others: Mapping[str, Problem | str],
+    *,
+    starts: int | None = None,
+    seed: int = 0,
+    max_steps: int = 200,
+    progress: Callable[[str], None] | None = None,
+) -> MethodComparison:
+    """Fit a problem by further methods.
+
+    Args:
+        main: the fit that the others are laid beside.
+        others: by method the problem, or why the method refuses it.
+        starts: as `fit` takes it.
+        seed: likewise.
+        max_steps: likewise.
+        progress: called with a line of text before each longer part of the work.
+    """
+    report = progress or (lambda _: None)
+    results = [MethodResult(main.method, main, _why_none(main), main.timing.get("fit", 0.0))]
+    for method, problem in others.items():
+        if isinstance(problem, str):
+            results.append(MethodResult(method, None, problem, 0.0))
+            continue
+        report(f"the same by {METHODS[method].label}")
+        began = time.perf_counter()
+        try:
+            found = fit(problem, starts=starts, seed=seed, max_steps=max_steps)
+            result = MethodResult(method, found, _why_none(found), 0.0)
+        except ValueError as e:  # one that fails must not cost the others
+            result = MethodResult(method, None, str(e), 0.0)
+        results.append(result._replace(seconds=time.perf_counter() - began))
+    return MethodComparison(tuple(results))
+
+
+def _why_none(found: Fit) -> str:
+    if found.status != "not-converged":
+        return ""
+    # What stopped the optimiser is the first of its notes about itself.
+    stopped = [n for n in found.notes if "stopped" in n]
+    return stopped[0] if stopped else "it did not converge"

@@ -1,0 +1,211 @@
+r"""Which estimates feedback may have moved, where nobody logged an excitation.
+
+Feedback brings what disturbs the machine into its inputs. Directly the response is off by the part
+$\gamma^2$ of the input that comes of it, and the record does not tell that part: a model follows
+its inputs where it can, and its residual then shows nothing of it. Two things it does tell.
+
+What of the response is coherent with the residual all the same: over the $n$ frequencies that make
+one average an estimate is off by $\sqrt{n \gamma^2}$ of its standard deviations at least.
+
+What feedback may have brought in: from one output, at a constant gain, $|k|^2 S_{ee}$ of $S_{uu}$,
+which is nowhere more than all of the input; with the largest such gain, as a mean over the outputs,
+since nobody knows which is fed back. A loop holds the machine at low frequencies, where gusts are
+large in it and sweeps move sticks no more than elsewhere.
+
+Either is a mean over the frequencies that tell of a parameter, by what they tell.
+
+Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Bendat and
+Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
+from heli_jax.identification.unknowns.layout import Noise, Solution
+from heli_jax.identification.validation.feedback import Feedback
+
+TRUSTED = 1.4
+"""stated standard deviations by which feedback may have moved an estimate that is trusted: its
+interval then covers two thirds of the time"""
+MAY_BE = 0.25
+"""part of the input that feedback may have brought in, where a parameter that is trusted shows"""
+_SEEN = 2.0
+"""times the residual's power, above which an output shows the response: only there is it asked how
+large a gain the input leaves room for"""
+_PART = 0.05
+"""sd of the Gaussian that smooths the spectra, as a part of the frequency"""
+
+
+class Moved(NamedTuple):
+    """What feedback may have done to one estimate. The names of the fields are keys of fit.json."""
+
+    by: float
+    """standard deviations that it is off by at least"""
+    may_be: float
+    """part of the input that feedback may have brought in, 0 to 1"""
+
+
+def moved_by_feedback(at: Solution) -> dict[str, Moved]:
+    """By unknown of interest; empty where the method knows no frequencies, or inputs are taken by
+    instrument.
+
+    Args:
+        at: where the fit ended.
+    """
+    layout, data, *_ = at
+    if not layout.estimator.by_instrument or data.flights[0].by_instrument is not None:
+        return {}
+    lines = _lines(at)
+    shares, chances, n = _coherent_with_residual(lines)
+    told = _information(at, [np.ones(len(v)) for v in shares])
+    sd = np.sqrt(np.diagonal(told))
+    # A parameter that is not determined has no standard deviation to be moved by.
+    covariance = np.linalg.pinv(told / np.outer(sd, sd), rcond=1e-12, hermitian=True)
+
+    def mean(of: np.ndarray) -> np.ndarray:
+        part = covariance @ (of / np.outer(sd, sd)) @ covariance
+        with np.errstate(all="ignore"):
+            return np.clip(np.nan_to_num(np.diagonal(part) / np.diagonal(covariance)), 0.0, 1.0)
+
+    by = np.sqrt(n * mean(_information(at, shares) - _information(at, chances)))
+    may_be = mean(_information(at, _room_for_feedback(lines)))
+    return {
+        n: Moved(float(b), float(m)) for n, b, m in zip(layout.of_interest, by, may_be, strict=True)
+    }
+
+
+def untrusted(moved: Mapping[str, Moved], found: Sequence[Feedback]) -> tuple[str, ...]:
+    """The parameters that a fit without an instrument cannot be trusted on: nothing where no loop
+    is seen, neither in the inputs nor in the residual.
+
+    Args:
+        moved: of `moved_by_feedback`.
+        found: whether inputs follow the response.
+    """
+    if not any(one.present for one in found) and not any(m.by > TRUSTED for m in moved.values()):
+        return ()
+    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > MAY_BE)
+
+
+class _Lines(NamedTuple):
+    """By record at its own frequencies."""
+
+    W: list[np.ndarray]
+    errors: list[np.ndarray]
+    measured: list[np.ndarray]
+    inputs: list[np.ndarray]
+
+
+def _lines(at: Solution) -> _Lines:
+    layout, data, noise, z = at
+    measured, inputs = [], []
+    for record in records_of(layout):
+        flight, part = data.flights[record.flight], slice(record.first, record.last)
+        sticks = naming.asdict(flight.inputs)
+        for signals, made in (
+            ([flight.outputs[n] for n in layout.outputs[record.flight]], measured),
+            (list(sticks.values()), inputs),
+        ):
+            v = np.stack([np.asarray(x)[part] for x in signals], axis=1)
+            lines = np.fft.rfft(v - v.mean(axis=0), axis=0) / np.sqrt(len(v))
+            made.append(lines[1 : 1 + record.lines])
+    moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
+    errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
+    W = [np.asarray(w) for w in noise.whitening]
+    return _Lines(W, errors, measured, [u[:, moving] for u in inputs])
+
+
+def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.ndarray], float]:
+    """By record and frequency the part of the model's response that is coherent with the residual,
+    what of it is chance, and the lines of all records in one average at the lowest frequencies."""
+    pairs = []
+    for W, e, y in zip(lines.W, lines.errors, lines.measured, strict=True):
+        white = [np.einsum("kij,kj->ki", W, v) for v in (y - e, e)]
+        pairs.append(np.concatenate(white, axis=1))
+    p, per_line, records = lines.W[0].shape[1], 2.0 * np.pi**0.5, len(pairs)
+    shares, chances = [], []
+    for S in smoothed(pairs, _PART):
+        crossed = S[:, p:, :p]
+        solved = np.linalg.solve(S[:, p:, p:], crossed)
+        explained = np.einsum("kia,kia->k", np.conj(crossed), solved)
+        shares.append(np.real(explained / np.einsum("kii->k", S[:, :p, :p])))
+        width = np.maximum(LEAST, _PART * np.arange(1, len(S) + 1))
+        chances.append(np.minimum(p / (per_line * width * records), 1.0))
+    return shares, chances, per_line * LEAST * records
+
+
+def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
+    """By record and frequency the part of the input that a constant gain may have brought in."""
+    m = lines.inputs[0].shape[1]
+    joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
+    rooms = []
+    for W, S, See in zip(
+        lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART), strict=True
+    ):
+        e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
+        ratio = e[:, None, :] / u[:, :, None]
+        white = np.real(np.einsum("kij,kjl,kil->k", W, S[:, m:, m:], np.conj(W))) / W.shape[1]
+        seen = white > _SEEN if np.any(white > _SEEN) else np.ones(len(white), bool)
+        # The largest gain that leaves the input no less than it has, at any frequency.
+        room = np.minimum(ratio / np.max(ratio[seen], axis=0)[None], 1.0).mean(axis=2)
+        # Each input by what it does: one that hardly acts moves no estimate.
+        H = np.swapaxes(
+            np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2
+        )
+        effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
+        rooms.append(np.sum(room * effect, axis=1) / np.sum(effect, axis=1))
+    return rooms
+
+
+def _information(
+    at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
+) -> Float[np.ndarray, "q q"]:
+    """Of the unknowns of interest, each frequency by its weight."""
+    layout, data, noise, z = at
+    weighed: Noise = noise._replace(
+        whitening=tuple(
+            np.asarray(W) * np.sqrt(w)[:, None, None]
+            for W, w in zip(noise.whitening, weights, strict=True)
+        )
+    )
+    # The program of the fit, with other weights; the priors' rows are no information of these.
+    q = len(layout.of_interest)
+    J = np.asarray(evaluate(layout, data, weighed, z).J)[:q, :q]
+    return J.T @ J
+
+
+def feedback_trust_notes(moved: Mapping[str, Moved], found: Sequence[Feedback]) -> list[str]:
+    """Which parameters a fit without an instrument cannot be trusted on, in words.
+
+    Args:
+        moved: of `moved_by_feedback`.
+        found: whether inputs follow the response.
+    """
+    doubted, closed = untrusted(moved, found), any(one.present for one in found)
+    if not doubted:
+        # A loop that was not found, and does nothing that shows, needs no words.
+        if not (closed and moved):
+            return []
+        return [
+            "Closed loop without an instrument: feedback can hardly have moved these estimates: "
+            "they are known from frequencies at which it brings in little."
+        ]
+    words = ", ".join(f"{n} ({100 * moved[n].may_be:.0f} %)" for n in doubted)
+    rest = [n for n in moved if n not in doubted]
+    seen = "" if closed else " (the response is coherent with the residual)"
+    return [
+        f"Closed loop without an instrument{seen}: this fit cannot be trusted on "
+        f"{', '.join(doubted)}. Where these show, so much of the inputs may be gusts that feedback "
+        f"brought in: {words}; no interval allows for that. "
+        + (f"{', '.join(rest)} are hardly touched. " if rest else "")
+        + "Remedy: log the excitation and name it (signals.instruments), or method: filter-error "
+        "with a disturbance."
+    ]

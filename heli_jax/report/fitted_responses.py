@@ -1,0 +1,197 @@
+"""Responses of a fitted model beside those of the flights that it was fitted to, both with errors.
+
+The measured ones are conditioned: sticks that move together are told apart, and flights count
+together (`heli_jax.analysis.flight_responses`).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.analysis.attitude_responses import (
+    Handling,
+    HandlingPair,
+    measured_handling,
+    prepared,
+)
+from heli_jax.analysis.flight_responses import FlightResponses, Settings, flight_responses
+from heli_jax.analysis.handling_qualities import HandlingQualities, handling_qualities
+from heli_jax.analysis.response_curves import (
+    Acting,
+    Curve,
+    LinearResponses,
+    Point,
+    linear_responses,
+    modelled_curve,
+    octave_mean,
+    without_hold,
+)
+from heli_jax.identification.fit import Fit
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate
+from heli_jax.report import frequency
+from heli_jax.report.coherence import COHERENT
+from heli_jax.report.frequency import FittedFlight
+
+MOST_PAIRS = 6
+"""of input and output that get a figure"""
+_Z95 = 1.959963984540054
+_BEYOND = 4.0
+"""times the last frequency of the data, up to which a model's phase is followed"""
+
+
+class FittedPair(NamedTuple):
+    """An output's response to an input; arrays (k,), those of the model at the same frequencies."""
+
+    input: str
+    output: str
+    omega: np.ndarray
+    """[rad/s]"""
+    H: np.ndarray
+    """measured, without what the input does between samples; NaN where it is not known"""
+    sd: np.ndarray
+    """of its real and of its imaginary part"""
+    coherence: np.ndarray
+    model: Point
+    """of the machine in continuous time"""
+
+
+class FittedResponses(NamedTuple):
+    """All that is shown of a fit's responses."""
+
+    pairs: tuple[FittedPair, ...]
+    """those with a coherence worth showing, the highest first"""
+    left_out: int
+    """as many more"""
+    handling: tuple[Handling, ...]
+    about: str
+    """where the model was linearised, in words; empty for a linear one"""
+    notes: tuple[str, ...]
+
+
+def fitted_responses(
+    fit: Fit, problem: Problem, settings: Settings, asked: Sequence[HandlingPair]
+) -> FittedResponses:
+    """The responses of a fit and of its flights, and handling qualities of both.
+
+    Args:
+        fit: the result.
+        problem: what was fitted.
+        settings: band and window of the measured responses.
+        asked: responses that handling qualities are read off.
+    """
+    try:
+        found = flight_responses(problem.training, settings)
+    except ValueError as e:
+        words = f"no responses of the flights: {e}"
+        return FittedResponses((), 0, (), "", (words,))
+    known = problem.training[0].known
+    params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
+    flight = FittedFlight(problem.model, params, fit, fit.signals[0])
+    at = frequency.at_record(flight)
+    free = [n for n in fit.estimates if n in naming.names(problem.model.Params) and n not in known]
+    of = linear_responses(problem.model, params, free, at.state, at.inputs)
+    if not all(np.isfinite(M).all() for M in of.matrices):
+        words = f"the model cannot be linearised about {at.words or 'zero'}"
+        return FittedResponses((), 0, (), at.words, (*found.notes, words))
+    curves = _Curves(fit, of, tuple(free), (found.omega[0], _BEYOND * found.omega[-1]))
+    pairs = _pairs(found, curves)
+    handling = tuple(
+        Handling(p, _of_model(curves, p), measured_handling(found, p))
+        for p in asked
+        # One that is fixed, or that does not move, is no part of the fit.
+        if p.input in found.holds and p.output in found.outputs
+    )
+    left_out = max(len(pairs) - MOST_PAIRS, 0)
+    return FittedResponses(tuple(pairs[:MOST_PAIRS]), left_out, handling, at.words, found.notes)
+
+
+class _Curves(NamedTuple):
+    """Responses of the fitted model with the covariance of the fit."""
+
+    fit: Fit
+    of: LinearResponses
+    free: tuple[str, ...]
+    band: tuple[float, float]
+
+    def curve(self, input: str, output: str) -> Curve:
+        """One of them."""
+        names = (*self.free, f"gain {input}", "time_shift")
+        root = _root(self.fit, names)
+        gain, shift = (self.fit.nuisance.get(n) for n in names[-2:])
+        # The derivatives by the two stand last, after those by the parameters.
+        q = len(self.free)
+        unit = np.eye(q + 2)
+        padded = tuple(
+            np.concatenate([d, np.zeros((2, *d.shape[1:]))]) for d in self.of.derivatives
+        )
+        delays = {n: (v, np.append(d, [0.0, 0.0])) for n, (v, d) in self.of.delays.items()}
+        of = self.of._replace(derivatives=padded, delays=delays)
+        acting = Acting(
+            1.0 if gain is None else gain.value,
+            0.0 if shift is None else shift.value,
+            unit[q] if gain is not None else None,
+            unit[q + 1] if shift is not None else None,
+        )
+        return modelled_curve(of, (input, output), root, self.band, acting)
+
+
+def _root(fit: Fit, names: Sequence[str]) -> np.ndarray:
+    """(q, r) R with R R' the covariance of the estimates; NaN where one is not identifiable, zero
+    where one was not estimated."""
+    known = {**fit.nuisance, **fit.estimates}
+    order = [fit.verdict.names.index(n) if n in known else None for n in names]
+    rows = np.zeros((len(names), len(fit.verdict.names)))
+    values, vectors = np.linalg.eigh(fit.verdict.correlation)
+    correlation = vectors * np.sqrt(np.maximum(values, 0.0))
+    for k, (name, i) in enumerate(zip(names, order, strict=True)):
+        if i is not None:
+            rows[k] = _sd(known[name], fit) * correlation[i]
+    return rows
+
+
+def _sd(estimate: Estimate, fit: Fit) -> float:
+    """As wide as the interval that is reported, which allows for what is known of the noise."""
+    e = estimate
+    if fit.status == "not-converged" or e.sd is None or e.lower95 is None or e.upper95 is None:
+        return np.nan
+    if e.lower95 * e.upper95 > 0:
+        half = 0.5 * abs(e.value * np.log(e.upper95 / e.lower95))
+    else:
+        half = 0.5 * (e.upper95 - e.lower95)
+    # An interval that a bound cuts off is no measure of the error.
+    return max(half / _Z95, e.sd)
+
+
+def _pairs(found: FlightResponses, curves: _Curves) -> list[FittedPair]:
+    ranked = []
+    for name, output in found.outputs.items():
+        for input, pair in output.pairs.items():
+            mean = octave_mean(found.omega, pair.coherence)
+            used = mean >= COHERENT
+            if not used.any():
+                continue
+            with np.errstate(all="ignore"):
+                H = without_hold(found.omega, pair.H, found.holds[input])
+                sd = pair.sd * np.abs(H / pair.H)
+            model = curves.curve(input, name).at(found.omega)
+            fitted = FittedPair(input, name, found.omega, H, sd, pair.coherence, model)
+            ranked.append((float(np.sum(mean[used])), fitted))
+    return [fitted for _, fitted in sorted(ranked, key=lambda r: -r[0])]
+
+
+def _of_model(curves: _Curves, pair: HandlingPair) -> HandlingQualities:
+    found = handling_qualities(prepared(pair, curves.curve(pair.input, pair.output)), pair.kind)
+    last, w180 = curves.band[1] / _BEYOND, found.numbers.get("w180")
+    needed = last if pair.kind == "open-loop" else 0.5 * last
+    if w180 is None or w180.value <= needed:
+        return found
+    beyond = "w180" if w180.value > last else "2 w180"
+    words = (
+        f"{beyond} lies beyond the band of the flights' responses, {last / (2.0 * np.pi):.3g} Hz: "
+        "what hangs on it is the model's word alone"
+    )
+    return found._replace(sentences=(*found.sentences, words))

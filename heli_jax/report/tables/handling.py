@@ -1,0 +1,81 @@
+"""Handling qualities as rows of text, and as lines of the terminal."""
+
+from collections.abc import Sequence
+
+from heli_jax.analysis.attitude_responses import Handling
+from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
+from heli_jax.numbers import number
+from heli_jax.report.tables.table import NOT_DETERMINED, Table
+
+_WORDS = {
+    "bandwidth": "bandwidth",
+    "phase_bandwidth": "phase bandwidth",
+    "gain_bandwidth": "gain bandwidth",
+    "w180": "ω₁₈₀",
+    "phase_delay": "phase delay",
+    "phase_delay_line": "phase delay by the line",
+    "crossover": "crossover",
+    "phase_margin": "phase margin",
+    "gain_margin": "gain margin",
+}
+_HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
+"""what the terminal shows"""
+
+
+def handling(entries: Sequence[Handling]) -> Table:
+    """A row for each number of each response, with the columns that were asked for.
+
+    Args:
+        entries: what model and data say.
+    """
+    sources = _sources(entries)
+    rows = []
+    for entry in entries:
+        for name in NUMBERS[entry.pair.kind]:
+            cells = (_cell(getattr(entry, s), name) for s in sources)
+            rows.append((entry.pair.words, _WORDS[name], *cells, UNITS[name]))
+    return Table(("response", "", *sources, "unit"), rows)
+
+
+def _sources(entries: Sequence[Handling]) -> tuple[str, ...]:
+    return tuple(s for s in ("model", "data") if any(getattr(e, s) is not None for e in entries))
+
+
+def _cell(of: HandlingQualities | str | None, name: str) -> str:
+    found = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
+    return NOT_DETERMINED if found is None else _shown(found)
+
+
+def _shown(n: Number) -> str:
+    if not n.sd >= 0.0:  # of a model whose parameters are not known well enough for an interval
+        return number(n.value, 3)
+    return f"{number(n.value, 3)} ({number(n.lower95, 3)} to {number(n.upper95, 3)})"
+
+
+def handling_sentences(entries: Sequence[Handling]) -> list[str]:
+    """Why numbers are missing, and what is to be heeded."""
+    said = []
+    for entry in entries:
+        for source in _sources(entries):
+            of = getattr(entry, source)
+            sentences = (of,) if isinstance(of, str) else () if of is None else of.sentences
+            said += [f"{entry.pair.words}, {source}: {s}" for s in sentences]
+    return said
+
+
+def handling_lines(entries: Sequence[Handling]) -> list[str]:
+    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5.0 to 5.3), data 5.2 (5 to 5.4)`
+
+    Args:
+        entries: what model and data say.
+    """
+    sources = _sources(entries)
+    lines = []
+    for entry in entries:
+        parts = []
+        for name in _HEADLINES:
+            if name in NUMBERS[entry.pair.kind]:
+                cells = ", ".join(f"{s} {_cell(getattr(entry, s), name)}" for s in sources)
+                parts.append(f"{_WORDS[name]} [{UNITS[name]}] {cells}")
+        lines.append(f"{entry.pair.words}: {'; '.join(parts)}")
+    return lines

@@ -1,0 +1,123 @@
+"""Errors of frequency responses: covariance against the linear map from samples, written out."""
+
+import numpy as np
+import pytest
+
+from heli_jax import Flight
+from heli_jax.analysis.response_errors import (
+    averages,
+    covariance,
+    noise_density,
+    pairs_used,
+    partial_coherence,
+    response_of,
+    whitening,
+)
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.analysis.windowed import windowed
+
+DT, N, L = 0.05, 600, 100
+
+
+def flights(noise: np.ndarray) -> list[Flight]:
+    """Two inputs that move together, two outputs of which one misses a sample in one flight."""
+    rng = np.random.default_rng(0)
+    out = []
+    for i, e in enumerate(noise):
+        u = np.cumsum(rng.standard_normal((2, N)), axis=1)
+        u[1] += 0.5 * u[0]
+        y = e.copy()
+        if i == 0:
+            y[1, 333] = np.nan
+        out.append(Flight(dt=DT, inputs={"a": u[0], "b": u[1]}, outputs={"p": y[0], "q": y[1]}))
+    return out
+
+
+def by_hand(flights: list[Flight], output: str, line: int) -> np.ndarray:
+    """(2, samples of both flights) from white noise on an output to its two responses."""
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(L) / L)
+    turn = window * np.exp(-2j * np.pi * line * np.arange(L) / L)
+    # A window less its mean: in the first line alone there is some of that.
+    turn = turn - np.mean(turn)
+    S_uu, rows = np.zeros((2, 2), complex), np.zeros((2, 2 * N), complex)
+    for i, f in enumerate(flights):
+        for s in range(0, N - L + 1, L // 2):
+            if np.isnan(f.outputs[output][s : s + L]).any():
+                continue
+            U = np.array([f.inputs[n][s : s + L] @ turn for n in ("a", "b")])
+            S_uu += np.outer(np.conj(U), U)
+            rows[:, i * N + s : i * N + s + L] += np.conj(U)[:, None] * turn
+    return np.linalg.solve(S_uu, rows)
+
+
+def test_errors_of_responses_are_those_of_the_linear_map_from_samples():
+    rng = np.random.default_rng(1)
+    mixed = np.array([[1.0, 0.0], [0.6, 0.8]])
+    noise = np.einsum("ij,fjn->fin", mixed, rng.standard_normal((2, 2, N)))
+    all_of_them = flights(noise)
+    w = windowed(all_of_them, ResponseOptions(window=L * DT))
+    at = averages(w)
+    assert w.seen.sum(axis=0).tolist() == [22.0, 20.0]
+    maps = {n: [by_hand(all_of_them, n, k) for k in w.numbers[:4]] for n in ("p", "q")}
+    E = response_of(w, at, w.Y)
+    white = {n: np.nan_to_num(np.concatenate([f.outputs[n] for f in all_of_them])) for n in "pq"}
+    rho = mixed @ mixed.T
+    # One-sided density of white noise of variance 1 is twice the sample time.
+    density = np.broadcast_to(2.0 * DT * rho, (len(w.numbers), 2, 2)).astype(complex)
+    C = covariance(at, density)
+    for k in range(4):
+        for j, n in enumerate("pq"):
+            np.testing.assert_allclose(E[k, j], maps[n][k] @ white[n], rtol=1e-9)
+            for i, m in enumerate("pq"):
+                expected = rho[j, i] * maps[n][k] @ np.conj(maps[m][k]).T
+                np.testing.assert_allclose(C[k, j, :, i], expected, rtol=1e-6, atol=1e-12)
+    used = np.ones((len(w.numbers), 2, 2), bool)
+    used[:, 1, 0] = False
+    W = whitening(at, density, used)
+    unit = np.einsum("kab,kbc,kdc->kad", W, C.reshape(-1, 4, 4), np.conj(W))
+    np.testing.assert_allclose(unit, np.diag([1.0, 1.0, 0.0, 1.0]) + 0 * unit, atol=1e-6)
+
+
+def test_noise_and_its_correlation_are_found_whatever_the_inputs_explain():
+    rng = np.random.default_rng(2)
+    mixed = np.array([[1.0, 0.0], [0.6, 0.8]])
+    noise = np.einsum("ij,fjn->fin", mixed, rng.standard_normal((8, 2, N)))
+    made = flights(noise)
+    moved = [
+        Flight(
+            dt=DT,
+            inputs=f.inputs,
+            outputs={"p": f.outputs["p"] + 3.0 * f.inputs["a"], "q": f.outputs["q"]},
+        )
+        for f in made
+    ]
+    w = windowed(moved, ResponseOptions(window=L * DT))
+    at = averages(w)
+    S = np.mean(noise_density(w, at, w.Y), axis=0) / (2.0 * DT)
+    np.testing.assert_allclose(S, mixed @ mixed.T, atol=0.15)
+    coherence = partial_coherence(w, at)
+    low = w.hz < 1.0
+    assert np.mean(coherence[low, 0, 0]) > 0.9
+    assert np.mean(coherence[low, 1, 0]) < 0.1
+    pairs = (PairOptions("a", "p", (0.5, 2.0)), PairOptions("a", "q", coherence=0.6))
+    sound = np.ones(coherence.shape, bool)
+    used = pairs_used(w, ResponseOptions(pairs=pairs), coherence, sound)
+    assert w.hz[used[:, 0, 0]].min() >= 0.5
+    assert w.hz[used[:, 0, 0]].max() <= 2.0
+    assert not used[:, 1].any()
+    assert not used[:, 0, 1].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (ResponseOptions(window=400.0), "averages"),
+        (ResponseOptions(window=5.0, band=(0.1, 2.0)), "at least one period in a window of 5 s"),
+        (ResponseOptions(window=5.0, band=(0.5, 11.0)), "below half the rate of 20 Hz"),
+        (ResponseOptions(window=5.0, band=(0.41, 0.45)), "holds a line of the window"),
+        (ResponseOptions(window=0.2), "at least 16 samples"),
+    ],
+)
+def test_what_does_not_fit_the_flights_is_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        windowed(flights(np.zeros((2, 2, N))), options)

@@ -1,0 +1,145 @@
+"""Frequency error by instrument: its equations, closed loops, and what is said of them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
+from heli_jax.identification.estimation.frequency_instrument import following
+from heli_jax.identification.estimation.frequency_rows import _Rows, _weighed
+from heli_jax.identification.estimation.frequency_spectrum import smoothed
+from heli_jax.identification.model_selection import choose
+
+DT = 0.04
+LEANING = """
+name: leaning
+states: {p: rad/s, phi: rad}
+inputs: {lat: "1"}
+outputs: {p: rad/s, phi: rad}
+parameters:
+  Lphi: {value: 0.4, unit: 1/s^2, source: none}
+  Lp: {value: -2.0, unit: 1/s, source: none}
+  Llat: {value: 10.0, unit: rad/s^2, source: none}
+A: {p: {p: Lp, phi: Lphi}, phi: {p: 1}}
+B: {p: {lat: Llat}}
+C: {p: {p: 1}, phi: {phi: 1}}
+"""
+TRUTH = {"Lphi": 0.4, "Lp": -2.0, "Llat": 10.0}
+
+
+def flown(seed: int, n: int = 3000) -> Flight:
+    """An unstable machine that a pilot holds upright in gusts, with random steps added."""
+    rng = np.random.default_rng(seed)
+    M = np.zeros((4, 4))
+    M[0], M[1, 0] = [TRUTH["Lp"], TRUTH["Lphi"], TRUTH["Llat"], 1.0], 1.0
+    E, keeps = scipy.linalg.expm(M * DT), np.exp(-DT / 0.7)
+    steps = np.repeat(rng.choice([-0.12, 0.12], n // 20), 20)
+    x, gust, y, u = np.zeros(2), 0.0, np.zeros((n, 2)), np.zeros(n)
+    for k in range(n):
+        y[k] = x + rng.standard_normal(2) * [2e-3, 1e-3]
+        u[k] = steps[k] - 0.05 * x[0] - 0.2 * x[1]
+        x = E[:2, :2] @ x + E[:2, 2] * u[k] + E[:2, 3] * gust
+        gust = keeps * gust + 0.25 * np.sqrt(1 - keeps**2) * rng.standard_normal()
+    outputs = {"p": y[:, 0], "phi": y[:, 1]}
+    return Flight(dt=DT, inputs={"lat": u}, outputs=outputs, instruments={"lat": steps})
+
+
+@pytest.fixture(scope="module")
+def leaning(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "leaning.yaml"
+    path.write_text(LEANING)
+    return linear_model(path)
+
+
+def problem(leaning, flights, **more):
+    free = {n: Free(1.3 * v) for n, v in TRUTH.items()}
+    off = Nuisance(initial_state=False, bias=False, input_offset=False)
+    method = {"method": "frequency-error", **more}
+    return Problem(leaning.model, leaning.vehicle().params, flights, free, off, **method)
+
+
+def test_the_rows_solve_the_equations_and_have_their_covariance():
+    rng = np.random.default_rng(0)
+    J, Z = rng.standard_normal((2, 3, 50)) * np.array([1.0, 1e6, 1e-4])[None, :, None]
+    e, Q = rng.standard_normal(50), np.linalg.qr(rng.standard_normal((50, 4)))[0]
+
+    def weighed(Z):
+        parts = [jnp.asarray(v) for v in (e, e @ Q, Z, Z @ Q, J, J @ Q)]
+        return [np.asarray(v) for v in _weighed(_Rows(*parts[:4]), _Rows(*parts[4:], *parts[2:4]))]
+
+    r, M = weighed(Z)
+    # The same with the ends projected out of everything by hand.
+    e, J, F = (v - v @ Q @ Q.T for v in (e, J, Z))
+    np.testing.assert_allclose(np.linalg.solve(M, r), np.linalg.solve(F @ J.T, F @ e), rtol=1e-8)
+    inverse = np.linalg.inv(F @ J.T)
+    covariance = inverse @ (F @ F.T) @ inverse.T
+    np.testing.assert_allclose(np.linalg.inv(M.T @ M), covariance, rtol=1e-8)
+    # An instrument that says what another says already makes no row, and not one of rounding.
+    r, M = weighed(np.stack([Z[0], Z[1], 2.0 * Z[0]]))
+    assert np.linalg.matrix_rank(M) == 2
+    assert np.count_nonzero(r) == 2
+
+
+def test_a_smoothed_spectrum_is_the_mean_under_a_gaussian():
+    rng = np.random.default_rng(1)
+    records = [rng.standard_normal((k, 2)) + 1j * rng.standard_normal((k, 2)) for k in (400, 250)]
+    S = smoothed(records)
+    f = [np.arange(1, len(v) + 1) / (2 * len(v) + 1) for v in records]
+    for i in (0, 1):
+        for k in (0, 40, 200):
+            widths = [max(6 * g[0], 0.08 * f[i][k]) for g in f]
+            w = [np.exp(-0.5 * ((f[i][k] - g) / s) ** 2) for g, s in zip(f, widths, strict=True)]
+            total = sum(
+                np.einsum("g,gi,gj->ij", a, v, np.conj(v)) for a, v in zip(w, records, strict=True)
+            )
+            np.testing.assert_allclose(S[i][k], total / sum(a.sum() for a in w), atol=0.03)
+
+
+def test_what_follows_an_excitation_is_found():
+    rng = np.random.default_rng(2)
+    flights, answers = [], []
+    for n in (1500, 1100):
+        r = np.convolve(rng.standard_normal(n), np.ones(5) / 5, "same")
+        answer = np.convolve(r, [0.0, 0.5, 0.3, 0.2])[:n]
+        u = answer + 0.5 * rng.standard_normal(n)
+        y = rng.standard_normal(n)
+        flights.append(Flight(dt=DT, inputs={"lat": u}, outputs={"p": y}, instruments={"lat": r}))
+        answers.append(answer)
+    made = following(flights, ["lat"], [f.instruments["lat"][:, None] for f in flights])
+    for found, answer in zip(made, answers, strict=True):
+        left = found["lat"] - found["lat"].mean() - (answer - answer.mean())
+        assert np.std(left) < 0.25 * np.std(answer)
+
+
+def test_by_instrument_feedback_moves_no_estimate_and_directly_it_is_said(leaning):
+    flights = [flown(1), flown(2)]
+    by = fit(problem(leaning, flights))
+    assert by.status == "converged"
+    assert by.method_label == "frequency error by instrument (lat)"
+    assert np.isnan(by.log_likelihood)
+    for name, one in by.estimates.items():
+        assert abs(one.value - TRUTH[name]) < 3.0 * one.sd
+        assert one.sd < 0.5 * abs(TRUTH[name])
+    direct = fit(problem(leaning, flights, instrument=()))
+    off = {n: (e.value - TRUTH[n]) / e.sd for n, e in direct.estimates.items()}
+    worst = max(off, key=lambda n: abs(off[n]))
+    assert abs(off[worst]) > 4.0
+    assert worst in direct.untrusted
+    assert any("cannot be trusted on" in note for note in direct.notes)
+
+
+def test_an_instrument_that_is_not_there_is_refused(leaning):
+    flight = flown(1, 400)
+    bare = Flight(dt=DT, inputs=flight.inputs, outputs=flight.outputs, name="second")
+    with pytest.raises(ValueError, match="instrument of lat: second holds none"):
+        problem(leaning, [flight, bare], instrument=("lat",))
+    with pytest.raises(ValueError, match="no such input"):
+        problem(leaning, [flight], instrument=("lot",))
+    with pytest.raises(ValueError, match="takes no input by an instrument"):
+        problem(leaning, [flight], instrument=("lat",), method="output-error")
+
+
+def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
+    with pytest.raises(ValueError, match="no likelihood to be compared by"):
+        choose({"one": problem(leaning, [flown(1, 400)])})

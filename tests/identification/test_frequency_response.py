@@ -1,0 +1,170 @@
+"""Fit of frequency responses: estimates, an unstable machine in a loop, and what is refused."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models
+from heli_jax import config as configuration
+from heli_jax.analysis.response_options import PairOptions, ResponseOptions
+from heli_jax.dynamics.jacobians import StateSpace
+from heli_jax.errors import InputError
+from heli_jax.identification.estimation.linear_machine import Machine, forgets
+from heli_jax.report import tables
+from heli_jax.report.files import fit_json
+from tests.identification.bench import BENCH, record, vehicle
+from tests.identification.test_frequency_error import FALLING
+from tests.test_log_responses import CONFIG
+from tests.test_log_responses import record as logged
+
+DT = 0.02
+FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
+
+
+def with_a_gap(flight: Flight) -> Flight:
+    roll = flight.outputs["roll"].copy()
+    roll[1100:1103] = np.nan
+    return Flight(dt=flight.dt, inputs=flight.inputs, outputs={"roll": roll})
+
+
+def test_a_flight_with_missing_samples_is_fitted_through_its_windows():
+    flight = with_a_gap(record(BENCH, seed=3, n=4000))
+    options = ResponseOptions(window=8.0, band=(0.25, 8.0))
+    problem = Problem(
+        models.roll_on_stand, vehicle(BENCH), [flight], FREE,
+        method="frequency-response", frequency=options,
+    )  # fmt: skip
+    found = fit(problem)
+    assert found.status == "converged"
+    for name, one in found.estimates.items():
+        assert one.lower95 < BENCH[name] < one.upper95
+        assert one.sd < 0.01 * BENCH[name]
+    # Of 19 windows two hold the gap.
+    assert dict(found.responses.averages)["roll"] == pytest.approx(17 / (1 + 2 / 36))
+    assert found.responses.lower95 < found.responses.chi_squared < found.responses.upper95
+    assert found.adequate
+    [pair] = found.responses.pairs
+    assert pair.simulated
+    assert pair.J < 100.0
+    # The simulation in time has an initial state and a bias of its own.
+    assert found.metrics["roll"].vaf > 0.999
+    content = fit_json(found, problem, None)["responses"]
+    assert content["pairs"][0]["output"] == "roll"
+    assert "in windows" in str(tables.responses(found).rows)
+
+
+def test_simulation_and_response_of_a_machine_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    A = np.array([[0.95, 0.1], [-0.2, 0.9]])
+    B, C, D = (rng.standard_normal(s) for s in ((2, 2), (3, 2), (3, 2)))
+    U, x0 = rng.standard_normal((90, 2)), rng.standard_normal(2)
+    machine = Machine(*(jnp.asarray(v) for v in (A, B, U, U, C, D, x0)))
+    _, y, _ = scipy.signal.dlsim((A, B, C, D, 1.0), U, x0=x0)
+    simulated = eqx.filter_jit(Machine.simulated)(machine, 32)
+    np.testing.assert_allclose(simulated, y.T, rtol=1e-10, atol=1e-12)
+    omega = np.array([0.1, 0.7, 2.0])
+    G, direct = machine.responses(np.exp(1j * omega))
+    for j in range(2):
+        num, den = scipy.signal.ss2tf(A, B, C, D, input=j)
+        for i in range(3):
+            _, expected = scipy.signal.freqz(num[i], den, omega)
+            np.testing.assert_allclose(G[:, i, j] + direct[i, j], expected, rtol=1e-9)
+
+
+def test_only_outputs_that_forget_within_a_window_are_simulated():
+    # A lag of 2 s, its integral, and a divergence that only the third output feels.
+    A = np.array([[-0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.2]])
+    matrices = StateSpace(*(jnp.asarray(v) for v in (A, np.eye(3)[:, :1], np.eye(3), A[:, :1])))
+    assert forgets(matrices, 0.02, np.ones(1), 500, 6000).tolist() == [True, False, False]
+    # Shorter than the lag remembers.
+    assert not forgets(matrices, 0.02, np.ones(1), 80, 6000)[0]
+
+
+@pytest.mark.slow
+def test_an_unstable_machine_in_a_loop_by_its_instrument(tmp_path):
+    """Gusts that come back through the stick bias a direct response; the logged steps do not."""
+    path = tmp_path / "falling.yaml"
+    path.write_text(FALLING)
+    model = linear_model(path)
+    rng = np.random.default_rng(5)
+    M = np.zeros((3, 3))
+    M[:2, :2], M[:2, 2] = [[-1.0, 2.0], [1.0, 0.0]], [10.0, 0.0]
+    E = scipy.linalg.expm(M * DT)
+    n = 6000
+    steps = np.repeat(rng.uniform(-0.1, 0.1, n // 20 + 1), 20)[:n]
+    x, u, y = np.zeros(2), np.zeros(n), np.zeros((n, 2))
+    for k in range(n):
+        y[k] = x + rng.standard_normal(2) * [0.02, 0.005]
+        u[k] = steps[k] - 0.3 * x[0] - 0.9 * x[1]
+        x = E[:2, :2] @ x + E[:2, 2] * u[k] + [0.02 * rng.standard_normal(), 0.0]
+    flight = Flight(
+        dt=DT,
+        inputs={"lat": u},
+        outputs={"p": y[:, 0], "phi": y[:, 1]},
+        instruments={"lat": steps},
+    )
+    truth = {"Lphi": 2.0, "Lp": -1.0, "Llat": 10.0}
+    free = {n: Free(1.4 * v) for n, v in truth.items()}
+    found = fit(
+        Problem(
+            model.model, model.vehicle().params, [flight], free,
+            Nuisance(bias=False, initial_state=False), method="frequency-response",
+            frequency=ResponseOptions(window=10.0),
+        )
+    )  # fmt: skip
+    assert found.responses.instruments == ("lat",)
+    assert not any(pair.simulated for pair in found.responses.pairs)
+    for name, one in found.estimates.items():
+        assert abs(one.value - truth[name]) < 3.0 * one.sd
+        assert one.sd < 0.3 * abs(truth[name])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (ResponseOptions(coherence=0.99999), "no response is left"),
+        (ResponseOptions(pairs=(PairOptions("roll", "roll"),)), r"pairs\[0\].input: .* no input"),
+        (
+            ResponseOptions(window=10.0, pairs=(PairOptions("x_roll", "roll", (30.0, 40.0)),)),
+            "holds a line of the window",
+        ),
+        (ResponseOptions(window=10.0, band=(0.4, 0.4001)), "more independent numbers than the 3"),
+        (ResponseOptions(window=50.0), "independent averages for 1 inputs"),
+    ],
+)
+def test_what_it_cannot_do_is_refused_with_a_reason(options, said):
+    flight = record(BENCH, seed=3, n=3000)
+    with pytest.raises(ValueError, match=said):
+        Problem(
+            models.roll_on_stand, vehicle(BENCH), [flight], FREE,
+            method="frequency-response", frequency=options,
+        )  # fmt: skip
+
+
+FIT = """
+  band: [0.5, 8]
+  coherence: 0.3
+  pairs:
+    - {input: lat, output: p, coherence: 0.5}
+fit:
+  method: METHOD
+  free: {Lb: {start: 3000}}
+"""
+
+
+def test_a_configuration_says_which_responses_are_fitted(tmp_path):
+    columns = logged(3, feedback=0.4)
+    table = np.column_stack([*columns.values()])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(columns), comments="")
+    path = tmp_path / "roll.yaml"
+    path.write_text(CONFIG + FIT.replace("METHOD", "frequency-response"))
+    problem = configuration.problem(configuration.load(path))
+    assert problem.frequency == ResponseOptions(
+        (0.5, 8.0), 10.0, None, 0.3, (PairOptions("lat", "p", None, 0.5),)
+    )
+    path.write_text(CONFIG + FIT.replace("METHOD", "output-error"))
+    with pytest.raises(InputError, match=r"pairs: is for fit.method: frequency-response"):
+        configuration.problem(configuration.load(path))

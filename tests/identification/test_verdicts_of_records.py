@@ -1,0 +1,70 @@
+"""Late sticks, stuck sensors and dropouts, as they are told of a record at any rate."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax.flights.signal_facts import facts_of_all
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, _of_noise
+from heli_jax.identification.validation.advice import OutputAdequacy, Record
+from heli_jax.identification.validation.late_inputs import led_by
+
+RNG = np.random.default_rng(0)
+T = 0.005 * np.arange(6000)
+STICK = np.repeat(RNG.uniform(-0.3, 0.3, 80), 75)
+# A damped swing at 2 Hz, by SciPy.
+ANSWER = scipy.signal.lsim(([20.0, 0.0], [1.0, 8.0, 160.0]), STICK, T)[1]
+ANSWER = ANSWER / ANSWER.std()
+
+
+@pytest.mark.parametrize("every", [1, 2, 4, 8])
+def test_a_late_stick_is_told_at_any_rate_of_the_log(every):
+    y = (ANSWER + 0.05 * np.random.default_rng(1).standard_normal(T.size))[::every]
+    dt = 0.005 * every
+    for late, least, most in ((0, None, None), (16, 0.039, 0.09), (40, 0.1, 0.21)):
+        led = led_by(y, {"u": np.roll(STICK, late)[::every]}, dt)
+        assert (led is None) == (late == 0)
+        assert led is None or least < led[1] < most
+    noise = np.random.default_rng(2).standard_normal(y.size)
+    assert led_by(noise, {"u": STICK[::every]}, dt) is None
+
+
+def test_a_stuck_sensor_is_seen_in_steps_as_large_as_its_noise_and_dropouts_are_named():
+    noisy = 20.0 * ANSWER + np.random.default_rng(3).standard_normal(T.size)
+
+    def of(y):
+        signals = {"p": (T, y), "q": (T, noisy[::-1].copy())}
+        return facts_of_all(signals, frozenset({"p"}))["p"]
+
+    for step in (0.0, 0.5, 1.0):
+        y = np.round(noisy / step) * step if step else noisy
+        assert of(y).stretches == ()
+        assert of(y).dropouts is None
+        stuck = np.where((T > 5) & (T < 9), y[1000], y)
+        stuck = np.where((T > 20) & (T < 22), y[4000], stuck)
+        lengths = [s.end - s.begin for s in of(stuck).stretches]
+        assert lengths == pytest.approx([4.0, 2.0], abs=0.05)
+    dithers = np.where((T > 5) & (T < 9), 3.0 + 1e-3 * (RNG.random(T.size) < 0.5), noisy)
+    assert len(of(dithers).stretches) == 1
+    assert len(of(dithers).within(8.0, 12.0).stretches) == 1
+    assert of(dithers).within(10.0, 12.0).stuck is None
+    dropped = np.where(T % 1.0 < 0.3, 0.0, noisy)
+    found = of(dropped).dropouts
+    assert found is not None
+    assert found.value == 0.0
+    assert of(dropped).dropped == pytest.approx(0.3, abs=0.01)
+    # A noise-free machine that comes to rest by itself, again and again, is no sensor's failure.
+    u = np.repeat(np.tile([0.0, 1.0], 10), 300)
+    rests = scipy.signal.lfilter([0.05], [1.0, -0.95], u)
+    assert of(np.round(rests, 5)).dropouts is None
+    assert of(np.round(rests, 5)).stretches == ()
+
+
+def test_an_output_of_which_nothing_is_explained_is_named():
+    judged = [OutputAdequacy(n, True, v, v, True, 0.0) for n, v in (("p", 1e-5), ("phi", 0.99))]
+    measured = dict.fromkeys(("p", "phi"), np.zeros(3000))
+    record = Record("one", 0.01, measured, measured)
+    evidence = Evidence((record,), {}, {}, None, 5)
+    assert [_of_noise(o, evidence) for o in judged] == [True, False]
+    said = Adequacy(True, False, tuple(judged), unexplained=("p",))
+    assert said.summary == "yes, but nothing of p is explained"

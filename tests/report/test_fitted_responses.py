@@ -1,0 +1,87 @@
+"""A fitted model's responses over those of its flights: numbers, figure, page and fit.json."""
+
+import numpy as np
+import pytest
+
+from heli_jax import naming
+from heli_jax.analysis.attitude_responses import handling_pairs
+from heli_jax.analysis.flight_responses import Settings
+from heli_jax.analysis.mismatch import unnoticeable
+from heli_jax.report import frequency
+from heli_jax.report.files import SupplementaryAnalyses, fit_json
+from heli_jax.report.fitted_responses import fitted_responses
+from heli_jax.report.html import Analysis, drawings, render
+from heli_jax.report.style import styled
+from heli_jax.report.tables.handling import handling_lines
+
+
+@pytest.fixture(scope="module")
+def shown(sound):
+    fit, problem, _ = sound
+    asked = handling_pairs(problem.model, problem.training[0].outputs)
+    return fitted_responses(fit, problem, Settings(window=10.0), asked)
+
+
+def test_the_model_s_response_is_that_of_the_bode_figure_and_moves_with_its_parameters(
+    sound, shown
+):
+    fit, problem, _ = sound
+    (pair,) = shown.pairs
+    names = (pair.output, pair.input)
+
+    def continuous(params):
+        H, _ = frequency.responses(problem.model, params, *names, 0.05)
+        return H(pair.omega)
+
+    H = continuous(fit.params)
+    np.testing.assert_allclose(pair.model.response, H, rtol=1e-9)
+    # Its standard deviation, by finite differences along the two estimates.
+    steps = []
+    for name in ("Ixx", "If"):
+        value = fit.estimates[name].value
+        moved = naming.replace(fit.params, **{name: value * (1.0 + 1e-6)})
+        steps.append(np.log(np.abs(continuous(moved) / H)) / 1e-6)
+    sd = np.array([fit.estimates[n].sd / fit.estimates[n].value for n in ("Ixx", "If")])
+    covariance = np.outer(sd, sd) * fit.verdict.correlation
+    by_hand = np.sqrt(np.einsum("ak,ab,bk->k", steps, covariance, steps))
+    # An interval of Student's t is a little wider than 1.96 standard deviations.
+    np.testing.assert_allclose(pair.model.gain_sd, by_hand, rtol=0.01, atol=1e-9)
+    # The data agree with the model within their errors, at the frequencies that count.
+    good = np.isfinite(pair.H) & (pair.coherence > 0.9)
+    z = (pair.H - H)[good] / np.hypot(pair.sd[good], np.abs(H[good]) * pair.model.gain_sd[good])
+    assert good.sum() > 10
+    assert np.mean(np.abs(np.stack([z.real, z.imag])) < 2.5) > 0.8
+
+
+def test_they_are_drawn_told_and_written(sound, shown):
+    fit, problem, baseline = sound
+    supplementary = SupplementaryAnalyses(responses=shown)
+    analysis = Analysis(fit, problem, baseline, supplementary)
+    (name,) = [n for n in drawings(analysis) if n.startswith("match")]
+    figure = styled(drawings(analysis)[name])
+    assert [ax.get_ylabel() for ax in figure.axes][2:] == [
+        "coherence", "error [dB]", "error [deg]",
+    ]  # fmt: skip
+    page = render(analysis, "title", {}, [])
+    assert "Handling qualities" in page
+    (line,) = handling_lines(shown.handling)
+    assert line.startswith("x_roll to roll: bandwidth [rad/s] model")
+    (content,) = fit_json(fit, problem, baseline, supplementary)["handling_qualities"]
+    model, data = (content[s]["numbers"]["phase_bandwidth"] for s in ("model", "data"))
+    assert data["lower95"] < model["value"] < data["upper95"]
+
+
+def test_flights_that_are_too_short_say_so(sound):
+    fit, problem, _ = sound
+    told = fitted_responses(fit, problem, Settings(window=100.0), ())
+    assert told.pairs == ()
+    assert "expected a part of at least 2000 samples" in told.notes[0]
+
+
+def test_the_envelopes_of_mismatch_are_narrowest_where_pilots_are():
+    at = unnoticeable(np.array([0.1, 1.5, 4.0, 50.0]))
+    for low, high in (at.gain_db, at.phase_deg):
+        width = high - low
+        assert np.all(low < 0)
+        assert np.all(high > 0)
+        assert max(width[1:3]) < min(width[0], width[3])
