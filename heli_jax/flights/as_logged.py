@@ -12,11 +12,12 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal, Source
-from heli_jax.flights.marks import at_marks, counted, mark_words, stray_words, strays
+from heli_jax.flights.marks import Counts, at_marks, counted, mark_words, without_marks
 from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.request import Request
-from heli_jax.flights.signal_facts import Counts, SignalFacts, Strays, facts_of_all
+from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
 from heli_jax.flights.slower import Timed
+from heli_jax.flights.strays import Strays, stray_words, strays
 from heli_jax.flights.table import column, shown, wrong
 
 _JUMP = (0.75, 1.001)
@@ -78,9 +79,9 @@ def _as_logged(
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = _in_log(signal, timed.values)
         at = at_marks(numbers)
-        marks[key] = _of_both(counted(numbers, at), of_sources.get(key, {}))
+        marks[key] = _of_both(counted(numbers[at]), of_sources.get(key, {}))
         if at.any():
-            words = mark_words(counted(numbers, at), np.count_nonzero(~np.isnan(numbers)))
+            words = mark_words(counted(numbers[at]), np.count_nonzero(~np.isnan(numbers)))
             if key[1] == "input":
                 first = float(timed.seconds[np.flatnonzero(at)[0]])
                 problem = f"has {words}, first at {first:.6g} s"
@@ -89,12 +90,13 @@ def _as_logged(
             notes.append(f"{name} has {words}: taken as missing")
         notes += source_notes(name, of_sources.get(key, {}), numbers.size)
         values = np.where(at, np.nan, timed.values)
-        odd[key] = strays(timed.seconds, np.where(at, np.nan, numbers), key[1])
-        notes += [f"{name} has {stray_words(found)}: kept as measured" for found in odd[key]]
         turn = _turn(signal)
         if turn is not None and is_wrapped(values, turn):
             values, note = unwrapped(values, turn)
             notes.append(f"{name} {note}")
+        # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
+        odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
+        notes += [f"{name} has {stray_words(found)}: kept as measured" for found in odd[key]]
         made[key] = Timed(timed.seconds, values)
     return AsLogged(made, _facts(made, marks, odd), tuple(notes))
 
@@ -131,13 +133,18 @@ def _of_both(own: Counts, sources: Mapping[str, Counts]) -> Counts:
     return tuple(sorted(most.items()))
 
 
+def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
+    """Values (N,) in SI of a signal, NaN where one stands for no value."""
+    return np.where(np.isnan(without_marks(_in_log(signal, values))), np.nan, values)
+
+
 def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Numbers (N,) of a log whose unit nobody states, with marks as missing and angles unwrapped
     that are surely some, and what was done in words."""
     notes, at = [], at_marks(numbers)
     if at.any():
         size = np.count_nonzero(~np.isnan(numbers))
-        notes.append(f"has {mark_words(counted(numbers, at), size)}: taken as missing")
+        notes.append(f"has {mark_words(counted(numbers[at]), size)}: taken as missing")
         numbers = np.where(at, np.nan, numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]

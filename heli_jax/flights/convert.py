@@ -112,8 +112,9 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
             if selection.rate * clock.usual > _INTERPOLATED:
                 notes.append(f"{clock.words}: interpolated, so its noise is no longer white")
     for name in names:
-        size = clocks[log.topic_of(name).name].seconds.size
-        notes += source_notes(shown(name), marks_of_sources(log, name), size)
+        times = log.channel(name).times[clocks[log.topic_of(name).name].rows]
+        marks = marks_of_sources(log, name, (times[0], times[-1]))
+        notes += source_notes(shown(name), marks, times.size)
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
     if named is not None:
         taken = {n: s for n, s in named.signals.items() if s.name in columns}
@@ -241,7 +242,7 @@ def _as_logged(
     for name in names:
         values = _finite(log.channel(name).values[clock.rows])
         if (at := at_marks(values)).any():
-            words = mark_words(counted(values, at), np.count_nonzero(~np.isnan(values)))
+            words = mark_words(counted(values[at]), np.count_nonzero(~np.isnan(values)))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
             notes.append(f"{shown(name)} has {words}: {done}")
         columns[name] = np.where(at, np.nan, values) if converted else values

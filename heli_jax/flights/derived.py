@@ -8,15 +8,15 @@ import dataclasses
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.errors import nearest
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.marks import at_marks, counted, mark_words, without_marks
+from heli_jax.flights.marks import Counts, at_sure_or_suspected, counted, mark_words
 from heli_jax.flights.resample import longest_gap
-from heli_jax.flights.signal_facts import Counts
 from heli_jax.flights.table import Survey, Table, shown, wrong
 
 EULER = ("roll", "pitch", "yaw")
@@ -30,6 +30,19 @@ FORMS = (
 )
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\((.*)\)(?:\.(\w+))?\s*")
 _LONGEST_NAME = 400
+
+
+class Marked(NamedTuple):
+    """Samples (K,) of a channel that stand for no value, and their places: rows of a table, or
+    times [s] of a topic."""
+
+    places: np.ndarray
+    values: np.ndarray
+
+    def within(self, span: tuple[float, float] | None) -> Counts:
+        """How many there are from the first place to the last, both included."""
+        first, last = span or (-np.inf, np.inf)
+        return counted(self.values[(self.places >= first) & (self.places <= last)])
 
 
 @dataclass(frozen=True)
@@ -217,15 +230,13 @@ class DerivedLog(ChannelLog):
                 raise wrong(self.path, f"{problem} channels of one", place)
         values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
         # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
-        return topics[0], np.stack([without_marks(x) for x in values])
+        return topics[0], np.stack([_without_marks(x) for x in values])
 
-    def source_marks(self, name: str) -> dict[str, Counts]:
+    def source_marks(self, name: str) -> dict[str, Marked]:
         """The marks in the channels that a derived one is computed from, by channel."""
-        return _marks({n: self.channel(n).values for n in self._sources(name)})
-
-    def _sources(self, name: str) -> list[str]:
         known = frozenset(self.names)
-        return [] if name in known else sources(name, known, self.swashplate)
+        needed = [] if name in known else sources(name, known, self.swashplate)
+        return _marked({n: self.channel(n) for n in needed})
 
 
 def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -251,7 +262,7 @@ class DerivedTable:
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
         self.notes, self.units = table.notes, table.units
-        self._marks: dict[str, dict[str, Counts]] = {}
+        self._marks: dict[str, dict[str, Marked]] = {}
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -264,12 +275,14 @@ class DerivedTable:
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
         for name, d in derived.items():
-            self._marks[name] = _marks({n: columns[n] for group in d.groups for n in group})
-            clean = [[without_marks(columns[n]) for n in group] for group in d.groups]
-            columns[name] = d.compute(*(np.stack(group) for group in clean))
+            needed = {n: columns[n] for group in d.groups for n in group}
+            rows = {n: (np.arange(x.size), x) for n, x in needed.items()}
+            self._marks[name] = _marked(rows)
+            clean = {n: _without_marks(x) for n, x in needed.items()}
+            columns[name] = d.compute(*(np.stack([clean[n] for n in g]) for g in d.groups))
         return {name: columns[name] for name in names}
 
-    def source_marks(self, name: str) -> dict[str, Counts]:
+    def source_marks(self, name: str) -> dict[str, Marked]:
         """The marks in the columns that a derived one was computed from, by column; none of one
         that was not asked for yet."""
         return self._marks.get(name, {})
@@ -299,19 +312,31 @@ class DerivedTable:
         return self.table.time_unit(name) if name in self.names else None
 
 
-def _marks(columns: Mapping[str, np.ndarray]) -> dict[str, Counts]:
-    """By channel the marks in samples (N,), of those that have some."""
-    return {n: counted(x, at) for n, x in columns.items() if (at := at_marks(x)).any()}
+def _without_marks(numbers: np.ndarray) -> np.ndarray:
+    return np.where(at_sure_or_suspected(numbers), np.nan, numbers)
 
 
-def marks_of_sources(log: Table | ChannelLog, name: str) -> dict[str, Counts]:
+def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Marked]:
+    """By channel the marks in places and samples (N,), of those that have some."""
+    found = {n: at_sure_or_suspected(x) for n, (_, x) in channels.items()}
+    return {n: Marked(*(x[found[n]] for x in pair)) for n, pair in channels.items()}
+
+
+def marks_of_sources(
+    log: Table | ChannelLog, name: str, span: tuple[float, float] | None = None
+) -> dict[str, Counts]:
     """The marks in the channels that a derived one is computed from, by channel.
 
     Args:
         log: where it is none of `with_derived`, nothing is derived.
         name: of any channel; of a table's derived one after it was read.
+        span: first and last row of a table, first and last time of an autopilot's log [s], between
+            which they are counted; all of it by default.
     """
-    return log.source_marks(name) if isinstance(log, DerivedTable | DerivedLog) else {}
+    if not isinstance(log, DerivedTable | DerivedLog):
+        return {}
+    inside = {n: marked.within(span) for n, marked in log.source_marks(name).items()}
+    return {n: counts for n, counts in inside.items() if counts}
 
 
 def why_missing(log: Table | ChannelLog, name: str) -> str:

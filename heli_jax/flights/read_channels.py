@@ -12,6 +12,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.marks import Counts
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -27,7 +28,6 @@ from heli_jax.flights.onto_grid import (
 )
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
-from heli_jax.flights.signal_facts import Counts
 from heli_jax.flights.slower import Timed, is_slower
 from heli_jax.flights.table import shown, wrong
 
@@ -150,7 +150,9 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
             problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"
             why = why_missing(log, signal.name)
             raise wrong(log.path, f"{problem}, expected a finite number{why}", at)
-        signals[key, kind] = ClockedSignal(clock, values, marks_of_sources(log, signal.name))
+        span = tuple(times[clock.rows][[0, -1]])
+        marks = marks_of_sources(log, signal.name, span)
+        signals[key, kind] = ClockedSignal(clock, values, marks)
     return signals
 
 

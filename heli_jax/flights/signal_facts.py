@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from heli_jax.flights.marks import Counts
+from heli_jax.flights.strays import Strays
+
 FEW = 8
 """distinct values of a signal below which its extremes are no rails: steps between a few levels"""
 _PILE = 5.0
@@ -71,25 +74,6 @@ class Stuck:
     begin: float
     end: float
     value: float
-
-
-Counts = tuple[tuple[float, int], ...]
-"""values, as the log has them, and how many of each there are"""
-
-
-@dataclass(frozen=True, eq=False)
-class Strays:
-    """Samples that may stand for no value and are kept, since nobody knows: their times (K,) [s],
-    their values (K,), as the log has them, and `why` they are odd."""
-
-    times: np.ndarray
-    values: np.ndarray
-    why: str
-
-    def within(self, begin: float, end: float) -> "Strays":
-        """Those from `begin` to `end` [s], with times from `begin`."""
-        at = (self.times >= begin) & (self.times <= end)
-        return Strays(self.times[at] - begin, self.values[at], self.why)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.marks import mark_words, stray_words
+from heli_jax.flights.marks import mark_words
 from heli_jax.flights.signal_facts import (
     DROP_SHARE,
     RAIL_SHARE,
@@ -21,6 +21,7 @@ from heli_jax.flights.signal_facts import (
     facts_of_all,
     quantum,
 )
+from heli_jax.flights.strays import stray_words
 from heli_jax.identification.validation.finding import Finding
 
 __all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "strays", "stuck"]
@@ -112,9 +113,7 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     for label, flight in flights:
         for (name, kind), facts in facts_of(flight).items():
             if facts.marks and kind == "output":
-                size = facts.size + sum(n for _, n in facts.marks)
-                words = f"{label}: {name} has {mark_words(facts.marks, size)}: "
-                words += "taken as missing; look "
+                words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
                 found.append((0.0, f"{words}at what the log says of such values."))
             if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
                 words = (
