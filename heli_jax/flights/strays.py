@@ -15,9 +15,10 @@ _MOST = 0.05
 """part of the samples that no motion leads to, at most"""
 _MOTION = 50
 """samples from which the range of a motion is known"""
-_FAR, _FARTHER = 5.0, 50.0
-"""times the range of all other samples, from which on no motion leads there; the larger for inputs,
-since a stick may be pushed out of noise for a moment, and for outputs of longer steps than"""
+_FAR, _FARTHER, _FARTHEST = 5.0, 20.0, 1e4
+"""times the range of all other samples, from which on no motion leads there; the second for inputs,
+since a stick may be pushed out of noise for a moment, and for outputs of longer steps than `_QUICK`;
+the third for inputs of such steps"""
 _QUICK = 0.04
 """s, between two samples of which a motion does not come and go"""
 _SOME = 10_000
@@ -78,9 +79,10 @@ def _unreached(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[np.
     coarse = np.count_nonzero(new) < _MOTION
     new |= coarse
     y, times = x[new], seconds[seen][new]
-    quick = kind == "output" and not coarse and float(np.median(np.diff(times))) <= _QUICK
-    far = _FAR if quick else _FARTHER
-    out, far = _lonely(y, far, _LONGEST if quick or kind == "input" else 1)
+    quick = float(np.median(np.diff(times))) <= _QUICK
+    close = quick and not coarse and kind == "output"
+    far = _FAR if close else _FARTHER if quick or kind == "output" else _FARTHEST
+    out, far = _lonely(y, far, _LONGEST if quick else 1)
     at = out[np.cumsum(new) - 1]
     if np.count_nonzero(at) <= _MOST * x.size:
         none[seen[at]] = True
@@ -98,7 +100,7 @@ def _lonely(y: np.ndarray, far: float, most: int) -> tuple[np.ndarray, float]:
         out = _beyond(y, low, high, far)
     levels = np.unique(y[~out]).size
     if levels < _LEVELS:
-        far = _FARTHER
+        far = max(far, _FARTHER)
         out &= _beyond(y, low, high, far) & (levels >= _FEW_LEVELS)
     return out, far
 
