@@ -133,8 +133,9 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
         x = np.asarray(numbers)
         # Of what was never logged nothing else is there, and a switch may have any value.
         if x.dtype.kind in "biuf" and (at := at_marks(x := x.astype(np.float64))).any():
-            words = mark_words(counted(x[at]), np.count_nonzero(~np.isnan(x)))
-            notes.append(f"{shown(name)} has {words}: a fit takes them as missing")
+            # What counts first: a terminal shows the beginning.
+            words = f"{listed(counted(x[at]))} stand for no value in {shown(name)}"
+            notes.append(f"{words}: a fit takes them as missing")
     more = len(notes) - _MOST_NOTES
     return [*notes[:_MOST_NOTES], f"{more} more channels have such samples"] if more > 0 else notes
 
