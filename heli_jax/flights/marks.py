@@ -47,9 +47,7 @@ Counts = tuple[tuple[float, int], ...]
 def at_marks(numbers: np.ndarray) -> np.ndarray:
     """Which of the numbers (N,) of a log surely stand for no value: known marks far outside of all
     others or of a sign that no other number has, and numbers that nothing measures."""
-    with np.errstate(invalid="ignore"):
-        absurd = np.abs(numbers) > _ABSURD
-    known = _is_one_of(_KNOWN, numbers)
+    absurd, known = is_absurd(numbers), _is_one_of(_KNOWN, numbers)
     none = np.zeros(numbers.shape, bool)
     if not (absurd.any() or known.any()):
         return none
@@ -65,6 +63,12 @@ def at_marks(numbers: np.ndarray) -> np.ndarray:
     # Among rotor speeds -9999 is not far, but the only one below zero.
     other_sign = (numbers < 0) if low >= 0 else (numbers > 0) if high <= 0 else none
     return at & (far | (other_sign & _is_one_of(_DECIMAL, numbers)))
+
+
+def is_absurd(numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) of a log nothing measures, whatever their unit."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(numbers) > _ABSURD
 
 
 def _is_mark(numbers: np.ndarray, absurd: np.ndarray) -> bool:

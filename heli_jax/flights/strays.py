@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax.flights.marks import counted, listed, suspected
+from heli_jax.flights.marks import counted, is_absurd, listed, suspected
 
 _LEVELS, _FEW_LEVELS = 8, 3
 """distinct values of a signal beside its strays, at least; where they are so few, only what is
@@ -16,9 +16,9 @@ _MOST = 0.05
 _MOTION = 50
 """samples from which the range of a motion is known"""
 _FAR, _FARTHER, _FARTHEST = 5.0, 20.0, 1e4
-"""times the range of all other samples, from which on no motion leads there; the second for inputs,
-since a stick may be pushed out of noise for a moment, and for outputs of longer steps than `_QUICK`;
-the third for inputs of such steps"""
+"""times the range of all other samples, from which on no motion leads there; the second for
+inputs, since a stick may be pushed out of noise for a moment, and for outputs of longer steps than
+`_QUICK`; the third for inputs of such steps"""
 _QUICK = 0.04
 """s, between two samples of which a motion does not come and go"""
 _SOME = 10_000
@@ -52,7 +52,9 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
     why = "which loggers write where they have no value"
     alone, far = _unreached(seconds, numbers, kind)
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
-    found = ((suspected(numbers), why), (alone, off))
+    absurd, too_large = is_absurd(numbers), "larger than any measurement"
+    alone &= ~absurd
+    found = ((suspected(numbers), why), (absurd, too_large), (alone, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in found if at.any())
 
 

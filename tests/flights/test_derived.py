@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Signal, read_flight
+from heli_jax.flights import Signal, describe_log, read_flight
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.derived import body_velocity, euler_angles, with_derived
@@ -72,6 +72,12 @@ def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
     got = convert_log(path, Selection(signals=(roll,)))
     assert np.isnan(got.columns[roll][50:60]).all()
     assert said in got.notes
+    # Of another part of the log nothing is said.
+    f = read_flight(path, time="t", inputs=inputs, outputs=outputs, window=(1.0, 1.9))
+    assert f.source is not None
+    assert not any("-9999" in note for note in f.source.notes)
+    said = describe_log(path).notes
+    assert "3 samples of -9999 stand for no value in 'h': a fit takes them as missing" in said
     inputs = {"u": Signal("unwrap(h, 360)", "deg", "deg")}
     with pytest.raises(InputError, match=r"line 82.*'h' has 3 samples of -9999"):
         read_flight(path, time="t", inputs=inputs, outputs={"p": Signal("u", "1", "1")})

@@ -202,9 +202,7 @@ class Estimator(abc.ABC):
             signals(layout), self.errors_of(layout, data, noise, e), strict=True
         ):
             y = np.asarray(data.flights[i].outputs[name])
-            # A residual that is all rounding would make the next rows infinite.
-            floor = 1e-12 * np.sqrt(np.mean(np.square(y[np.isfinite(y)]))) + 1e-300
-            size = max(np.sqrt(np.mean(np.square(r)) * freedom), floor)
+            size = max(np.sqrt(np.mean(np.square(r)) * freedom), least_noise(y))
             sd[i][name] = np.asarray(size, np.asarray(y).dtype)
         return z, Noise(tuple(sd), noise.log_variance_ratio)
 
@@ -382,6 +380,14 @@ class Estimator(abc.ABC):
             ill: whether it is ill-conditioned.
         """
         return []
+
+
+def least_noise(y: np.ndarray) -> float:
+    """The sd, SI, below which what is left of an output (N,) is rounding; NaN is missing."""
+    # A residual that is all rounding would make the next rows infinite; of an output that is
+    # nothing at all even 1e-12 of its unit is plenty.
+    rms = float(np.sqrt(np.mean(np.square(y[np.isfinite(y)]))))
+    return 1e-12 * (rms if rms > 1e-100 else 1.0)
 
 
 def signals(layout: Layout) -> list[tuple[int, str]]:
