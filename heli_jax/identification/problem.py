@@ -48,8 +48,6 @@ __all__ = ["MAX_TIME_SHIFT", "Free", "Nuisance", "Prior", "Problem", "Sign"]
 
 _FEWEST = 4
 """samples of a window at least: each window brings an initial state of its own"""
-_STILL = 1e-100
-"""SI: an output that moves by no more does not move"""
 _FEWEST_SEEN = 8
 """measured samples of an output at least"""
 _PER_PARAMETER = 3
@@ -319,7 +317,6 @@ def _check_flight(flight: Flight, problem: Problem) -> None:
     if not flight.outputs:
         raise ValueError(f"{where} has no output: nothing can be compared with the model")
     _check_measured(flight, problem, where)
-    _check_moving(flight, where)
     _check_known(flight, problem, where)
     count, least = len(problem.free), _PER_PARAMETER * len(problem.free)
     # What counts is what was measured, of the output of which most was.
@@ -366,18 +363,6 @@ def _check_measured(flight: Flight, problem: Problem, where: str) -> None:
                 f"{where}, output {name!r}: expected the sd of its noise, which is fixed "
                 "(sigma_y), got none"
             )
-
-
-def _check_moving(flight: Flight, where: str) -> None:
-    """Refuse a flight in which no output does anything: any gain of zero fits it, without noise."""
-    seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
-    if flight.hold_out or any(np.ptp(y) > _STILL for y in seen.values() if y.size):
-        return
-    values = ", ".join(f"{n} is {y[0]:.4g}" for n, y in seen.items() if y.size)
-    raise ValueError(
-        f"{where}: expected an output that moves, got one value in the whole record ({values}); "
-        "look whether the sensor was logged, or leave the flight out"
-    )
 
 
 def _check_model(problem: Problem) -> None:
