@@ -12,7 +12,14 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal, Source
-from heli_jax.flights.marks import Counts, at_marks, counted, mark_words, without_marks
+from heli_jax.flights.marks import (
+    Counts,
+    at_marks,
+    counted,
+    mark_words,
+    suspect_notes,
+    without_marks,
+)
 from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.request import Request
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
@@ -81,7 +88,7 @@ def _as_logged(
         at = at_marks(numbers)
         marks[key] = _of_both(counted(numbers[at]), of_sources.get(key, {}))
         if at.any():
-            words = mark_words(counted(numbers[at]), np.count_nonzero(~np.isnan(numbers)))
+            words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
                 first = float(timed.seconds[np.flatnonzero(at)[0]])
                 problem = f"has {words}, first at {first:.6g} s"
@@ -143,9 +150,10 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
     that are surely some, and what was done in words."""
     notes, at = [], at_marks(numbers)
     if at.any():
-        size = np.count_nonzero(~np.isnan(numbers))
+        size = int(np.sum(~np.isnan(numbers)))
         notes.append(f"has {mark_words(counted(numbers[at]), size)}: taken as missing")
         numbers = np.where(at, np.nan, numbers)
+    notes += suspect_notes(numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]
         if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):

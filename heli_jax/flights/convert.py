@@ -13,7 +13,7 @@ from heli_jax.flights.ccpm import Swashplate
 from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import at_marks, counted, mark_words
+from heli_jax.flights.marks import at_marks, counted, mark_words, suspect_notes
 from heli_jax.flights.named import NamedBy
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
@@ -242,9 +242,10 @@ def _as_logged(
     for name in names:
         values = _finite(log.channel(name).values[clock.rows])
         if (at := at_marks(values)).any():
-            words = mark_words(counted(values[at]), np.count_nonzero(~np.isnan(values)))
+            words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
             done = "taken as missing" if converted else "kept; with --rate they are missing"
             notes.append(f"{shown(name)} has {words}: {done}")
+        notes += [f"{shown(name)} {said}" for said in suspect_notes(np.where(at, np.nan, values))]
         columns[name] = np.where(at, np.nan, values) if converted else values
     return columns
 

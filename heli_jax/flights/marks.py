@@ -39,6 +39,7 @@ _FAR = 10.0
 _SPACING = 3.0
 """times the largest distance between neighbouring values, by which what may be a mark is off"""
 _MOST_NOTES = 6
+WHY_SUSPECTED = "which loggers write where they have no value"
 
 Counts = tuple[tuple[float, int], ...]
 """values, as the log has them, and how many of each there are"""
@@ -115,6 +116,12 @@ def suspected(numbers: np.ndarray) -> np.ndarray:
         if np.count_nonzero(numbers == value) < 2:
             at &= numbers != value
     return at
+
+
+def suspect_notes(numbers: np.ndarray) -> list[str]:
+    """What is said of numbers (N,) that may be marks, behind the name of their channel."""
+    at = suspected(numbers)
+    return [f"has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"] if at.any() else []
 
 
 def at_sure_or_suspected(numbers: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax.flights.marks import counted, is_absurd, listed, suspected
+from heli_jax.flights.marks import WHY_SUSPECTED, counted, is_absurd, listed, suspected
 
 _LEVELS, _FEW_LEVELS = 8, 3
 """distinct values of a signal beside its strays, at least; where they are so few, only what is
@@ -49,12 +49,11 @@ def strays(seconds: np.ndarray, numbers: np.ndarray, kind: str) -> tuple[Strays,
         numbers: (N,), as the log has them, NaN where there is none or a mark stood.
         kind: `input` or `output`.
     """
-    why = "which loggers write where they have no value"
     alone, far = _unreached(seconds, numbers, kind)
     off = f"which no motion leads to: more than {far:g} times the range of all others away"
     absurd, too_large = is_absurd(numbers), "larger than any measurement"
     alone &= ~absurd
-    found = ((suspected(numbers), why), (absurd, too_large), (alone, off))
+    found = ((suspected(numbers), WHY_SUSPECTED), (absurd, too_large), (alone, off))
     return tuple(Strays(seconds[at], numbers[at], words) for at, words in found if at.any())
 
 
