@@ -95,7 +95,7 @@ def _as_logged(
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
             notes.append(f"{name} has {words}: taken as missing")
-        notes += source_notes(name, of_sources.get(key, {}), numbers.size)
+        notes += source_notes(name, of_sources.get(key, {}))
         values = np.where(at, np.nan, timed.values)
         turn = _turn(signal)
         if turn is not None and is_wrapped(values, turn):
@@ -118,17 +118,21 @@ def _facts(
     return {key: replace(f, marks=marks[key], strays=odd[key]) for key, f in facts.items()}
 
 
-def source_notes(name: str, marks: Mapping[str, Counts], size: int) -> list[str]:
+def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
     """Notes on the marks in the channels that a derived one is computed from.
 
     Args:
         name: of the derived one, as it is shown.
         marks: by channel.
-        size: samples of the derived one.
     """
+    # The four parts of a quaternion are lost together: one note says it of all.
+    alike: dict[Counts, list[str]] = {}
+    for source, counts in marks.items():
+        alike.setdefault(counts, []).append(shown(source))
     return [
-        f"{name}: {shown(source)} has {mark_words(counts, size)}: taken as missing"
-        for source, counts in marks.items()
+        f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
+        f"{mark_words(counts)}: taken as missing"
+        for counts, sources in alike.items()
     ]
 
 

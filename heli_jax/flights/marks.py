@@ -145,7 +145,8 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
         # Of what was never logged nothing else is there, and a switch may have any value.
         if x.dtype.kind in "biuf" and (at := at_marks(x := x.astype(np.float64))).any():
             # What counts first: a terminal shows the beginning.
-            words = f"{listed(counted(x[at]))} stand for no value in {shown(name)}"
+            stand = "stands" if np.count_nonzero(at) == 1 else "stand"
+            words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
             notes.append(f"{words}: a fit takes them as missing")
     more = len(notes) - _MOST_NOTES
     return [*notes[:_MOST_NOTES], f"{more} more channels have such samples"] if more > 0 else notes
