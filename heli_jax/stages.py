@@ -11,6 +11,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+COMPILATION = "compilation (of these)"
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
@@ -79,12 +80,12 @@ def recorded() -> Iterator[dict[str, float]]:
     from jax import monitoring
 
     outer = _work.get()
-    seconds: dict[str, float] = {}
+    seconds = {COMPILATION: 0.0}
 
     # Any: whatever else JAX says of an event.
     def compiled(event: str, duration_secs: float, **_: Any) -> None:
         if event == _COMPILED:
-            seconds[COMPILATION] = seconds.get(COMPILATION, 0.0) + duration_secs
+            seconds[COMPILATION] += duration_secs
 
     token = _work.set(_Work(outer.observer if outer else None, seconds))
     monitoring.register_event_duration_secs_listener(compiled)
@@ -93,9 +94,6 @@ def recorded() -> Iterator[dict[str, float]]:
     finally:
         monitoring.unregister_event_duration_listener(compiled)
         _work.reset(token)
-
-
-COMPILATION = "compilation (of these)"
 
 
 @contextlib.contextmanager
