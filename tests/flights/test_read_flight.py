@@ -166,7 +166,8 @@ def test_what_is_wrong_outside_the_window_is_no_matter(tmp_path):
     assert read_flight(path, **ASKED, window=(0.02, 1.0)).n_samples == 11
 
 
-NUMBERS = st.floats(-1e12, 1e12, allow_subnormal=False)
+# Single numbers beyond 1e9 among small ones stand for none: test_as_logged.py.
+NUMBERS = st.floats(-1e8, 1e8, allow_subnormal=False)
 
 
 @settings(max_examples=40, deadline=None)

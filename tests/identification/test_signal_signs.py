@@ -106,6 +106,7 @@ def test_an_output_before_its_stick_is_said_before_any_fit():
     bad = Flight(dt=DT, inputs={"u": u_late[cut], "v": np.zeros(N - 50)}, outputs=outputs)
     assert late_inputs([("flight 1", good)], ()) == []
     [finding] = late_inputs([("flight 1", bad)], ())
-    assert "p moves 0.16 s before u does" in finding.sentence
+    # Means over 0.02 s, to which logs of any rate are brought, leave one sample of the lead open.
+    assert "p moves 0.14 s or more before u does" in finding.sentence
     follows = Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)
     assert late_inputs([("flight 1", bad)], (follows,)) == []

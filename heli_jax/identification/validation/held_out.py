@@ -51,7 +51,7 @@ def validate(
     # What is shared stands first in z and in the same order, whichever flights there are.
     other = layout_of(problem, held)
     # What no line of a spectrum knows, the initial states and biases, shows in time alone.
-    if not other.estimator.rows_are_samples:
+    if not other.estimator.nuisances_in_rows:
         other = replace(other, estimator=estimator_of("output-error"))
     data = data_of(problem, held, other)
     # From any point a linear model's are found in one step, so zero, the middle of their weak
