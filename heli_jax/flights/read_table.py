@@ -214,7 +214,8 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
     stated = table.time_unit(time.name)
     scale = units.factor(stated or time.unit, "s")
-    said = _unit_notes(time, stated)
+    # A type is unmistakable; only words may be meant for something else.
+    said = () if stated and not table.units.get(time.name) else _unit_notes(time, stated)
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
