@@ -62,12 +62,13 @@ class Resolved(NamedTuple):
     """What a machine does at every line of a record, signals apart."""
 
     z: Complex[np.ndarray, " K"]
-    P: Complex[Array, "K n n"]
-    """(zI - Ad)^-1"""
+    T: Complex[Array, "n n"]
+    """Ad = V T V^H, triangular"""
+    V: Complex[Array, "n n"]
     W: Float[Array, "K 2p 2p"]
     """the whitening"""
     H: Float[Array, "K 2p 2n"]
-    """W C P"""
+    """W C (zI - Ad)^-1"""
     Q: Float[Array, "s n"]
     """an orthonormal basis of what the ends may add to whitened rows; zero where a state leaves no
     trace"""
@@ -182,11 +183,12 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     """
     z = np.exp(2j * np.pi * np.arange(1, record.lines + 1) / record.samples)
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
-    P = jnp.linalg.inv(z[:, None, None] * jnp.eye(m.Ad.shape[0], dtype=z.dtype) - m.Ad[None])
-    H = (whitening @ m.C.astype(z.dtype)[None]) @ P
+    # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved.
+    T, V = jax.scipy.linalg.schur(m.Ad, output="complex")
+    H = whitening @ (_solved(z, T, m.C @ V, left=False) @ jnp.conj(V.T))
     # What the ends of the record explain is found by linear least squares.
     Q, solution = _span(stacked(z[:, None, None] * H).reshape(-1, H.shape[2]))
-    return Resolved(z, P, _real(whitening), _real(H), Q, solution)
+    return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
 
 
 def _span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
@@ -255,7 +257,15 @@ def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"
         at: the machine at the lines.
         driving: B U, and the ends.
     """
-    return jnp.einsum("kij,kj->ki", at.P, driving)
+    seen = (driving @ jnp.conj(at.V))[:, :, None]
+    return _solved(at.z, at.T, seen, left=True)[:, :, 0] @ at.V.T
+
+
+def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> Array:
+    """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with a triangle T."""
+    M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype) - T[None]
+    b = jnp.broadcast_to(b, (len(z), *b.shape[-2:]))
+    return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
 
 
 def _times(M: Float[Array, "K a 2b"], v: Complex[Array, "K b"]) -> Float[Array, "K a"]:
