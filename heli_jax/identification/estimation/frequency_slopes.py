@@ -33,6 +33,9 @@ from heli_jax.identification.estimation.frequency_lines import (
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
+_BLOCK = 256
+"""lines whose derivatives are made and summed before the next"""
+
 
 class Products(NamedTuple):
     """Of whitened errors e (of white noise of variance 1), their derivatives J by the unknowns and
@@ -42,6 +45,49 @@ class Products(NamedTuple):
     Ze: Float[Array, " q"]
     ZZ: Float[Array, "q q"]
     ZJ: Float[Array, "q q"]
+
+
+class _Driven(NamedTuple):
+    """Lines of one record: the states, what drives them, and the derivatives of that."""
+
+    X: Complex[Array, "K n"]
+    lines: Signals
+    slopes: Signals
+    """(K, c, q); None for those that do not move"""
+
+
+class _Block(NamedTuple):
+    """Lines of one record with all that their products are made of."""
+
+    H: Float[Array, "K 2p 2n"]
+    W: Float[Array, "K 2p 2p"]
+    Q: Float[Array, "K 2p n"]
+    e: Float[Array, "K 2p"]
+    own: _Driven
+    by: _Driven | None
+
+
+class _Sums(NamedTuple):
+    """Products, and the components along what the ends may add."""
+
+    ee: Array
+    Ze: Array
+    ZZ: Array
+    ZJ: Array
+    Qe: Array
+    QZ: Array
+    QJ: Array
+
+    def products(self) -> Products:
+        """Z P e and Z P J with the projection P: only the small products change (Kaufman)."""
+        made = Products(
+            self.ee - self.Qe @ self.Qe,
+            -(self.Ze - self.Qe @ self.QZ),
+            self.ZZ - self.QZ.T @ self.QZ,
+            self.ZJ - self.QZ.T @ self.QJ,
+        )
+        # Of a complex normal error each part has half of the variance.
+        return jax.tree.map(lambda v: 2.0 * v, made)
 
 
 def products_of_lines(
@@ -78,11 +124,12 @@ def products_of_lines(
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
                 e = errors(at, m, record, signals, y)
-                J = _slopes(at, m, dm, e.X, e.signals, _lines(record, ds))
-                Z = J
+                own, other = _Driven(e.X, e.signals, _lines(record, ds)), None
                 if by is not None:
-                    Z = _by_instrument(at, m, dm, record, by, dby, J, noise.by_instrument)
-                made.append(_products(at, e.rows, J, Z))
+                    other = _driven_by(at, m, record, by, dby)
+                Q = at.Q.reshape(*e.rows.shape, -1)
+                whole = _Block(at.H, at.W, Q, e.rows, own, other)
+                made.append(_summed(m, dm, noise.by_instrument, whole).products())
             return jax.tree.map(lambda *v: sum(v), *made)
 
         each = (machines.signals, slopes.signals, machines.by, slopes.by)
@@ -93,41 +140,46 @@ def products_of_lines(
     return jax.tree.map(lambda *v: sum(v), *total)
 
 
-def _products(at: Resolved, e: Array, J: Array, Z: Array) -> Products:
-    """Of one record: e (K, 2p), J and Z (K, 2p, q), minus the derivatives."""
+def _driven_by(at: Resolved, m: Matrices, record: Record, by: Signals, dby: Signals) -> _Driven:
+    lines = Signals(*(at_lines(record, v) for v in by))
+    X = states(at, lines.U @ m.B.T.astype(at.z.dtype))
+    return _Driven(X, lines, _lines(record, dby))
+
+
+def _summed(m: Matrices, dm: Matrices, by_instrument: Array, whole: _Block) -> _Sums:
+    """Over all lines, some hundred at a time: the derivatives of all would leave every cache."""
+    K = whole.e.shape[0]
+    count = -(-K // _BLOCK)
+    size = -(-K // count)
+
+    def blocks(v: Array) -> Array:
+        # Lines of zeros add nothing.
+        v = jnp.pad(v, [(0, count * size - K)] + [(0, 0)] * (v.ndim - 1))
+        return v.reshape(count, size, *v.shape[1:])
+
+    def made(block: _Block) -> _Sums:
+        return _sums(m, dm, by_instrument, block)
+
+    def more(total: _Sums, block: _Block) -> tuple[_Sums, None]:
+        return jax.tree.map(jnp.add, total, made(block)), None
+
+    stacked_blocks = jax.tree.map(blocks, whole)
+    shapes = jax.eval_shape(made, jax.tree.map(lambda v: v[0], stacked_blocks))
+    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    return jax.lax.scan(more, zeros, stacked_blocks)[0]
+
+
+def _sums(m: Matrices, dm: Matrices, by_instrument: Array, block: _Block) -> _Sums:
+    J = Z = _slopes(block, m, dm, block.own)
+    if block.by is not None:
+        # One program for both: the direct estimate is where the search by instrument begins.
+        by = block.by
+        Z = jax.lax.cond(by_instrument > 0.5, lambda: _slopes(block, m, dm, by), lambda: J)
+    # J and Z are minus the derivatives: a sign that `products` gives back to Z e.
     q = J.shape[2]
-    e, J, Z = e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
-    e_ends, J_ends, Z_ends = at.Q.T @ e, at.Q.T @ J, at.Q.T @ Z
-    # Z P e and Z P J with the projection P: only the small products change (Kaufman).
-    made = Products(
-        e @ e - e_ends @ e_ends,
-        -(e @ Z - e_ends @ Z_ends),
-        Z.T @ Z - Z_ends.T @ Z_ends,
-        Z.T @ J - Z_ends.T @ J_ends,
-    )
-    # Of a complex normal error each part has half of the variance.
-    return jax.tree.map(lambda v: 2.0 * v, made)
-
-
-def _by_instrument(
-    at: Resolved,
-    m: Matrices,
-    dm: Matrices,
-    record: Record,
-    by: Signals,
-    dby: Signals,
-    J: Array,
-    wanted: Array,
-) -> Array:
-    """The derivatives of the response to the inputs by instrument, or J where these are not used
-    yet: one program for both."""
-
-    def made() -> Array:
-        lines = Signals(*(at_lines(record, v) for v in by))
-        X = states(at, lines.U @ m.B.T.astype(at.z.dtype))
-        return _slopes(at, m, dm, X, lines, _lines(record, dby))
-
-    return jax.lax.cond(wanted > 0.5, made, lambda: J)
+    e, J, Z = block.e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
+    Q = block.Q.reshape(e.size, -1)
+    return _Sums(e @ e, e @ Z, Z.T @ Z, Z.T @ J, Q.T @ e, Q.T @ Z, Q.T @ J)
 
 
 def _lines(record: Record, ds: Signals) -> Signals:
@@ -140,18 +192,11 @@ def _lines(record: Record, ds: Signals) -> Signals:
     return Signals(*(None if v is None else lines(v) for v in ds))
 
 
-def _slopes(
-    at: Resolved,
-    m: Matrices,
-    dm: Matrices,
-    X: Complex[Array, "K n"],
-    lines: Signals,
-    dlines: Signals,
-) -> Float[Array, "K a q"]:
+def _slopes(block: _Block, m: Matrices, dm: Matrices, of: _Driven) -> Float[Array, "K a q"]:
     """The derivatives of the whitened response, real parts and imaginary ones."""
-    driving = _moved(X, lines.U, (dm.Ad, dm.B), (m.B, dlines.U))
-    passing = _moved(X, lines.acting, (dm.C, dm.D), (m.D, dlines.acting))
-    made = [M @ v for M, v in ((at.H, driving), (at.W, passing)) if v is not None]
+    driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
+    passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
+    made = [M @ v for M, v in ((block.H, driving), (block.W, passing)) if v is not None]
     return made[0] if len(made) == 1 else made[0] + made[1]
 
 
