@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from heli_jax.simulation.options import SimulationOptions as SimulationOptions
     from heli_jax.simulation.simulate import simulate as simulate
     from heli_jax.simulation.trajectory import Trajectory as Trajectory
+    from heli_jax.studies.run import run_study as run_study
     from heli_jax.sweeps.run import sweep as sweep
     from heli_jax.vehicle import Helicopter as Helicopter
     from heli_jax.vehicle import load_vehicle as load_vehicle
@@ -85,6 +86,7 @@ _HOMES = {
     "load_config": "workflow",
     "run_check": "workflow",
     "run_fit": "workflow",
+    "run_study": "studies.run",
     "run_sweep": "workflow",
     "write_report": "workflow",
 }

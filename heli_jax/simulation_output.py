@@ -54,37 +54,47 @@ def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simu
 
 
 @contextlib.contextmanager
-def sweep_progress() -> Iterator["Callable[[Progress], None]"]:
+def sweep_progress(
+    what: str = "sweep", of: str = "elements"
+) -> Iterator["Callable[[Progress], None]"]:
     """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
-    line."""
+    line.
+
+    Args:
+        what: what goes on.
+        of: what it has many of.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     # A bar in a log file is a line of carriage returns.
     if not sys.stderr.isatty():
-        yield _Lines()
+        yield _Lines(what, of)
         return
-    columns = (TextColumn("sweep"), BarColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("compiling", total=1.0)
-        yield lambda p: bar.update(task, completed=p.done / p.total, description=_progress_words(p))
+        yield lambda p: bar.update(
+            task, completed=p.done / p.total, description=_progress_words(p, of)
+        )
 
 
 class _Lines:
     """A line at the first chunk, the last, and every ten seconds between."""
 
-    def __init__(self) -> None:
-        self.last = -math.inf
+    def __init__(self, what: str, of: str) -> None:
+        self.what, self.of, self.last = what, of, -math.inf
 
     def __call__(self, p: "Progress") -> None:
         now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
         if p.done == p.total or now - self.last > 10.0:
             self.last = now
-            print(f"heli-jax: sweep: {_progress_words(p)}", file=sys.stderr, flush=True)
+            words = f"heli-jax: {self.what}: {_progress_words(p, self.of)}"
+            print(words, file=sys.stderr, flush=True)
 
 
-def _progress_words(p: "Progress") -> str:
-    words = f"{p.done} of {p.total} elements"
+def _progress_words(p: "Progress", of: str) -> str:
+    words = f"{p.done} of {p.total} {of}"
     # The first chunk compiles: a rate that contained it would foretell hours.
     if math.isnan(p.rate):
         return words

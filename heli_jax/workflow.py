@@ -127,6 +127,11 @@ def run_fit(
     if out is not None:
         run_directory.require_free(Path(out))  # before the work, not after it
     config = config if isinstance(config, Experiment) else load_config(config)
+    # One fit of it alone would look like the study's result.
+    if config.config.study is not None:
+        raise InputError(
+            f"{config.path}: study: asks for many fits, expected heli_jax.run_study, or study: null"
+        )
     problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for note in reading_notes(problem):
