@@ -94,11 +94,10 @@ def read_study(
     path = Path(path)
     single, repeated = _told_apart(overrides)
     content = read_overridden(path, single)
-    axes = {**_in_file(content, path), **repeated, **_over(over)}
-    # A value in place of the file's is one fit's, as for any other key.
+    # A value in place of an axis of the file is that of all fits, as for any other key.
     named = single if isinstance(single, Mapping) else [parse_override(t)[0] for t in single]
-    asked = {*repeated, *_over(over)}
-    axes = {key: values for key, values in axes.items() if key in asked or key not in named}
+    stated = {k: v for k, v in _section(content, path).items() if k not in named}
+    axes = {**_listed_logs(content, path), **stated, **repeated, **_over(over)}
     if not axes:
         return None
     axes = {key: _logs(key, values, path) for key, values in axes.items()}
@@ -146,21 +145,24 @@ def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:
     return axes
 
 
-def _in_file(content: dict[str, Any], path: Path) -> Axes:
-    """The axes of a configuration, which are taken out of it."""
+def _listed_logs(content: dict[str, Any], path: Path) -> Axes:
+    """The flights that have a list of logs."""
     axes: Axes = {}
     flights = content.get("flights")
     for i, flight in enumerate(flights if isinstance(flights, list) else ()):
         if isinstance(flight, dict) and isinstance(flight.get("log"), list):
             axes[f"flights.{i}.log"] = _values(flight["log"], f"{path}: flights[{i}].log")
+    return axes
+
+
+def _section(content: dict[str, Any], path: Path) -> Axes:
+    """The section `study`, which is taken out of the configuration."""
     stated = content.pop("study", None)
     if stated is None:
-        return axes
+        return {}
     if not isinstance(stated, dict):
         raise InputError(f"{path}: study: expected keys with lists of values, got {stated!r:.60}")
-    return axes | {
-        str(key): _values(values, f"{path}: study.{key}") for key, values in stated.items()
-    }
+    return {str(key): _values(values, f"{path}: study.{key}") for key, values in stated.items()}
 
 
 def _values(values: Any, where: str) -> tuple[Any, ...]:
