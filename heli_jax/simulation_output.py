@@ -130,10 +130,11 @@ def print_sweep(out: Path) -> None:
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
     width = len(head) if "float32_error" in totals else len(head) - 1
     print_table(head[:width], [row[:width] for row in rows])
-    for name, worst_ones in totals["worst"].items():
-        element = worst_ones[0]
-        at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
-        print(f"worst {name}: element {element['element']}, {at}")
+    for words in ("worst", "best"):
+        for name, elements in totals[words].items():
+            element = elements[0]
+            at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
+            print(f"{words} {name}: element {element['element']}, {at}")
     for note in totals["notes"]:
         print(f"! {note}")
     for name, result in totals["results"].items():

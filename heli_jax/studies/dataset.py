@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import xarray as xr
@@ -27,7 +27,9 @@ _ADEQUATE = {True: "yes", False: "no", None: "not judged"}
 Fits = Sequence[Mapping[str, Any] | None]
 
 
-def dataset(study: Study, names: Sequence[str], fits: Fits, versions: Mapping[str, str]):
+def dataset(
+    study: Study, names: Sequence[str], fits: Fits, versions: Mapping[str, str]
+) -> xr.Dataset:
     """The Dataset of a study.
 
     Args:
@@ -104,7 +106,7 @@ def _coordinate(values: Sequence[Any]) -> np.ndarray:
     return np.array([v if isinstance(v, str) else json.dumps(v) for v in values], _TEXT)
 
 
-def _is_fit(fit: Mapping[str, Any] | None) -> bool:
+def _is_fit(fit: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
     return fit is not None and "status" in fit
 
 
@@ -115,12 +117,12 @@ def _status(fit: Mapping[str, Any] | None) -> str:
 
 
 def _verdict(fit: Mapping[str, Any] | None) -> str:
-    return str(fit["verdict"]["text"]) if fit is not None and _is_fit(fit) else ""
+    return str(fit["verdict"]["text"]) if _is_fit(fit) else ""
 
 
 def _estimates(fit: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
     """The estimates by name: parameters, and the nuisance parameters that are of no one flight."""
-    if fit is None or not _is_fit(fit):
+    if not _is_fit(fit):
         return {}
     free = {n: e for n, e in fit["parameters"].items() if not e.get("fixed", False)}
     return free | {n: e for n, e in fit["nuisance"].items() if "/" not in n}
@@ -144,4 +146,4 @@ def _unit(name: str, estimates: Sequence[Mapping[str, Mapping[str, Any]]]) -> st
 
 
 def _metrics(fit: Mapping[str, Any] | None, part: str) -> Mapping[str, Any]:
-    return fit[part] if fit is not None and _is_fit(fit) else {}
+    return fit[part] if _is_fit(fit) else {}
