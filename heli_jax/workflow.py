@@ -437,11 +437,14 @@ def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
     Raises:
         InputError: the figures cannot be written.
     """
+    from heli_jax.report.sweep_page import write_page
     from heli_jax.report.sweeps import RESULTS, results, write_figures
     from heli_jax.sweeps.summary import worst
 
     try:
         write_figures(out / "figures", dataset, worst(dataset, job))
+        with run_directory.whole_file(out / "report.html", f"--out {out}: report.html") as page:
+            write_page(page, out, out.name)
     except OSError as e:  # the results are safe in the store by now
         raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
     # A figure for each result and axis: of dozens nobody would look at any.
