@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from heli_jax.simulation.options import SimulationOptions as SimulationOptions
     from heli_jax.simulation.simulate import simulate as simulate
     from heli_jax.simulation.trajectory import Trajectory as Trajectory
+    from heli_jax.studies.run import run_study as run_study
+    from heli_jax.sweep_workflow import run_sweep as run_sweep
     from heli_jax.sweeps.run import sweep as sweep
     from heli_jax.vehicle import Helicopter as Helicopter
     from heli_jax.vehicle import load_vehicle as load_vehicle
@@ -44,7 +46,6 @@ if TYPE_CHECKING:
     from heli_jax.workflow import load_config as load_config
     from heli_jax.workflow import run_check as run_check
     from heli_jax.workflow import run_fit as run_fit
-    from heli_jax.workflow import run_sweep as run_sweep
     from heli_jax.workflow import write_report as write_report
 
 # Which module each name is of, loaded when the name is first used: `import heli_jax` and
@@ -85,7 +86,8 @@ _HOMES = {
     "load_config": "workflow",
     "run_check": "workflow",
     "run_fit": "workflow",
-    "run_sweep": "workflow",
+    "run_study": "studies.run",
+    "run_sweep": "sweep_workflow",
     "write_report": "workflow",
 }
 

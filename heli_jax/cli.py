@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
 
     fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
     _add_config(fit)
-    fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
+    cli_options.add_fit_options(fit)
     fit.add_argument("--json", action="store_true", help="print fit.json, for other programs")
     agree = command("compatibility", _compatibility, "do a log's sensors agree? their errors")
     _add_config(agree)
@@ -176,8 +176,17 @@ def _new_directory(options: argparse.Namespace) -> Path:
 
 def _fit(options: argparse.Namespace) -> int:
     began = time.perf_counter()  # before JAX is imported, which the user waits for too
-    out = _new_directory(options)
+    if not options.resume:
+        _new_directory(options)
     _prepare_jax()
+    from heli_jax import study_command
+
+    study = study_command.asked(options)
+    if study is not None:
+        if options.json:
+            raise InputError("--json: prints the fit.json of one fit, and a study has many")
+        return study_command.fit(options, study, options.say)
+    out = _new_directory(options)
     from heli_jax import output, workflow
 
     experiment = workflow.load_config(options.config, options.set)
@@ -302,7 +311,7 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import simulation_output, workflow
+    from heli_jax import simulation_output, sweep_workflow, workflow
 
     experiment = workflow.load_config(config, options.set)
 
@@ -314,10 +323,10 @@ def _sweep(options: argparse.Namespace) -> int:
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
     with (
-        simulation_output.sweep_progress(options.quiet) as progress,
-        _client(options, config) as client,
+        simulation_output.sweep_progress(quiet=options.quiet) as progress,
+        cli_options.dask_client(options, config) as client,
     ):
-        workflow.run_sweep(
+        sweep_workflow.run_sweep(
             experiment,
             out,
             figures=not options.no_figures,
@@ -331,23 +340,6 @@ def _sweep(options: argparse.Namespace) -> int:
         )
     simulation_output.print_sweep(out)
     return DONE
-
-
-# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
-def _client(options: argparse.Namespace, config: Path) -> contextlib.AbstractContextManager[Any]:
-    """A dask client where one is asked for."""
-    if options.scheduler is None and options.workers is None:
-        return contextlib.nullcontext()
-    try:
-        from heli_jax.sweeps.cluster import connected
-    except ImportError as e:
-        option = "--workers" if options.scheduler is None else "--scheduler"
-        raise InputError(
-            f"{option}: dask.distributed is not installed, expected the extra distributed: "
-            "pip install 'heli_jax[distributed]'"
-        ) from e
-    # Workers import models and reducers of one's own from the configuration's folder.
-    return connected(options.scheduler, options.workers, config.absolute().parent)
 
 
 def _info(options: argparse.Namespace) -> int:

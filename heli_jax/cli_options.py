@@ -1,13 +1,45 @@
 """Options of the commands that have many, and what reads their values."""
 
 import argparse
+import contextlib
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from heli_jax.errors import InputError
 
 if TYPE_CHECKING:
     from heli_jax.flights.convert import Selection
+
+
+def add_fit_options(command: argparse.ArgumentParser) -> None:
+    """Of `heli-jax fit`."""
+    command.add_argument("--out", metavar="DIR", help="directory (default: runs/NAME-DATE-TIME)")
+    study = command.add_argument_group(
+        "a study of fits",
+        "where a key takes several values: --over, --set repeated with one KEY, or study in CONFIG "
+        "(docs/studies.md)",
+    )
+    study.add_argument(
+        "--over",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE,VALUE",
+        help="fit with each value, with several keys each combination",
+    )
+    study.add_argument(
+        "--resume", action="store_true", help="go on where the study in --out was ended"
+    )
+    study.add_argument(
+        "--reports", action="store_true", help="write each fit's page too: it takes seconds"
+    )
+    where = study.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=count, metavar="N", help="processes (default: as many as cores)"
+    )
+    where.add_argument(
+        "--scheduler", metavar="tcp://HOST:8786", help="fit on the workers of this dask scheduler"
+    )
 
 
 def add_simulate_options(command: argparse.ArgumentParser) -> None:
@@ -189,3 +221,30 @@ def seconds(text: str) -> float:
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"expected a number of seconds above 0, got {text!r}")
     return value
+
+
+# Any: dask.distributed is an extra, and only `sweeps.cluster` names its classes.
+def dask_client(
+    options: argparse.Namespace, config: Path
+) -> contextlib.AbstractContextManager[Any]:
+    """A dask client where one is asked for.
+
+    Args:
+        options: of a command with --workers and --scheduler.
+        config: the configuration.
+
+    Raises:
+        InputError: dask is not installed, or nothing answers.
+    """
+    if options.scheduler is None and options.workers is None:
+        return contextlib.nullcontext()
+    try:
+        from heli_jax.sweeps.cluster import connected
+    except ImportError as e:
+        option = "--workers" if options.scheduler is None else "--scheduler"
+        raise InputError(
+            f"{option}: dask.distributed is not installed, expected the extra distributed: "
+            "pip install 'heli_jax[distributed]'"
+        ) from e
+    # Workers import models and reducers of one's own from the configuration's folder.
+    return connected(options.scheduler, options.workers, config.absolute().parent)

@@ -54,11 +54,15 @@ def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simu
 
 
 @contextlib.contextmanager
-def sweep_progress(quiet: bool = False) -> Iterator["Callable[[Progress], None]"]:
+def sweep_progress(
+    what: str = "sweep", of: str = "elements", *, quiet: bool = False
+) -> Iterator["Callable[[Progress], None]"]:
     """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
     line.
 
     Args:
+        what: what goes on.
+        of: what it has many of.
         quiet: show nothing.
     """
     if quiet:
@@ -69,29 +73,32 @@ def sweep_progress(quiet: bool = False) -> Iterator["Callable[[Progress], None]"
 
     # A bar in a log file is a line of carriage returns.
     if not sys.stderr.isatty():
-        yield _Lines()
+        yield _Lines(what, of)
         return
-    columns = (TextColumn("sweep"), BarColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("compiling", total=1.0)
-        yield lambda p: bar.update(task, completed=p.done / p.total, description=_progress_words(p))
+        yield lambda p: bar.update(
+            task, completed=p.done / p.total, description=_progress_words(p, of)
+        )
 
 
 class _Lines:
     """A line at the first chunk, the last, and every ten seconds between."""
 
-    def __init__(self) -> None:
-        self.last = -math.inf
+    def __init__(self, what: str, of: str) -> None:
+        self.what, self.of, self.last = what, of, -math.inf
 
     def __call__(self, p: "Progress") -> None:
         now = time.monotonic()  # unlike time.time() it does not jump when a clock is set
         if p.done == p.total or now - self.last > 10.0:
             self.last = now
-            print(f"heli-jax: sweep: {_progress_words(p)}", file=sys.stderr, flush=True)
+            words = f"heli-jax: {self.what}: {_progress_words(p, self.of)}"
+            print(words, file=sys.stderr, flush=True)
 
 
-def _progress_words(p: "Progress") -> str:
-    words = f"{p.done} of {p.total} elements"
+def _progress_words(p: "Progress", of: str) -> str:
+    words = f"{p.done} of {p.total} {of}"
     # The first chunk compiles: a rate that contained it would foretell hours.
     if math.isnan(p.rate):
         return words
@@ -127,10 +134,11 @@ def print_sweep(out: Path) -> None:
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
     width = len(head) if "float32_error" in totals else len(head) - 1
     print_table(head[:width], [row[:width] for row in rows])
-    for name, worst_ones in totals["worst"].items():
-        element = worst_ones[0]
-        at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
-        print(f"worst {name}: element {element['element']}, {at}")
+    for words in ("worst", "best"):
+        for name, elements in totals[words].items():
+            element = elements[0]
+            at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
+            print(f"{words} {name}: element {element['element']}, {at}")
     for note in totals["notes"]:
         print(f"! {note}")
     for name, result in totals["results"].items():

@@ -1,7 +1,7 @@
 """A whole analysis as functions, for a script, a notebook and the command line alike.
 
 `load_config` reads a configuration; `run_fit` does what `heli-jax fit` does, `run_check` what
-`heli-jax check` does and `run_sweep` what `heli-jax sweep` does. `load_fit` reads what an earlier
+`heli-jax check` does. `load_fit` reads what an earlier
 fit wrote.
 """
 
@@ -33,9 +33,7 @@ from heli_jax.stages import recorded, stage
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
-    import xarray as xr
-
-    from heli_jax.sweeps.spec import Job
+    pass
 
 # Words for people as the work goes on. A function and not a logger, which a notebook would have to
 # set up and the command line to capture.
@@ -145,6 +143,12 @@ def _fit_run(
     # A reader shows how far it is by itself.
     with stage("reading the log", name="reading", shown=False):
         config = config if isinstance(config, Experiment) else load_config(config)
+        # One fit of it alone would look like the study's result.
+        if config.config.study is not None:
+            raise InputError(
+                f"{config.path}: study: asks for many fits, expected heli_jax.run_study, or "
+                "study: null"
+            )
         problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for note in reading_notes(problem):
@@ -368,90 +372,3 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     asked = asked_handling(run.config, logged)
     responses = fitted_responses(run.fit, run.problem, settings, asked)
     return run.supplementary._replace(responses=responses)
-
-
-def run_sweep(
-    config: Experiment | str | Path,
-    out: str | Path | None = None,
-    *,
-    figures: bool = True,
-    **options: Any,
-) -> "xr.Dataset":
-    """Run the design of a configuration's `sweep`.
-
-    Args:
-        config: of `load_config`, or the path of a configuration.
-        out: a directory for sweep.zarr, summary.json, config.yaml and figures/; in memory, and
-            without figures, unless given.
-        figures: whether to draw: it takes seconds.
-        **options: of `heli_jax.sweeps.run.Options`, as of `heli_jax.sweep`: resume, chunk, lanes,
-            devices, client, memory, progress, say.
-
-    Returns:
-        A Dataset over `element`, with axes and `status` as coordinates.
-
-    Raises:
-        InputError: something of the configuration is wrong, or `out` exists (without `resume`),
-            is of another sweep, or cannot be written to.
-    """
-    # Here, since xarray and zarr take a second, which a fit should not wait for.
-    from heli_jax.sweeps.run import Options
-    from heli_jax.sweeps.run import run_sweep as run_job
-
-    config = config if isinstance(config, Experiment) else load_config(config)
-    job = _sweep_job(config)
-    design = config.config.sweep
-    assert design is not None  # `_sweep_job` refuses a configuration without
-    resolved = as_yaml(configuration.resolved(config))
-    notes = []
-    # Not refused: a fit's configuration has its disturbance, and a sweep over Ixx may do without.
-    if config.config.disturbance is not None and "seed" not in job.design.names:
-        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
-    out = None if out is None else Path(out)
-    # What is given here goes before what the configuration says.
-    carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
-    try:
-        dataset = run_job(
-            job,
-            out,
-            carrying,
-            # In the directory to be run again, in the store to travel with the numbers.
-            files={"config.yaml": resolved},
-            attributes={"configuration": resolved, "seed": design.seed or 0},
-            notes=notes,
-        )
-    except InputError:
-        raise
-    except ValueError as e:
-        raise InputError(f"{config.path}: sweep: {e}") from e
-    if figures and out is not None:
-        carrying.say("drawing figures")
-        _draw_sweep(out, dataset, job, carrying.say)
-    return dataset
-
-
-def _sweep_job(config: Experiment) -> "Job":
-    # `drive` gives the experiment anew, since wind adds inputs to its model.
-    from heli_jax import generate
-    from heli_jax.config.sweeps import simulates, sweep_job
-
-    return sweep_job(*generate.drive(config)) if simulates(config) else sweep_job(config)
-
-
-def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
-    """The figures of a sweep; what they leave out is said.
-
-    Raises:
-        InputError: the figures cannot be written.
-    """
-    from heli_jax.report.sweeps import RESULTS, results, write_figures
-    from heli_jax.sweeps.summary import worst
-
-    try:
-        write_figures(out / "figures", dataset, worst(dataset, job))
-    except OSError as e:  # the results are safe in the store by now
-        raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
-    # A figure for each result and axis: of dozens nobody would look at any.
-    count = len(results(dataset))
-    if count > RESULTS:
-        say(f"slices and maps are of the first {RESULTS} of {count} results")

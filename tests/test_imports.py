@@ -54,7 +54,8 @@ ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
     "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
-    "file_commands", "run_commands", "stage_display", "terminal",
+    "file_commands", "run_commands", "stage_display", "terminal", "studies", "study_command",
+    "sweep_workflow",
     "__init__",
     "__main__",
 }  # fmt: skip
@@ -192,6 +193,8 @@ def test_nothing_imports_the_command_line(name):
             "xarray",
             {
                 "sweeps",
+                "studies",
+                "study_command.py",
                 "report/sweeps",
                 "report/responses.py",
                 "flights/array_table.py",

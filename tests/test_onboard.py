@@ -9,7 +9,8 @@ from heli_jax import models
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
-from heli_jax.workflow import run_check, run_sweep
+from heli_jax.sweep_workflow import run_sweep
+from heli_jax.workflow import run_check
 
 ONBOARD = {
     "servos": {"on": ["lat"], "delay": True},

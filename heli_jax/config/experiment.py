@@ -47,16 +47,49 @@ def load(path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) ->
     Raises:
         InputError: anything in the file or an override is wrong.
     """
-    path = Path(path)
+    return from_content(read_overridden(path, overrides), Path(path))
+
+
+def read_overridden(
+    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()
+) -> dict[str, Any]:
+    """What a configuration's file says, with overrides in place, as of `load`; not yet validated.
+
+    Raises:
+        InputError: no such file, no YAML, or an override that cannot be put in.
+    """
     content = read_mapping(path)
     # Before the validation, so that an override is checked as what the file says is, and may set a
     # key that the file leaves out.
     if isinstance(overrides, Mapping):
         for key, value in overrides.items():
-            _set(content, str(key), value, f"override {key!r:.80}")
-    else:
-        for text in overrides:
-            _override(content, text)
+            set_value(content, str(key), value, f"override {key!r:.80}")
+        return content
+    keys: set[str] = set()
+    for text in overrides:
+        key, value, where = parse_override(text)
+        # The last of several would win without a word.
+        if key in keys:
+            raise InputError(
+                f"{where}: {key} is set twice, expected one value (several make a study of fits: "
+                "heli-jax fit)"
+            )
+        keys.add(key)
+        set_value(content, key, value, where)
+    return content
+
+
+def from_content(content: dict[str, Any], path: Path) -> Experiment:
+    """The experiment that the content of a configuration describes.
+
+    Args:
+        content: as YAML holds it; is not kept.
+        path: the file that it is of, which need not exist: messages name it, and relative paths
+            begin at its folder.
+
+    Raises:
+        InputError: anything in it is wrong.
+    """
     config = _validated(completed(content, str(path)), str(path))
     # The model before the vehicle, since its Params say which constants a vehicle may have.
     logs = OpenedLogs()
@@ -123,19 +156,28 @@ def in_wind(experiment: Experiment) -> Experiment:
     return experiment._replace(model=_started(config, path, model, experiment.logs))
 
 
-def _override(content: dict[str, Any], text: str) -> None:
+def parse_override(text: str) -> tuple[str, Any, str]:
+    """Key and value of a `key.path=value` text, and what a message on it begins with.
+
+    Raises:
+        InputError: it is no such text.
+    """
     key, equals, value = text.partition("=")
     where = f"--set {text!r:.80}"
     if not equals or not key.strip():
         raise InputError(f"{where}: expected key.path=value")
     # The value is read as YAML reads it, so that --set fit.seed=1 is a number and =null switches a
     # section off.
-    _set(content, key.strip(), parse_value(value, where), where)
+    return key.strip(), parse_value(value, where), where
 
 
 # What YAML holds is Any below: a mapping, a list or a value, at any depth.
-def _set(content: dict[str, Any], key: str, value: Any, where: str) -> None:
-    """Put a value at `key.path`, in sections that are made where they are missing."""
+def set_value(content: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Put a value at `key.path`, in sections that are made where they are missing.
+
+    Raises:
+        InputError: there is something else than a section or a list on the way.
+    """
     *above, last = key.split(".")
     at: Any = content
     for name in above:

@@ -130,8 +130,19 @@ def _window_choice(value: Any) -> Any:
     raise ValueError(f"expected two finite numbers of seconds or auto, got {value!r:.60}")
 
 
+def _one_log(value: Any) -> Any:
+    # A study takes the list away before: what still has one is read by another command.
+    if isinstance(value, list):
+        raise ValueError(
+            "expected one log, got a list, which makes a study of fits (heli-jax fit, "
+            "heli_jax.run_study)"
+        )
+    return value
+
+
 class FlightConfig(_Strict):
-    log: str
+    log: Annotated[str, BeforeValidator(_one_log, json_schema_input_type=str | list[str])]
+    """a file; a list is a study with a fit for each (docs/studies.md)"""
     signals: SignalsConfig
     flight: Annotated[int, Field(ge=1)] | None = None
     """which flight of a log that holds several, from 1"""
@@ -370,3 +381,5 @@ class Config(_Strict):
     """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
     simulate: SimulateConfig | None = None
     sweep: SweepConfig | None = None
+    study: dict[str, list[Any]] | None = None
+    """by key the values that it takes in a study of fits: every combination (docs/studies.md)"""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from heli_jax.sweeps.design import sobol as sobol
     from heli_jax.sweeps.design import table as table
     from heli_jax.sweeps.design import zipped as zipped
+    from heli_jax.sweeps.gridded import as_grid as as_grid
     from heli_jax.sweeps.reducers import Reduce as Reduce
     from heli_jax.sweeps.reducers import Streaming as Streaming
     from heli_jax.sweeps.run import sweep as sweep
@@ -33,6 +34,7 @@ _HOMES = {
     **dict.fromkeys(("Trajectories", "Trimmed"), "spec"),
     **dict.fromkeys(("Reduce", "Streaming"), "reducers"),
     "Range": "axes",
+    "as_grid": "gridded",
     "sweep": "run",
 }
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -251,6 +251,46 @@ def computed(
         if following is not None:
             running.add(submitted(following))
         yield chunk, results
+
+
+def mapped[T, R](
+    client: Client, function: Callable[[T], R], items: Sequence[T]
+) -> Iterator[tuple[int, R | None]]:
+    """A function of each item as they are done, in any order.
+
+    Args:
+        client: of the scheduler whose workers compute.
+        function: of a module that workers can import.
+        items: its arguments.
+
+    Yields:
+        The place of an item, and what the function gave; None where workers died over it.
+
+    Raises:
+        InputError: the scheduler or its workers are gone.
+    """
+    token = uuid.uuid4().hex  # as in `computed`
+    waiting = iter(range(len(items)))
+    places: dict[str, int] = {}
+
+    def submitted(k: int) -> Any:
+        places[f"item-{k}-{token}"] = k
+        return client.submit(function, items[k], key=f"item-{k}-{token}", pure=False)
+
+    at_once = _AHEAD * _threads(client)
+    running = as_completed([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
+    for future in running:
+        with _answering():
+            try:
+                result = future.result()
+            # dask counts how many workers died over one task: the others go on.
+            except KilledWorker:
+                result = None
+        future.release()
+        following = next(waiting, None)
+        if following is not None:
+            running.add(submitted(following))
+        yield places.pop(future.key), result
 
 
 def _received(job: Job) -> Job:

@@ -1,7 +1,9 @@
 """What a sweep came to, in a page of JSON."""
 
 import contextlib
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,8 @@ def write_summary(
 
 
 def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, Any]:
-    """Counts by status, quantiles of every result over the elements that are ok, the worst.
+    """Counts by status, quantiles of every result over the elements that are ok, the worst and the
+    best.
 
     Args:
         dataset: the finished sweep; read in pieces.
@@ -67,6 +70,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         "axes": {n: ends for n in job.design.names if (ends := _ends(dataset[n]))},
         "results": results,
         "worst": {name: _rows(dataset, job, name, k) for name, k in worst(dataset, job).items()},
+        "best": {name: _rows(dataset, job, name, k) for name, k in best(dataset, job).items()},
         "split": dataset.attrs["split"],
         "timing": timing,
         "versions": dataset.attrs["versions"],
@@ -129,6 +133,23 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str,
         job: what was computed.
         count: elements of each result at most.
     """
+    return _extreme(dataset, job, count, 1.0)
+
+
+def best(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, np.ndarray]:
+    """By result, the elements that are ok and best in it, best first: the reverse of `worst`; of
+    several flights the worst one counts.
+
+    Args:
+        dataset: the finished sweep; read in pieces.
+        job: what was computed.
+        count: elements of each result at most.
+    """
+    return _extreme(dataset, job, count, -1.0)
+
+
+def _extreme(dataset: xr.Dataset, job: Job, count: int, sign: float) -> dict[str, np.ndarray]:
+    """The worst elements of each result, or with a sign of -1 the best."""
     fine = dataset["status"].to_numpy() == OK
     by_result = {}
     for name, reduce in job.reduce.items():
@@ -136,19 +157,31 @@ def worst(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str,
         # which of theirs should be small is not known.
         if name not in dataset.data_vars:
             continue
-        elements = _worst(dataset[name], fine, reduce.how in _SMALL_IS_BAD, count)
+        badness = functools.partial(_badness, small_is_bad=reduce.how in _SMALL_IS_BAD, sign=sign)
+        elements = _worst(dataset[name], fine, badness, count)
         if elements.size:
             by_result[name] = elements
     return by_result
 
 
-def _worst(variable: xr.DataArray, fine: np.ndarray, small_is_bad: bool, count: int) -> np.ndarray:
+def _badness(part: np.ndarray, *, small_is_bad: bool, sign: float) -> np.ndarray:
+    """What is to be large (elements,) of a result (elements, ...)."""
+    values = part.astype(np.float64)  # a bool or an integer has no minus
+    bad = -values if small_is_bad else np.abs(values)
+    # The worst flight first, whichever end is looked for.
+    return sign * bad.reshape(len(values), -1).max(axis=1)
+
+
+def _worst(
+    variable: xr.DataArray,
+    fine: np.ndarray,
+    badness_of: Callable[[np.ndarray], np.ndarray],
+    count: int,
+) -> np.ndarray:
     """The elements that are fine and worst in a variable, worst first, (count,) or fewer."""
     badness, element = np.empty(0), np.empty(0, np.int64)
     for which, part in chunks_of(variable):
-        values = part.astype(np.float64)  # a bool or an integer has no minus
-        bad = -values if small_is_bad else np.abs(values)
-        bad = bad.reshape(len(values), -1).max(axis=1)
+        bad = badness_of(part)
         usable = np.flatnonzero(fine[which] & np.isfinite(bad))
         most = min(count, usable.size)
         # Of each part the worst few, and of those the worst: all are never sorted, nor held.

@@ -13,7 +13,8 @@ from heli_jax import fit, generate
 from heli_jax.cli import main
 from heli_jax.errors import InputError
 from heli_jax.linear_models.read import linear_model
-from heli_jax.workflow import run_check, run_sweep
+from heli_jax.sweep_workflow import run_sweep
+from heli_jax.workflow import run_check
 
 FILES = Path(__file__).parents[2] / "heli_jax" / "linear_models" / "files"
 HEAVE = {

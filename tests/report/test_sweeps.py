@@ -520,3 +520,14 @@ def label_boxes(figure):
                 texts += [t] if inside and t.get_rotation() == 0 else []
         shown = [t for t in texts if t.get_visible() and t.get_text().strip()]
         yield from ((t.get_text(), t.get_window_extent()) for t in shown)
+
+
+def test_a_fine_grid_is_mapped_at_its_own_resolution():
+    x, y = np.meshgrid(np.linspace(1.0, 2.0, 60), np.linspace(3.0, 5.0, 50), indexing="ij")
+    axes = {"Ixx": ("element", x.ravel()), "a": ("element", y.ravel())}
+    status = ("element", np.zeros(x.size, np.uint8))
+    z = np.sin(9.0 * x) * y
+    ds = xr.Dataset({"misfit": ("element", z.ravel())}, {**axes, "status": status})
+    ds.attrs["axes"] = ["Ixx", "a"]
+    [mesh] = [c for c in sweeps.maps(ds, "misfit").axes[0].collections if c.get_array() is not None]
+    np.testing.assert_array_equal(np.asarray(mesh.get_array()).reshape(50, 60), z.T)

@@ -62,6 +62,10 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert {p.name for p in out.iterdir()} >= {"config.yaml", "sweep.zarr", "summary.json"}
     assert (out / "figures" / "slices-rms.png").stat().st_size > 1000
     assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == len(list((out / "figures").glob("*.png")))
+    assert "6 elements of roll-on-stand: 6 ok." in page
+    assert "http" not in page
     found = opened(out)
     np.testing.assert_allclose(found["Ixx"], np.linspace(0.02, 0.05, 6))
     assert yaml.safe_load(found.attrs["configuration"])["sweep"]["design"] == "grid"

@@ -79,6 +79,8 @@ def test_the_summary_counts_and_names_the_worst(whole):
     assert found["results"]["rms"]["median"] == pytest.approx(float(np.median(data["rms"])))
     assert found["worst"]["rms"][0]["element"] == int(np.argmax(data["rms"].values))
     assert found["worst"]["fit"][0]["element"] == int(np.argmin(data["fit"].values))
+    assert found["best"]["rms"][0]["element"] == int(np.argmin(data["rms"].values))
+    assert found["best"]["fit"][0]["element"] == int(np.argmax(data["fit"].values))
     assert found["timing"]["computed_chunks"] == found["timing"]["chunks"] == 10
 
 

@@ -21,8 +21,9 @@ DRAWN = 1 << 18
 MARKS = 300
 # The status of an element that counts; that of heli_jax.sweeps, whose import takes JAX.
 _OK = 0
-# Distinct values that are cells of their own: even ones would leave gaps between so many.
-_FEW_CELLS = 40
+# Distinct values that are cells of their own, so that a grid is seen at its own resolution. A map
+# of two axes counts its cells in 16 bits: 181 by 181 at most.
+_FEW_CELLS = 180
 
 
 class Column:

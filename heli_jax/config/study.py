@@ -1,0 +1,191 @@
+"""The study of fits that a configuration describes: which keys take which values."""
+
+import copy
+import glob
+import itertools
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from heli_jax.config.experiment import (
+    from_content,
+    parse_override,
+    read_overridden,
+    resolved,
+    set_value,
+)
+from heli_jax.errors import InputError
+from heli_jax.yaml_file import parse_value
+
+_MOST = 100_000
+"""fits: each has a directory of its own"""
+
+# What YAML holds is Any below: a number, a text, a list or a section.
+Axes = dict[str, tuple[Any, ...]]
+
+
+class Study(NamedTuple):
+    """A configuration of which some keys take several values."""
+
+    path: Path
+    """of the configuration; relative paths begin at its folder"""
+    content: dict[str, Any]
+    """as YAML holds it, without the study"""
+    axes: Axes
+    """by key its values, in the order of the Dataset's dimensions"""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many values each axis has."""
+        return tuple(len(values) for values in self.axes.values())
+
+    @property
+    def size(self) -> int:
+        """How many fits there are."""
+        return math.prod(self.shape)
+
+    def points(self) -> list[dict[str, Any]]:
+        """By fit the value of each key, the last axis fastest."""
+        rows = itertools.product(*self.axes.values())
+        return [dict(zip(self.axes, row, strict=True)) for row in rows]
+
+    def content_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
+        """The configuration of one fit.
+
+        Args:
+            point: of `points`.
+        """
+        content = copy.deepcopy(self.content)
+        for key, value in point.items():
+            # A value may be a section, which the next key is set in.
+            set_value(content, key, copy.deepcopy(value), f"{self.path}: study.{key}")
+        return content
+
+    def described(self) -> dict[str, Any]:
+        """All that fixes the fits, as plain data; logs by their paths.
+
+        Raises:
+            InputError: the first fit's configuration is wrong.
+        """
+        axes = {key: list(values) for key, values in self.axes.items()}
+        first = from_content(self.content_at(self.points()[0]), self.path)
+        return {"axes": axes, "configuration": resolved(first)}
+
+
+def read_study(
+    path: str | Path,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    over: Sequence[str] | Mapping[str, Sequence[Any]] = (),
+) -> Study | None:
+    """The study that a configuration or its overrides ask for; None where they ask for one fit.
+
+    Args:
+        path: the configuration.
+        overrides: as of `load`; a key that is set several times by texts takes each value.
+        over: values by key, or as on the command line, `fit.free.a.start=4,5,6`: what stands behind
+            = is a list of YAML without its brackets.
+
+    Raises:
+        InputError: something of the file or of an option is wrong.
+    """
+    path = Path(path)
+    single, repeated = _told_apart(overrides)
+    content = read_overridden(path, single)
+    # A value in place of an axis of the file is that of all fits, as for any other key.
+    named = single if isinstance(single, Mapping) else [parse_override(t)[0] for t in single]
+    stated = {k: v for k, v in _section(content, path).items() if k not in named}
+    axes = {**_listed_logs(content, path), **stated, **repeated, **_over(over)}
+    if not axes:
+        return None
+    axes = {key: _logs(key, values, path) for key, values in axes.items()}
+    for key, values in axes.items():
+        if len({repr(v) for v in values}) < len(values):
+            raise InputError(f"{path}: study.{key}: a value stands twice, expected each once")
+    study = Study(path, content, axes)
+    if study.size > _MOST:
+        raise InputError(f"{path}: study: expected at most {_MOST} fits, got {study.size}")
+    return study
+
+
+def _told_apart(
+    overrides: Sequence[str] | Mapping[str, Any],
+) -> tuple[Sequence[str] | Mapping[str, Any], Axes]:
+    """The overrides of one value, and by key the values of those that are given several times."""
+    if isinstance(overrides, Mapping):
+        return overrides, {}
+    parsed = [parse_override(text) for text in overrides]
+    counts = Counter(key for key, *_ in parsed)
+    single = [text for text, p in zip(overrides, parsed, strict=True) if counts[p[0]] == 1]
+    several = dict.fromkeys(key for key, *_ in parsed if counts[key] > 1)
+    return single, {k: tuple(value for key, value, _ in parsed if key == k) for k in several}
+
+
+def _over(over: Sequence[str] | Mapping[str, Sequence[Any]]) -> Axes:
+    if isinstance(over, Mapping):
+        return {key: _values(values, f"over {key!r:.80}") for key, values in over.items()}
+    axes: Axes = {}
+    for text in over:
+        key, equals, values = text.partition("=")
+        key, where = key.strip(), f"--over {text!r:.80}"
+        if not equals or not key:
+            raise InputError(f"{where}: expected key.path=value,value,...")
+        if key in axes:
+            raise InputError(f"{where}: {key} is given twice, expected all its values in one")
+        listed = parse_value(f"[{values}]", where)
+        # One in brackets is one value that is a list: of windows, say.
+        if not isinstance(listed, list) or len(listed) < 2:
+            raise InputError(
+                f"{where}: expected two values at least, with commas between them and no brackets "
+                "around"
+            )
+        axes[key] = tuple(listed)
+    return axes
+
+
+def _listed_logs(content: dict[str, Any], path: Path) -> Axes:
+    """The flights that have a list of logs."""
+    axes: Axes = {}
+    flights = content.get("flights")
+    for i, flight in enumerate(flights if isinstance(flights, list) else ()):
+        if isinstance(flight, dict) and isinstance(flight.get("log"), list):
+            axes[f"flights.{i}.log"] = _values(flight["log"], f"{path}: flights[{i}].log")
+    return axes
+
+
+def _section(content: dict[str, Any], path: Path) -> Axes:
+    """The section `study`, which is taken out of the configuration."""
+    stated = content.pop("study", None)
+    if stated is None:
+        return {}
+    if not isinstance(stated, dict):
+        raise InputError(f"{path}: study: expected keys with lists of values, got {stated!r:.60}")
+    return {str(key): _values(values, f"{path}: study.{key}") for key, values in stated.items()}
+
+
+def _values(values: Any, where: str) -> tuple[Any, ...]:
+    # Of a script, which counts with NumPy.
+    values = values.tolist() if hasattr(values, "tolist") else values
+    if isinstance(values, str | Mapping) or not isinstance(values, Sequence) or not values:
+        raise InputError(f"{where}: expected a list of values, got {values!r:.60}")
+    return tuple(values)
+
+
+def _logs(key: str, values: tuple[Any, ...], path: Path) -> tuple[Any, ...]:
+    """The values, patterns of logs' names in them replaced by the files of such names."""
+    if not key.endswith(".log"):
+        return values
+    folder = path.absolute().parent
+    named: list[Any] = []
+    for value in values:
+        # A file may be called so all the same.
+        if not isinstance(value, str) or not glob.has_magic(value) or (folder / value).exists():
+            named.append(value)
+            continue
+        files = sorted(glob.glob(value, root_dir=folder))
+        if not files:
+            raise InputError(f"{path}: {key}: no file {os.fspath(folder / value)}")
+        named += files
+    return tuple(named)

@@ -1,0 +1,158 @@
+"""The directory of a study: each fit's own, which appears whole or not at all."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from heli_jax import run_directory
+from heli_jax.config.study import Study
+from heli_jax.errors import InputError
+from heli_jax.regular_file import read_regular
+from heli_jax.studies.point import Outcome
+from heli_jax.sweeps.description import differences
+from heli_jax.yaml_file import as_yaml
+
+FITS = "fits"
+_DESCRIPTION = "study.json"
+_LONGEST_NAME = 80
+_LIMIT_BYTES = 1_000_000_000
+
+
+def create(out: Path, study: Study, described: dict[str, Any], versions: dict[str, str]) -> None:
+    """A new directory without any fit; it appears whole or not at all.
+
+    Args:
+        out: where.
+        study: what is to be fitted.
+        described: of the study.
+        versions: of what computes.
+
+    Raises:
+        InputError: it cannot be written to.
+    """
+    try:
+        with run_directory.whole(out) as folder:
+            text = as_yaml({**study.content, "study": described["axes"]})
+            place = f"# Relative paths in it begin at {study.path.absolute().parent}.\n"
+            (folder / "study.yaml").write_text(place + text, encoding="utf-8")
+            content = {**described, "versions": versions}
+            (folder / _DESCRIPTION).write_text(json.dumps(content, indent=1), encoding="utf-8")
+            (folder / FITS).mkdir()
+    except OSError as e:
+        raise InputError(f"--out {out}: cannot be written ({e.strerror or e})") from e
+
+
+def require_same(out: Path, described: dict[str, Any]) -> dict[str, str]:
+    """Refuse the directory of another study; returns the versions that it was begun with.
+
+    Args:
+        out: the directory.
+        described: of the study that goes on.
+
+    Raises:
+        InputError: it is of another, or of none.
+    """
+    where = f"--out {out}"
+    data = read_regular(out / _DESCRIPTION, "the study.json of a study", _LIMIT_BYTES)
+    try:
+        old = json.loads(data)
+        versions = old.pop("versions")
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise InputError(f"{where}: {_DESCRIPTION} is not what a study writes ({e})") from e
+    # Through JSON and back, as the stored one went: a tuple is a list there.
+    changes = differences(old, json.loads(json.dumps(described)))
+    if changes:
+        more = f" (and {len(changes) - 1} more)" if len(changes) > 1 else ""
+        raise InputError(
+            f"{where}: is of another study: {changes[0]}{more}; expected the same, or another --out"
+        )
+    return versions
+
+
+def names(study: Study) -> list[str]:
+    """The directories of the fits: a number and what tells it apart from the others."""
+    short = _short_keys(list(study.axes))
+    width = len(str(study.size - 1))
+    named = []
+    for i, point in enumerate(study.points()):
+        words = "_".join(f"{short[key]}={_word(value)}" for key, value in point.items())
+        named.append(f"{i:0{width}d}_{words}"[:_LONGEST_NAME].rstrip("._-"))
+    return named
+
+
+def _short_keys(keys: list[str]) -> dict[str, str]:
+    """The shortest ends of keys that tell them apart; `Ixx` for its start."""
+    # Of `fit.free.Ixx.start` the last word says less than the one before.
+    parts = {key: key.removesuffix(".start").split(".") for key in keys}
+    for depth in range(1, max(len(p) for p in parts.values()) + 1):
+        short = {key: ".".join(p[-depth:]) for key, p in parts.items()}
+        if len(set(short.values())) == len(keys):
+            return short
+    return {key: key for key in keys}
+
+
+# Any: what YAML holds.
+def _word(value: Any) -> str:
+    text = Path(value).stem if isinstance(value, str) else json.dumps(value)
+    return re.sub(r"[^\w.+]+", "-", text).strip("-")
+
+
+def read_fit(place: Path) -> dict[str, Any] | None:
+    """What fit.json or failed.json in a fit's directory holds; None where there is neither.
+
+    Args:
+        place: the directory.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    for name in ("fit.json", "failed.json"):
+        path = place / name
+        if path.exists():
+            data = read_regular(path, f"the {name} of a fit", _LIMIT_BYTES)
+            try:
+                content = json.loads(data)
+            except ValueError as e:
+                raise InputError(f"{path}: expected JSON, got {str(e)[:80]}") from e
+            if not isinstance(content, dict):
+                raise InputError(f"{path}: expected a JSON object")
+            return content
+    return None
+
+
+def is_done(place: Path) -> bool:
+    """Whether there is a fit in its directory."""
+    return (place / "fit.json").is_file()
+
+
+def write_fit(place: Path, outcome: Outcome) -> None:
+    """Write a fit's directory, in place of that of one that failed.
+
+    Args:
+        place: the directory.
+        outcome: of the fit.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        shutil.rmtree(place, ignore_errors=True)
+        with run_directory.whole(place) as folder:
+            for name, data in outcome.files.items():
+                file = folder / name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(data)
+    except OSError as e:
+        raise InputError(
+            f"{place}: cannot be written ({e.strerror or e}); what is finished is kept"
+        ) from e
+
+
+def remove_remains(out: Path) -> None:
+    """Remove what a process that was killed was writing; only for who holds the lock."""
+    for folder in (out, out / FITS):
+        for path in folder.glob(".*-????????"):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,117 @@
+"""One fit of a study, from its configuration to its files: what a worker does, here or elsewhere.
+
+Whoever asked writes the files, so that workers need no disk in common and only one process writes.
+"""
+
+import json
+import tempfile
+import traceback
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from heli_jax.errors import InputError
+
+_MAPPED = 30_000
+"""Regions of memory above which compiled programs are let go: Linux grants a process 65530, every
+compiled kernel takes some, and past them the process dies."""
+
+
+class Task(NamedTuple):
+    """What a worker needs to know of a fit; plain data, for JSON."""
+
+    path: str
+    """of the configuration, which need not exist there: relative paths begin at its folder"""
+    content: dict[str, Any]
+    """as YAML holds it"""
+    point: dict[str, Any]
+    """by key of the study its value here"""
+    reports: bool = False
+    """whether the page and its figures are made, which takes seconds"""
+
+
+class Outcome(NamedTuple):
+    """What became of a fit."""
+
+    files: dict[str, bytes]
+    """by path within its directory"""
+    sentence: str | None = None
+    """why there is no fit; None where there is one"""
+
+
+def fit_point(task: Task) -> Outcome:
+    """Fit one point of a study. Whatever goes wrong is in the outcome: it costs no other fit.
+
+    Args:
+        task: what to fit.
+    """
+    try:
+        return Outcome(_files(task))
+    except InputError as e:
+        return failure(" ".join(str(e).split()), task)
+    except Exception as e:  # a fault of ours, whose traceback a report of it needs
+        sentence = " ".join(f"{type(e).__name__}: {e}".split())
+        return failure(sentence, task, traceback.format_exc())
+    finally:
+        _let_programs_go()
+
+
+def failure(sentence: str, task: Task, trace: str = "") -> Outcome:
+    """The outcome of a fit that there is not.
+
+    Args:
+        sentence: why.
+        task: what was to be fitted.
+        trace: the traceback where it is a fault of the program.
+    """
+    content = {"sentence": sentence, "point": task.point} | ({"traceback": trace} if trace else {})
+    text = json.dumps(content, indent=1)
+    return Outcome({"failed.json": text.encode()}, sentence)
+
+
+def _files(task: Task) -> dict[str, bytes]:
+    # Here, since the process that asks and writes needs neither.
+    from heli_jax import workflow
+    from heli_jax.config.experiment import from_content
+
+    run = workflow.run_fit(from_content(task.content, Path(task.path)))
+    with tempfile.TemporaryDirectory(prefix="heli_jax-study-") as folder:
+        place = Path(folder) / "fit"
+        if task.reports:
+            workflow.write_report(run, place)
+        else:
+            _write_plain(run, place)
+        return {
+            file.relative_to(place).as_posix(): file.read_bytes()
+            for file in sorted(place.rglob("*"))
+            if file.is_file()
+        }
+
+
+# Any: a FitRun, whose module takes a second to import.
+def _write_plain(run: Any, place: Path) -> None:
+    """What `load_fit` and `heli-jax compare` read, without the page."""
+    import time
+
+    from heli_jax.config import resolved
+    from heli_jax.report import files
+    from heli_jax.yaml_file import as_yaml
+
+    place.mkdir()
+    (place / "config.yaml").write_text(as_yaml(resolved(run.config)), encoding="utf-8")
+    files.write_signals(place / "signals.csv", run.fit.signals)
+    run.fit.timing["total"] = time.perf_counter() - run.began
+    content = files.fit_json(run.fit, run.problem, run.baseline, run.supplementary)
+    files.write_json(place / "fit.json", content)
+
+
+def _let_programs_go() -> None:
+    regions = Path("/proc/self/maps")
+    if not regions.exists():
+        return
+    if regions.read_bytes().count(b"\n") > _MAPPED:
+        import gc
+
+        import jax
+
+        jax.clear_caches()
+        gc.collect()

@@ -1,0 +1,187 @@
+"""run_study: many fits of one configuration, each written when it is done."""
+
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xarray as xr
+
+from heli_jax import run_directory
+from heli_jax.config.experiment import from_content
+from heli_jax.config.study import Study, read_study
+from heli_jax.errors import InputError
+from heli_jax.studies import directory
+from heli_jax.studies.dataset import dataset
+from heli_jax.studies.point import Outcome, Task, failure, fit_point
+from heli_jax.sweeps.cores import cores
+from heli_jax.sweeps.run import Progress
+from heli_jax.sweeps.store import only_writer, writable
+from heli_jax.versions import versions
+
+STORE = "study.zarr"
+
+
+class Options(NamedTuple):
+    """How a study is carried out; nothing of it changes a number."""
+
+    resume: bool = False
+    """go on with what is in the directory; what failed is tried again"""
+    workers: int | None = None
+    """processes of this machine: as many as there are cores unless given"""
+    # Any: a dask Client, of an extra that is not installed everywhere.
+    client: Any = None
+    """a dask.distributed Client whose workers fit, in place of processes"""
+    reports: bool = False
+    """write each fit's page and figures too, which takes seconds a fit"""
+    progress: Callable[[Progress], None] = lambda _: None
+    say: Callable[[str], None] = lambda _: None
+
+
+def run_study(
+    config: str | Path,
+    out: str | Path | None = None,
+    over: Mapping[str, Sequence[Any]] | Sequence[str] = (),
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    **options: Any,
+) -> xr.Dataset:
+    """Fit a configuration for every combination of some keys' values.
+
+    Args:
+        config: path of the configuration; what its section `study` says comes first.
+        out: a directory for study.zarr and the fits' directories; none is kept unless given.
+        over: values by key, `{"fit.free.a.start": [4, 5, 6]}`.
+        overrides: values in place of the file's, as of `load_config`.
+        **options: fields of `Options`: resume, workers, client, reports, progress, say.
+
+    Returns:
+        A Dataset whose dimensions are the axes, with parameter and output. A fit that failed has
+        the status 'failed' and its sentence; it stops no other.
+
+    Raises:
+        InputError: something of the configuration is wrong, nothing takes several values, or `out`
+            exists (without `resume`), is of another study, or cannot be written to.
+        TypeError: a keyword that is no option.
+    """
+    study = read_study(config, overrides, over)
+    if study is None:
+        raise InputError(
+            f"{config}: study: missing, expected keys with lists of values, here or in `over`"
+        )
+    carrying = Options(**options)
+    if out is not None:
+        return run(study, Path(out), carrying)
+    with tempfile.TemporaryDirectory(prefix="heli_jax-study-") as folder:
+        return run(study, Path(folder) / "study", carrying._replace(resume=False))
+
+
+def run(study: Study, out: Path, options: Options) -> xr.Dataset:
+    """Carry out a study.
+
+    Args:
+        study: what is to be fitted.
+        out: its directory.
+        options: how.
+
+    Raises:
+        InputError: as `run_study`.
+    """
+    if options.workers is not None and options.workers < 1:
+        raise InputError(f"workers: expected at least 1, got {options.workers}")
+    # An empty directory counts as none, as for a sweep: a job on a cluster is started and restarted
+    # by the same command.
+    empty = out.is_dir() and not any(out.iterdir())
+    new = not (options.resume and out.exists() and not empty)
+    if new and not (options.resume and empty):
+        run_directory.require_free(out, ", or --resume")
+    described = study.described()
+    tasks = _tasks(study, options.reports)
+    if new:
+        directory.create(out, study, described, versions())
+    if not writable(out):
+        raise InputError(f"--out {out}: expected a directory that can be written to")
+    begun_with = directory.require_same(out, described)
+    with only_writer(out, f"--out {out}"):
+        directory.remove_remains(out)
+        _say_changes(begun_with, options.say)
+        names = directory.names(study)
+        places = [out / directory.FITS / name for name in names]
+        _compute(tasks, places, options)
+        result = dataset(study, names, [directory.read_fit(p) for p in places], begun_with)
+        _write(out, result)
+    return result
+
+
+def _tasks(study: Study, reports: bool) -> list[Task]:
+    """What workers are told; a value that the configuration cannot have is refused now.
+
+    Raises:
+        InputError: it names the point.
+    """
+    tasks = []
+    path = str(study.path.absolute())
+    for point in study.points():
+        try:
+            from_content(study.content_at(point), study.path)
+        except InputError as e:
+            at = ", ".join(f"{key} = {value!r:.60}" for key, value in point.items())
+            raise InputError(f"{e} (study, at {at})") from e
+        tasks.append(Task(path, study.content_at(point), point, reports))
+    return tasks
+
+
+def _say_changes(old: Mapping[str, str], say: Callable[[str], None]) -> None:
+    changed = [f"{n} {old[n]} then, {v} now" for n, v in versions().items() if old.get(n, v) != v]
+    if changed:
+        say(f"begun with other versions ({', '.join(changed)}): numbers may differ")
+
+
+def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) -> None:
+    """Fit what is not there yet, and write each fit as it is done."""
+    todo = [k for k, place in enumerate(places) if not directory.is_done(place)]
+    if not todo:
+        return
+    done = len(tasks) - len(todo)
+    first: tuple[float, int] | None = None
+    for number, outcome in _outcomes([tasks[k] for k in todo], options):
+        place = places[todo[number]]
+        directory.write_fit(place, outcome)
+        if outcome.sentence is not None:
+            options.say(f"{place.name}: no fit: {outcome.sentence}")
+        done += 1
+        # The first waited for imports and the compiler: counted, it would make what is left look
+        # longer than it is.
+        rate = math.nan
+        if first is None:
+            first = time.perf_counter(), done
+        else:
+            rate = (done - first[1]) / max(time.perf_counter() - first[0], 1e-9)
+        options.progress(Progress(done, len(tasks), rate, (len(tasks) - done) / rate))
+
+
+def _outcomes(tasks: Sequence[Task], options: Options) -> Iterator[tuple[int, Outcome]]:
+    if options.client is not None:
+        # Here, since dask is an extra that is not installed everywhere.
+        from heli_jax.sweeps.cluster import mapped
+
+        for number, outcome in mapped(options.client, fit_point, tasks):
+            lost = failure("the dask workers that fitted it died", tasks[number])
+            yield number, lost if outcome is None else outcome
+        return
+    from heli_jax.studies.processes import computed
+
+    yield from computed(tasks, min(options.workers or cores(), len(tasks)))
+
+
+def _write(out: Path, result: xr.Dataset) -> None:
+    """The Dataset in a Zarr store, in place of an earlier one."""
+    target = out / STORE
+    try:
+        with run_directory.whole(target) as folder:
+            result.to_zarr(folder, mode="w", consolidated=False, zarr_format=3)
+            shutil.rmtree(target, ignore_errors=True)
+    except OSError as e:
+        raise InputError(f"--out {out}: {STORE} cannot be written ({e.strerror or e})") from e

@@ -1,0 +1,155 @@
+"""`heli-jax fit` over several values: a study, in the terminal."""
+
+import argparse
+import contextlib
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heli_jax import cli_options, run_directory
+from heli_jax.config.study import Study, read_study
+from heli_jax.errors import InputError
+from heli_jax.numbers import rounded
+from heli_jax.terminal_table import print_table
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+DONE, NOT_DETERMINED, NOT_CONVERGED = 0, 3, 4  # as of a single fit
+_MOST_ROWS = 40
+_WIDEST = 24
+"""characters of an axis's value"""
+
+
+def asked(options: argparse.Namespace) -> Study | None:
+    """The study that a `heli-jax fit` asks for; None where it asks for one fit.
+
+    Raises:
+        InputError: the configuration or an option is wrong, or an option is for a study alone.
+    """
+    study = read_study(options.config, options.set, options.over)
+    if study is None:
+        for option in ("resume", "workers", "scheduler", "reports"):
+            if getattr(options, option):
+                raise InputError(
+                    f"--{option}: is for a study of fits, expected --over KEY=VALUE,VALUE, or "
+                    f"study in {options.config}"
+                )
+    elif options.resume and not options.out:
+        raise InputError("--resume: expected --out DIR too, the directory of the study")
+    return study
+
+
+def fit(options: argparse.Namespace, study: Study, say: Callable[[str], None]) -> int:
+    """Carry out a study and print it; returns the exit code, that of the worst fit.
+
+    Args:
+        options: of `heli-jax fit`.
+        study: of `asked`.
+        say: for words as the work goes on.
+    """
+    from heli_jax import simulation_output
+    from heli_jax.studies import run as studies
+
+    out = Path(options.out) if options.out else run_directory.default_directory(study.path)
+
+    def interrupted() -> str:
+        kept = f"what is finished is kept: --out {out} --resume goes on"
+        return f"interrupted; {kept if out.exists() else 'nothing was written'}"
+
+    options.interrupts.words = interrupted
+    # Workers of dask have to be told; our own processes end with this one.
+    options.interrupts.unwinds = bool(options.scheduler)
+    shown = simulation_output.sweep_progress("study", "fits", quiet=options.quiet)
+    with shown as progress, contextlib.ExitStack() as s:
+        workers = options.workers
+        # Without a scheduler --workers are processes of our own, for which dask is not needed.
+        dask = None
+        if options.scheduler:
+            dask = s.enter_context(cli_options.dask_client(options, study.path))
+        carrying = studies.Options(options.resume, workers, dask, options.reports, progress, say)
+        result = studies.run(study, out, carrying)
+    print_study(result)
+    print(f"fits: {out / 'fits'}\nDataset: {out / studies.STORE}")
+    return _code(result)
+
+
+def _code(result: "xr.Dataset") -> int:
+    statuses = set(map(str, result["status"].to_numpy().ravel()))
+    if statuses - {"converged", "not-identifiable"}:
+        return NOT_CONVERGED
+    return NOT_DETERMINED if "not-identifiable" in statuses else DONE
+
+
+def print_study(result: "xr.Dataset") -> None:
+    """The fits of a study as a table, and how their estimates scatter, on standard output.
+
+    Args:
+        result: of `run_study`.
+    """
+    axes, parameters = result.attrs["axes"], [str(p) for p in result["parameter"].to_numpy()]
+    flat = result.stack(fit=axes, create_index=False)
+    status = [str(s) for s in flat["status"].to_numpy()]
+    counts = ", ".join(f"{count} {words}" for words, count in Counter(status).items())
+    fits = "1 fit" if len(status) == 1 else f"{len(status)} fits"
+    print(f"{fits}: {counts}")
+    rows = []
+    for i in range(min(len(status), _MOST_ROWS)):
+        one = flat.isel(fit=i)
+        at = [_axis(one[axis].item()) for axis in axes]
+        estimates = [_measured(one, p) for p in parameters]
+        agreement = [_percent(v) for v in one["nrmse_fit_percent"].to_numpy()]
+        rows.append((*at, status[i], *estimates, *agreement))
+    outputs = [f"fit of {o} [%]" for o in result["output"].to_numpy()]
+    print_table((*axes, "status", *parameters, *outputs), rows)
+    if len(status) > _MOST_ROWS:
+        print(f"... and {len(status) - _MOST_ROWS} more")
+    _print_scatter(flat, parameters)
+    for run, sentence in _failures(flat):
+        print(f"! {run}: {sentence}")
+
+
+def _axis(value: Any) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= _WIDEST else f"...{text[3 - _WIDEST :]}"
+
+
+# Any: a Dataset of one fit.
+def _measured(one: Any, parameter: str) -> str:
+    at = one.sel(parameter=parameter)
+    value, sd = at["estimate"].item(), at["sd"].item()
+    if math.isnan(sd):
+        return "not determined" if str(one["status"].item()) != "failed" else "–"
+    return " ± ".join(rounded(value, sd))
+
+
+def _percent(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.1f}"
+
+
+def _print_scatter(flat: "xr.Dataset", parameters: list[str]) -> None:
+    """What lies between the fits beside what each of them claims."""
+    rows = []
+    arrived = flat["status"].to_numpy() != "not-converged"
+    for i, parameter in enumerate(parameters):
+        one = flat.sel(parameter=parameter)
+        values, sds = (one[n].to_numpy() for n in ("estimate", "sd"))
+        there = np.isfinite(values) & np.isfinite(sds) & arrived
+        if np.count_nonzero(there) < 2:
+            continue
+        values, sds = values[there], sds[there]
+        numbers = (values.min(), np.median(values), values.max(), values.std(ddof=1))
+        cells = [f"{v:.5g}" for v in numbers[:3]] + [f"{numbers[3]:.2g}", f"{np.median(sds):.2g}"]
+        rows.append((parameter, str(values.size), *cells, str(flat["unit"].to_numpy()[i])))
+    if rows:
+        head = ("parameter", "fits", "lowest", "median", "highest", "sd between fits")
+        print_table((*head, "median sd of a fit", "unit"), rows)
+
+
+def _failures(flat: "xr.Dataset") -> list[tuple[str, str]]:
+    pairs = zip(flat["run"].to_numpy(), flat["sentence"].to_numpy(), strict=True)
+    return [(str(run), str(words)) for run, words in pairs if words]

@@ -1,0 +1,106 @@
+"""A whole sweep as a function, for a script, a notebook and the command line alike."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from heli_jax import config as configuration
+from heli_jax import run_directory
+from heli_jax.config import Experiment
+from heli_jax.errors import InputError
+from heli_jax.workflow import Say, load_config
+from heli_jax.yaml_file import as_yaml
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from heli_jax.sweeps.spec import Job
+
+
+def run_sweep(
+    config: Experiment | str | Path,
+    out: str | Path | None = None,
+    *,
+    figures: bool = True,
+    **options: Any,
+) -> "xr.Dataset":
+    """Run the design of a configuration's `sweep`.
+
+    Args:
+        config: of `load_config`, or the path of a configuration.
+        out: a directory for sweep.zarr, summary.json, config.yaml and figures/; in memory, and
+            without figures, unless given.
+        figures: whether to draw: it takes seconds.
+        **options: of `heli_jax.sweeps.run.Options`, as of `heli_jax.sweep`: resume, chunk, lanes,
+            devices, client, memory, progress, say.
+
+    Returns:
+        A Dataset over `element`, with axes and `status` as coordinates.
+
+    Raises:
+        InputError: something of the configuration is wrong, or `out` exists (without `resume`),
+            is of another sweep, or cannot be written to.
+    """
+    # Here, since xarray and zarr take a second, which a fit should not wait for.
+    from heli_jax.sweeps.run import Options
+    from heli_jax.sweeps.run import run_sweep as run_job
+
+    config = config if isinstance(config, Experiment) else load_config(config)
+    job = _sweep_job(config)
+    design = config.config.sweep
+    assert design is not None  # `_sweep_job` refuses a configuration without
+    resolved = as_yaml(configuration.resolved(config))
+    notes = []
+    # Not refused: a fit's configuration has its disturbance, and a sweep over Ixx may do without.
+    if config.config.disturbance is not None and "seed" not in job.design.names:
+        notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
+    out = None if out is None else Path(out)
+    # What is given here goes before what the configuration says.
+    carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
+    try:
+        dataset = run_job(
+            job,
+            out,
+            carrying,
+            # In the directory to be run again, in the store to travel with the numbers.
+            files={"config.yaml": resolved},
+            attributes={"configuration": resolved, "seed": design.seed or 0},
+            notes=notes,
+        )
+    except InputError:
+        raise
+    except ValueError as e:
+        raise InputError(f"{config.path}: sweep: {e}") from e
+    if figures and out is not None:
+        carrying.say("drawing figures")
+        _draw_sweep(out, dataset, job, carrying.say)
+    return dataset
+
+
+def _sweep_job(config: Experiment) -> "Job":
+    # `drive` gives the experiment anew, since wind adds inputs to its model.
+    from heli_jax import generate
+    from heli_jax.config.sweeps import simulates, sweep_job
+
+    return sweep_job(*generate.drive(config)) if simulates(config) else sweep_job(config)
+
+
+def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
+    """The figures of a sweep; what they leave out is said.
+
+    Raises:
+        InputError: the figures cannot be written.
+    """
+    from heli_jax.report.sweep_page import write_page
+    from heli_jax.report.sweeps import RESULTS, results, write_figures
+    from heli_jax.sweeps.summary import worst
+
+    try:
+        write_figures(out / "figures", dataset, worst(dataset, job))
+        with run_directory.whole_file(out / "report.html", f"--out {out}: report.html") as page:
+            write_page(page, out, out.name)
+    except OSError as e:  # the results are safe in the store by now
+        raise InputError(f"--out {out}: figures cannot be written ({e.strerror or e})") from e
+    # A figure for each result and axis: of dozens nobody would look at any.
+    count = len(results(dataset))
+    if count > RESULTS:
+        say(f"slices and maps are of the first {RESULTS} of {count} results")
