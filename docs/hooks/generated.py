@@ -26,6 +26,7 @@ _DEMO = "configs/bench-roll.yaml"
 _SWEEP = (
     "configs/bench-sweep.yaml",
     *("--set", "sweep.n=256", "--set", "simulate.duration=10", "--devices", "1"),
+    *("--set", "sweep.reduce={rms_roll: {signal: roll, how: rms}}"),
 )
 
 
