@@ -32,7 +32,8 @@ test: .venv/.installed
 	$(BIN)/python -m pytest -n 2
 
 docs: .venv/.installed
-	$(BIN)/mkdocs build --strict
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo site/index.html
 
 bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/identification.py

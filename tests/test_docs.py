@@ -87,6 +87,7 @@ def test_the_reference_has_what_the_code_has(site, pages):
 
     text = (site / "reference/keys.html").read_text(encoding="utf-8")
     assert [k.path for k in keys() if f"<code>{k.path}</code>" not in text] == []
+    assert [k.path for k in keys() if not k.meaning] == []
     anchors = pages["reference/api.html"].anchors
     described = {a.rsplit(".", 1)[-1] for a in anchors}
     assert set(heli_jax.__all__) - described == {"models"}  # a module, told in words

@@ -80,17 +80,18 @@ def _cell(text: str) -> str:
 def _keys() -> str:
     from heli_jax.config.keys import Key, keys
 
-    def row(key: Key) -> tuple[str, ...]:
-        default = "**needed**" if key.default is None else _cell(key.default)
-        default = "" if key.default == "null" else default
-        return f"`{key.path}`", _cell(key.kind), default, _cell(key.meaning)
+    def entry(key: Key) -> str:
+        default = "**has to be there**" if key.default is None else f"default `{key.default}`"
+        default = "optional" if key.default == "null" else default
+        # A list and not a table: paths are long, and screens may be narrow.
+        meaning = f"<br>{_cell(key.meaning)}" if key.meaning else ""
+        return f"`{key.path}`\n:   {_cell(key.kind)}; {default}{meaning}"
 
     every, parts = keys(), []
     sections = dict.fromkeys(re.split(r"[.\[]", key.path)[0] for key in every)
     for section in sections:
-        rows = (row(k) for k in every if re.split(r"[.\[]", k.path)[0] == section)
-        head = ("key", "what may stand there", "default", "meaning")
-        parts.append(f"## {section}\n\n{_table(head, rows)}")
+        entries = (entry(k) for k in every if re.split(r"[.\[]", k.path)[0] == section)
+        parts.append("\n\n".join((f"## {section}", *entries)))
     return "\n\n".join(parts)
 
 
