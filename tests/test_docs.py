@@ -93,3 +93,25 @@ def test_the_reference_has_what_the_code_has(site, pages):
     assert set(heli_jax.__all__) - described == {"models"}  # a module, told in words
     # Nothing that the build made shows where it was made.
     assert str(ROOT) not in "".join(p.read_text() for p in site.rglob("*.html"))
+
+
+def test_the_gates_that_the_page_names_are_those_of_the_card():
+    from heli_jax.report import card
+
+    rows = [
+        line.split("|")
+        for line in (ROOT / "docs/report.md").read_text(encoding="utf-8").splitlines()
+        if line.startswith("|") and line.count("|") == 5
+    ]
+    asked = {row[1].strip(): row[2].strip() for row in rows}
+    for what, limit in {
+        "Cramér-Rao": f"at most {card.CRAMER_RAO:g} %",
+        "insensitivity": f"at most {card.INSENSITIVITY:g} %",
+        "largest correlation": f"at most {card.CORRELATION:g}",
+        "VAF, NRMSE fit": f"at least {card.VAF:g}, at least {card.NRMSE_FIT:g} %",
+        "Theil coefficient": f"at most {card.THEIL:g}",
+        "Theil bias, variance part": f"at most {card.THEIL_PART:g}",
+        "error power over expected": f"at most {card.EXPECTED:g}",
+        "coherence": f"at least {card.COHERENCE:g}",
+    }.items():
+        assert limit in asked[what], what
