@@ -21,6 +21,7 @@ from mkdocs.structure.files import File, Files
 _ROOT = Path(__file__).parents[2]
 _MARK = re.compile(r"^<!-- generated: (\S+) -->$", re.MULTILINE)
 _ENDS = re.compile(r"([|<>])")
+_PAGE = re.compile(r"docs/([\w-]+)\.md")
 # Of these the demo has the figures that the gallery shows; the report has all.
 _DEMO = "configs/bench-roll.yaml"
 _SWEEP = (
@@ -84,7 +85,8 @@ def _keys() -> str:
         default = "**has to be there**" if key.default is None else f"default `{key.default}`"
         default = "optional" if key.default == "null" else default
         # A list and not a table: paths are long, and screens may be narrow.
-        meaning = f"<br>{_cell(key.meaning)}" if key.meaning else ""
+        words = _PAGE.sub(r"[\1](../\1.md)", _cell(key.meaning))
+        meaning = f"<br>{words}" if words else ""
         return f"`{key.path}`\n:   {_cell(key.kind)}; {default}{meaning}"
 
     every, parts = keys(), []
