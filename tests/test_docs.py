@@ -100,7 +100,7 @@ def test_the_gates_that_the_page_names_are_those_of_the_card():
 
     rows = [
         line.split("|")
-        for line in (ROOT / "docs/report.md").read_text(encoding="utf-8").splitlines()
+        for line in (ROOT / "docs/reading-a-report.md").read_text(encoding="utf-8").splitlines()
         if line.startswith("|") and line.count("|") == 5
     ]
     asked = {row[1].strip(): row[2].strip() for row in rows}
