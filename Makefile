@@ -1,7 +1,8 @@
 # make demo   the main job on a bench log that the project makes itself; CONFIG=FILE fits yours
 # make test   all checks; where CI=true without the slowest tests
+# make docs   the documentation site, into site/
 # make bench  the benchmarks, side by side in one run
-.PHONY: demo test bench clean
+.PHONY: demo test docs bench clean
 SHELL := /bin/bash
 CONFIG ?= configs/bench-roll.yaml
 OUT ?= runs/demo/fit
@@ -14,7 +15,7 @@ BIN := .venv/bin
 	if [ -z "$$found" ]; then \
 	  echo "heli_jax needs Python 3.12 or newer: install python3.13 (with its venv module) or uv." >&2; exit 1; fi; \
 	if [ ! -x $(BIN)/python ]; then "$$found" -m venv .venv || exit 1; fi; \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,logs,bayes,distributed]' -c constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,logs,bayes,distributed,docs]' -c constraints.txt
 	@touch $@
 
 demo: .venv/.installed
@@ -30,6 +31,10 @@ test: .venv/.installed
 	$(BIN)/pyright
 	$(BIN)/python -m pytest -n 2
 
+docs: .venv/.installed
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo site/index.html
+
 bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/identification.py
 	$(BIN)/python experiments/benchmarks/helicopter.py
@@ -37,4 +42,4 @@ bench: .venv/.installed
 	$(BIN)/python experiments/benchmarks/filter.py
 
 clean:
-	rm -rf .venv runs .pytest_cache .ruff_cache
+	rm -rf .venv runs site .pytest_cache .ruff_cache

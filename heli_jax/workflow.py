@@ -1,8 +1,7 @@
 """A whole analysis as functions, for a script, a notebook and the command line alike.
 
 `load_config` reads a configuration; `run_fit` does what `heli-jax fit` does, `run_check` what
-`heli-jax check` does. `load_fit` reads what an earlier
-fit wrote.
+`heli-jax check` does. `load_fit` reads what an earlier fit wrote.
 """
 
 import time

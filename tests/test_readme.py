@@ -1,4 +1,4 @@
-"""The README's Python runs as it stands."""
+"""The Python of the README and of docs/python.md runs as it stands."""
 
 import re
 import shutil
@@ -23,8 +23,8 @@ def folder(tmp_path_factory):
     return folder
 
 
-def parts():
-    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def parts(page):
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
 def run(folder, program):
@@ -36,8 +36,27 @@ def run(folder, program):
     return done.stdout
 
 
+def test_the_readme_is_one_screen():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    for page in re.findall(r"\]\((docs/[^)#]*)\)", text):
+        assert (ROOT / page).exists(), page
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(folder):
+    [program] = parts("README.md")
+    assert len(program.strip().splitlines()) <= 11
+    out = run(folder, program.replace("runs/notebook", "runs/readme"))
+    assert out.strip().splitlines()[-1].startswith("converged 0.02")
+    assert (folder / "runs/readme/fit/report.html").exists()
+
+
 def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
-    program = parts()[0]
+    program = parts("docs/python.md")[0]
+    # What the README shows is a part of it, so that one run tells of both.
+    [shown] = parts("README.md")
+    assert [line for line in shown.splitlines()[4:8] if line not in program.splitlines()] == []
     assert len(program.strip().splitlines()) <= 16
     assert set(re.findall(r"from (\S+) import", program)) == {"heli_jax"}
     out = run(folder, program)
@@ -50,9 +69,9 @@ def test_from_a_log_to_estimates_intervals_a_figure_and_a_data_frame(folder):
 
 
 @pytest.mark.slow
-def test_the_python_of_the_readme_runs(folder):
-    assert len(parts()) == 3
-    out = run(folder, "\n".join(parts()[1:]))
+def test_the_python_of_the_page_runs(folder):
+    assert len(parts("docs/python.md")) == 3
+    out = run(folder, "\n".join(parts("docs/python.md")[1:]))
     status, estimates, gradients, best = out.strip().split("\n", 3)
     assert status.startswith("converged The data alone determine only a/Ixx and a/If")
     assert "'Ixx': (0.024" in estimates

@@ -67,6 +67,7 @@ class DisturbanceConfig(BaseModel):
     # Two poles for a push that is smoother than a lag of white noise; both have the same time
     # constant.
     poles: Literal[1, 2] = 1
+    """1: an Ornstein-Uhlenbeck process; 2: passed through a second lag"""
     sigma_w: _Size = None
     """standard deviation, in the state's unit per second (SI) or as {value, unit}, of several by
     name: needed to simulate, an initial guess for filter error"""

@@ -23,10 +23,15 @@ class TransferConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
+    """the model's name"""
     output: str
+    """the model's name"""
     zeros: Annotated[int, Field(ge=0, le=8)] = 0
+    """of the transfer function"""
     poles: Annotated[int, Field(ge=1, le=8)]
+    """of the transfer function"""
     delay: StrictBool = True
+    """whether it has a delay"""
     band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
     """[Hz]; all frequencies unless given"""
     coherence: Annotated[float, Field(ge=0, lt=1)] = 0.6
@@ -47,7 +52,9 @@ class PairConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
+    """the model's name"""
     output: str
+    """the model's name"""
     band: Annotated[tuple[_Positive, _Positive] | None, BeforeValidator(increasing)] = None
     """[Hz]; that of all unless given"""
     coherence: _Coherence | None = None
@@ -60,9 +67,11 @@ class HandlingConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     input: str
+    """the model's name"""
     output: str
     """an angle, or a rate [rad/s], whose response is integrated"""
     response: Literal["rate", "attitude-command", "open-loop"] = "rate"
+    """what of ADS-33E-PRF is read off"""
     gain: _Positive = 1.0
     """of an open loop that the response is a part of"""
 
@@ -90,6 +99,7 @@ class FrequencyConfig(BaseModel):
     pairs: Annotated[list[PairConfig], Field(min_length=1)] | None = None
     """responses that are fitted; all unless given"""
     transfer_functions: list[TransferConfig] = []
+    """fitted to the responses of the logs, by `heli-jax frf`"""
     handling: list[HandlingConfig] | None = None
     """responses whose handling qualities are shown; unless given those of roll, pitch and yaw to
     their sticks; [] for none"""

@@ -59,10 +59,13 @@ class ServosConfig(_Strict):
     """Equal servos on some inputs (`with_servos`)."""
 
     on: Names
+    """inputs that these servos move"""
     # Off unless asked for: it is the one device here that makes a linear model nonlinear, which
     # costs the exact step.
     rate_limit: StrictBool = False
+    """whether their speed is limited (rate_servo)"""
     delay: StrictBool = False
+    """whether they act late (delay_servo)"""
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9_]*$")] = "servo"
     """ends the names of its parameters: omega_servo, ..."""
 
@@ -73,8 +76,11 @@ class RateLoopConfig(_Strict):
     on: NamesOrPairs = None
     """sticks, or by stick the state that is its rate; those of roll and pitch unless given"""
     integral: StrictBool = True
+    """whether it has the term Ki"""
     feedforward: StrictBool = True
+    """whether it has the term Kff"""
     lag: StrictBool = False
+    """whether its gyro is a first-order lag (tau_gyro)"""
 
 
 class GyroConfig(_Strict):
@@ -83,18 +89,26 @@ class GyroConfig(_Strict):
     on: NamesOrPairs = None
     """the pedal, or by pedal the state that is its rate; that of yaw unless given"""
     heading_hold: StrictBool = True
+    """whether the pedal commands a rate that is held; otherwise it damps alone"""
     lag: StrictBool = True
+    """whether its gyro is a first-order lag (tau_gyro)"""
 
 
 class SensorsConfig(_Strict):
     """What the log's sensors do (`with_sensors`)."""
 
     imu: StrictBool = False
+    """adds the specific forces ax, ay, az at the place of the accelerometer"""
     angular_acceleration: StrictBool = False
+    """adds the derivatives of the rates"""
     airspeed: StrictBool = False
+    """adds the airspeed and its components at the probe"""
     lowpass: Names = []
+    """outputs behind a first-order lag (tau_lowpass)"""
     delay: NamesOrPairs = []
+    """outputs that are late, or by output the parameter that is its delay"""
     order: Order = ORDER
+    """states by which each delay is approximated"""
 
 
 class DelaysConfig(_Strict):
@@ -103,7 +117,9 @@ class DelaysConfig(_Strict):
     inputs: NamesOrPairs = []
     """names, or by name the parameter"""
     outputs: NamesOrPairs = []
+    """names, or by name the parameter"""
     order: Order = ORDER
+    """states by which each delay is approximated"""
 
 
 FROM_LOG = "from log"
@@ -115,9 +131,11 @@ class FilterConfig(_Strict):
     """A filter between a sensor and the log (`Filter`)."""
 
     kind: Literal["pt1", "pt2", "pt3", "biquad", "notch", "from log"]
+    """of low-pass or notch; from log: by the settings that the log states"""
     hz: _Positive | None = None
     """where a low-pass is 3 dB down, or the notch's centre"""
     q: _Positive | None = None
+    """quality of a biquad or notch"""
     bandwidth: _Positive | None = None
     """of a notch [Hz], in place of q"""
     attenuation: _Positive | None = None
@@ -194,6 +212,7 @@ class VibrationConfig(_Strict):
     rotor: _Positive
     """speed of the rotor, in rad/s unless `unit` says otherwise"""
     unit: str = "rad/s"
+    """of the speed: rad/s, rpm, Hz"""
 
 
 class OnboardConfig(_Strict):
@@ -203,10 +222,15 @@ class OnboardConfig(_Strict):
         list[ServosConfig],
         BeforeValidator(_one_or_several, json_schema_input_type=ServosConfig | list[ServosConfig]),
     ] = []
+    """one kind of servo, or a list of kinds"""
     rate_loop: RateLoopConfig | None = None
+    """a flybarless unit"""
     gyro: GyroConfig | None = None
+    """a gyro on the tail"""
     sensors: SensorsConfig | None = None
+    """what the sensors do to the motion"""
     delays: DelaysConfig | None = None
+    """radio and log"""
 
 
 def with_onboard(model: Model, config: OnboardConfig | None, path: Path) -> Model:

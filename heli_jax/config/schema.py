@@ -5,12 +5,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
 
-from heli_jax.config.design_section import DesignConfig, ReduceConfig, TrajectoriesConfig
+from heli_jax.config.design_section import SweepConfig
 from heli_jax.config.disturbance_section import DisturbanceConfig
+from heli_jax.config.flight_values import one_log, window_choice
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
 from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
-from heli_jax.config.simulate_section import SimulateConfig, StartConfig
+from heli_jax.config.simulate_section import SimulateConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.limits import F_ENTER
 from heli_jax.identification.methods import METHODS
@@ -54,19 +55,25 @@ def _model_choice(value: Any) -> Any:
 
 class TimeConfig(_Strict):
     signal: str
+    """the column of time stamps"""
     unit: str = "s"
+    """of the stamps: s, ms, us or ns"""
 
 
 class InputConfig(LoggedInputConfig):
     unit: str | None = None
+    """that the numbers have then; taken to be in SI unless given"""
     hold: Literal["auto", "zero-order", "linear"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
 
 
 class OutputConfig(ScaledConfig):
     signal: str
+    """a channel's or column's name in the log"""
     unit: str | None = None
+    """that the numbers have then"""
     sd: Positive | None = None
+    """standard deviation of its noise, in `unit`, as far as it is known"""
     filter: Filters | None = None
     """what the autopilot filtered it with: from log, or one or several of {kind, hz, ...}
     (docs/onboard.md); none: nothing is known of it"""
@@ -82,7 +89,9 @@ class SignalsConfig(PresetConfig):
     # Names are checked where the model is known: what it has for inputs and outputs is not known
     # here.
     inputs: dict[str, InputConfig] = Field(default={})
+    """the model's inputs, by its names"""
     outputs: dict[str, OutputConfig] = Field(default={})
+    """the model's outputs, by its names"""
     instruments: dict[str, InputConfig] = Field(default={})
     """by input, an excitation that was added to it and that no feedback reaches
     (docs/frequency.md)"""
@@ -114,52 +123,42 @@ class AlsoConfig(_Strict):
     """A further log of the same flight (docs/logs.md)."""
 
     log: str
+    """the file; its path begins at the configuration"""
     align: AlignConfig
+    """how its clock is found"""
     signals: AlsoSignalsConfig
+    """what is taken from it"""
     flight: Annotated[int, Field(ge=1)] | None = None
-
-
-def _window_choice(value: Any) -> Any:
-    # By hand: of a union pydantic would report every member.
-    if value is None or value == "auto":
-        return value
-    if isinstance(value, list | tuple) and len(value) == 2:
-        numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
-        if len(numbers) == 2 and all(math.isfinite(v) for v in numbers):
-            return value
-    raise ValueError(f"expected two finite numbers of seconds or auto, got {value!r:.60}")
-
-
-def _one_log(value: Any) -> Any:
-    # A study takes the list away before: what still has one is read by another command.
-    if isinstance(value, list):
-        raise ValueError(
-            "expected one log, got a list, which makes a study of fits (heli-jax fit, "
-            "heli_jax.run_study)"
-        )
-    return value
+    """which flight of a log that holds several, from 1"""
 
 
 class FlightConfig(_Strict):
-    log: Annotated[str, BeforeValidator(_one_log, json_schema_input_type=str | list[str])]
-    """a file; a list is a study with a fit for each (docs/studies.md)"""
+    log: Annotated[str, BeforeValidator(one_log, json_schema_input_type=str | list[str])]
+    """the file; its path begins at the configuration. A list is a study with a fit for each
+    (docs/studies.md)"""
     signals: SignalsConfig
+    """which channel is which input and output"""
     flight: Annotated[int, Field(ge=1)] | None = None
     """which flight of a log that holds several, from 1"""
     name: str | None = None
+    """in tables and figures; 'flight 1' and so on unless given"""
     rate: Positive | None = None
+    """samples a second [Hz] to resample to; the log's own unless given"""
     # Increasing is checked where logs are read, for configurations and scripts alike.
     window: Annotated[
-        tuple[Finite, Finite] | Literal["auto"] | None, BeforeValidator(_window_choice)
+        tuple[Finite, Finite] | Literal["auto"] | None, BeforeValidator(window_choice)
     ] = None
     """[s] from the log's beginning; auto: the windows that say most of what is free"""
     gaps: Literal["fail", "split"] = "fail"
     """what to do about gaps too long to be bridged: refuse them, or make flights of the parts"""
     also: list[AlsoConfig] = []
+    """further logs of the same flight"""
     # Such a run is predicted and never fitted: agreement with it is the only one that no free
     # parameter was bent to.
     hold_out: bool = False
+    """whether it is predicted and not fitted"""
     known: dict[str, Finite] = {}
+    """parameters of the model that are known of this flight alone, in SI: {Ixx_added: 0.01}"""
     notch: Notches | None = None
     """frequencies [Hz] that are taken out of inputs and outputs alike"""
     vibration: VibrationConfig | None = None
@@ -170,7 +169,9 @@ class FlightConfig(_Strict):
 
 class PriorConfig(_Strict):
     mean: Finite
+    """of a normal distribution, in SI"""
     sd: Positive
+    """standard deviation, in SI"""
 
 
 class FreeConfig(_Strict):
@@ -178,8 +179,11 @@ class FreeConfig(_Strict):
     start: Finite = math.nan
     """may be left out where `fit.start` finds it"""
     lower: Finite | None = None
+    """bound, in SI"""
     upper: Finite | None = None
+    """bound, in SI"""
     prior: PriorConfig | None = None
+    """what is known of it besides the data"""
     sign: Sign | None = None
     """whether the estimate may have another sign than the start: keep, or any; unless given, a
     helicopter's parameters keep theirs and those of a model of one's own may have any"""
@@ -198,9 +202,13 @@ def _offset_choice(value: object) -> object:
 
 class NuisanceConfig(_Strict):
     initial_state: bool = True
+    """whether the state at the first sample is estimated, of each flight"""
     bias: bool = True
+    """whether a constant added to each output is, of each flight"""
     time_shift: bool = False
+    """whether a delay [s] of all inputs is, below zero where they were logged late"""
     input_gain: bool = False
+    """whether a factor of each input is"""
     # Any, since the validator before it has said what it may be.
     input_offset: Annotated[
         Any, BeforeValidator(_offset_choice, json_schema_input_type=bool | list[str] | None)
@@ -278,9 +286,11 @@ def _start_method(value: Any) -> Any:
 class FitConfig(_Strict):
     # Of the table of estimators, so that a new one can be asked for without an entry here.
     method: Literal[tuple(METHODS)] = "output-error"  # pyright: ignore[reportInvalidTypeForm]
+    """by what model and data are compared"""
     also: list[Literal[tuple(METHODS)]] = []  # pyright: ignore[reportInvalidTypeForm]
     """further methods by which the same is fitted, their estimates laid beside those of `method`"""
     free: dict[str, FreeConfig]
+    """what is estimated, by the names of the model"""
     start: Annotated[
         StartMethodConfig,
         BeforeValidator(_start_method, json_schema_input_type=str | StartMethodConfig),
@@ -293,17 +303,22 @@ class FitConfig(_Strict):
     """frequency-error: inputs that are taken by their instrument, or none; unless given, all of
     which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
+    """what is estimated beside"""
     shooting: ShootingConfig | None = None
+    """windows with initial states of their own"""
     # Unless given, the number depends on what is free: the misfit has a valley for each period by
     # which a delay is wrong, and one start finds the nearest.
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """points to start from; one unless given, five where a delay is free"""
     seed: Annotated[int, Field(ge=0)] = 0
+    """of random starts, bootstrap and NUTS"""
     max_steps: Annotated[int, Field(ge=1)] = 200
+    """of the optimiser, from each start"""
     compare: bool = False
     """whether to fit the candidate models too: no disturbance, one pole, two poles; no stand; where
     several axes may be disturbed, all of them and each left out"""
     intervals: IntervalsConfig = IntervalsConfig()
+    """further intervals beside the Gaussian ones"""
 
     @property
     def by_instrument(self) -> tuple[str, ...] | None:
@@ -330,34 +345,18 @@ class FitConfig(_Strict):
 class RLSConfig(_Strict):
     # Four is the order of the paper.
     order: Annotated[int, Field(ge=1, le=20)] = 4
+    """of the discrete transfer function"""
     # One forgets nothing: all samples count alike, as for a machine that does not change in a
     # record.
     forgetting: Annotated[float, Field(gt=0, le=1)] = 1.0
-
-
-class SweepConfig(DesignConfig):
-    """Many runs: a design, what is kept of each run, and how it is computed."""
-
-    reduce: dict[str, ReduceConfig] = Field(default_factory=dict)
-    trajectories: TrajectoriesConfig | None = None
-    inputs: Literal["flights", "simulate"] | None = None
-    """where the inputs come from; the flights unless there are none"""
-    start: StartConfig | None = None
-    """the steady flight in which each run of a whole helicopter begins, the flights' sticks as
-    they are; what `simulate` makes begins as it says there"""
-    solver: str | None = None
-    substeps: int | None = None
-    precision: Literal["float64", "float32"] = "float64"
-    chunk: int | None = None
-    """design points written at a time"""
-    lanes: int | None = None
-    """batch size: design points computed side by side on a device"""
+    """factor by which each sample counts less than the next"""
 
 
 class Config(_Strict):
     """One experiment."""
 
     model: Annotated[str | LinearConfig, BeforeValidator(_model_choice)]
+    """a model's name, package.module:name, or {linear: FILE}"""
     # A file, or constants as in one: checked by the readers of vehicle files, with their messages.
     vehicle: str | dict[str, Any] | None = None
     """may be left out where the model is a file: its own values are a vehicle"""
@@ -373,13 +372,19 @@ class Config(_Strict):
     begin at zero"""
     # May be missing: a simulation needs none.
     flights: list[FlightConfig] = []
+    """the logged runs"""
     fit: FitConfig | None = None
+    """what is estimated, and how"""
     # On unless switched off by `rls: null`: the baseline of the paper costs little.
     rls: RLSConfig | None = RLSConfig()
+    """the recursive least squares of the paper, beside the fit; null for none"""
     disturbance: DisturbanceConfig | None = None
+    """random pushes: drawn by simulate, estimated by filter error"""
     frequency: FrequencyConfig | None = None
     """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
     simulate: SimulateConfig | None = None
+    """a run that `heli-jax simulate` makes"""
     sweep: SweepConfig | None = None
+    """many runs, for `heli-jax sweep`"""
     study: dict[str, list[Any]] | None = None
     """by key the values that it takes in a study of fits: every combination (docs/studies.md)"""

@@ -21,9 +21,11 @@ class ScaledConfig(_Strict):
     """(number in the log - offset) scale, in the stated unit, inverted or not."""
 
     scale: _Finite = 1.0
+    """factor of the number in the log, after offset"""
     offset: _Finite = 0.0
     """in the log's own numbers"""
     invert: StrictBool = False
+    """whether the sign is turned"""
 
     @model_validator(mode="after")
     def _sensible(self) -> "ScaledConfig":
@@ -42,6 +44,7 @@ class LoggedInputConfig(ScaledConfig):
     """An input's channel, or its value where the log lacks it."""
 
     signal: str | None = None
+    """a channel's or column's name in the log"""
     constant: _Finite | None = None
     """in the stated unit"""
 
@@ -80,12 +83,19 @@ class CcpmConfig(_Strict):
     """The servos of a swashplate and where they lift it (`heli_jax.flights.ccpm.Swashplate`)."""
 
     servos: list[str]
+    """the channels of the servos"""
     angles: list[_Finite]
+    """[deg] of each, clockwise from the nose, seen from above"""
     radius: _Numbers = 1.0
+    """of each from the mast, in any one unit"""
     offset: _Numbers = 0.0
+    """of each at rest, in the log's numbers"""
     scale: _Numbers = 1.0
+    """lift for a unit of the log"""
     invert: _Booleans = False
+    """whether a servo moves the other way"""
     phase: _Finite = 0.0
+    """[deg] by which the plate leads the blades"""
 
     @model_validator(mode="after")
     def _regular(self) -> "CcpmConfig":

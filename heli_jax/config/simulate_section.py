@@ -19,8 +19,11 @@ class StickConfig(_Strict):
 
     # "sweep" is the older name of "chirp".
     kind: Literal["random-steps", "3-2-1-1", "chirp", "sweep", "neutral"] = "random-steps"
+    """how it moves"""
     amplitude: Positive
+    """largest deflection, in `unit`"""
     unit: str | None = None
+    """the model's SI unit unless given"""
     hold: tuple[Positive, Positive] = (0.3, 2.0)
     """shortest and longest step of random-steps [s]"""
     step: Positive = 0.3
@@ -33,7 +36,9 @@ class StickConfig(_Strict):
 
 class NoiseConfig(_Strict):
     sd: Positive
+    """standard deviation, in `unit`"""
     unit: str | None = None
+    """the output's SI unit unless given"""
 
 
 class StartConfig(_Strict):
@@ -73,10 +78,15 @@ class SimulateConfig(_Strict):
     """
 
     duration: Positive
+    """[s]"""
     rate: Positive
+    """samples a second [Hz]"""
     inputs: dict[str, StickConfig] = {}
+    """how each input moves; those not named stay at rest"""
     noise: dict[str, NoiseConfig] = {}
+    """white noise added to the outputs, by name"""
     seed: Annotated[int, Field(ge=0)] = 0
+    """of inputs, noise and disturbance"""
     start: StartConfig | None = None
     """hover unless given"""
     wind: tuple[Finite, Finite, Finite] | None = None

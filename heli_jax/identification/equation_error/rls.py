@@ -102,7 +102,8 @@ def regressors(
     """Phi(k) = [y(k-1) ... y(k-n), u(k) ... u(k-n)], eq. 25, with zeros before the first sample.
 
     Args:
-        u, y: input and output, (N,).
+        u: input, (N,).
+        y: output, (N,).
         order: n.
     """
 
@@ -130,7 +131,8 @@ def rls(
     zeros there.
 
     Args:
-        u, y: input and output, (N,).
+        u: input, (N,).
+        y: output, (N,).
         order: n of Hd(z); the paper's is 4.
         forgetting: in (0, 1].
         p0: initial variance of every parameter.

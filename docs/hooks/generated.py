@@ -1,0 +1,226 @@
+"""What the site takes from the code when it is built, so that no page can lag behind it.
+
+A page asks for it by a line `<!-- generated: NAME -->`; NAME is an entry of `_PARTS`. Beside them
+stand the figures and the report of the demo, of which nothing is kept in the repository.
+"""
+
+import contextlib
+import functools
+import io
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+_ROOT = Path(__file__).parents[2]
+_MARK = re.compile(r"^<!-- generated: (\S+) -->$", re.MULTILINE)
+_ENDS = re.compile(r"([|<>])")
+_PAGE = re.compile(r"docs/([\w-]+)\.md")
+# Of these the demo has the figures that the gallery shows; the report has all.
+_DEMO = "configs/bench-roll.yaml"
+_SWEEP = (
+    "configs/bench-sweep.yaml",
+    *("--set", "sweep.n=256", "--set", "simulate.duration=10", "--devices", "1"),
+    *("--set", "sweep.reduce={rms_roll: {signal: roll, how: rms}}"),
+)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the demo's report and figures to the site, below made/."""
+    made = _made()
+    for path in sorted(made.rglob("*")):
+        if path.suffix in (".svg", ".html"):
+            place = f"made/{path.relative_to(made).as_posix()}"
+            files.append(File.generated(config, place, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """The page with what it asks for."""
+    return _MARK.sub(lambda mark: _PARTS[mark[1]](), markdown)
+
+
+def on_shutdown(**_: Any) -> None:
+    """Removes the demo's files."""
+    if _made.cache_info().currsize:
+        shutil.rmtree(_made())
+        _made.cache_clear()
+
+
+@functools.cache
+def _made() -> Path:
+    """The folder with what the demo and a small sweep wrote."""
+    from heli_jax.cli import main
+
+    folder = Path(tempfile.mkdtemp(prefix="heli_jax-site-"))
+    shutil.copytree(_ROOT / "configs", folder / "configs")
+    # Commands name files as they are told, and a page must not show where it was built.
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
+        assert main(["simulate", _DEMO, "--out", "runs/demo/bench.csv"]) == 0
+        assert main(["fit", _DEMO, "--set", "fit.starts=1", "--out", "fit"]) == 0
+        assert main(["sweep", *_SWEEP, "--out", "sweep"]) == 0
+    return folder
+
+
+def _table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> str:
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _cell(text: str) -> str:
+    # A bar would end the cell, and Python-Markdown takes angle brackets for HTML.
+    return _ENDS.sub(r"\\\1", text)
+
+
+def _keys() -> str:
+    from heli_jax.config.keys import Key, keys
+
+    def entry(key: Key) -> str:
+        default = "**has to be there**" if key.default is None else f"default `{key.default}`"
+        default = "optional" if key.default == "null" else default
+        # A list and not a table: paths are long, and screens may be narrow.
+        words = _PAGE.sub(r"[\1](../\1.md)", _cell(key.meaning))
+        meaning = f"<br>{words}" if words else ""
+        return f"`{key.path}`\n:   {_cell(key.kind)}; {default}{meaning}"
+
+    every, parts = keys(), []
+    sections = dict.fromkeys(re.split(r"[.\[]", key.path)[0] for key in every)
+    for section in sections:
+        entries = (entry(k) for k in every if re.split(r"[.\[]", k.path)[0] == section)
+        parts.append("\n\n".join((f"## {section}", *entries)))
+    return "\n\n".join(parts)
+
+
+def _commands() -> str:
+    from heli_jax import cli
+
+    # Of the terminal in which the site is built nothing may show.
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "88"
+    try:
+        parser = cli._parser()
+        [commands] = parser._subparsers._group_actions  # type: ignore[union-attr]
+        texts = {name: command.format_help() for name, command in commands.choices.items()}  # type: ignore[union-attr]
+    finally:
+        os.environ.pop("COLUMNS")
+        if before is not None:
+            os.environ["COLUMNS"] = before
+    return "\n\n".join(f"## {name}\n\n```text\n{text}```" for name, text in texts.items())
+
+
+def _configurations() -> str:
+    parts = []
+    for path in sorted((_ROOT / "configs").rglob("*.yaml")):
+        name = path.relative_to(_ROOT).as_posix()
+        text = path.read_text(encoding="utf-8")
+        parts.append(f"## {name} {{#{path.stem}}}\n\n```yaml\n{text}```")
+    return "\n\n".join(parts)
+
+
+def _linear_models() -> str:
+    from heli_jax.linear_models.read import linear_model, shipped
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for name in shipped():
+            model = linear_model(name).model
+            records = (model.State, model.Inputs, model.Outputs)
+            yield f"`{{linear: {name}}}`", *(_names(record) for record in records)
+
+    return _table(("model", "states", "inputs", "outputs"), rows())
+
+
+def _models() -> str:
+    from heli_jax import models
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for name in (*models._SHIPPED, *models._HELICOPTERS):
+            model = models.by_name(name)
+            records = (model.State, model.Inputs, model.Outputs)
+            yield f"`{name}`", *(_names(record) for record in records)
+
+    return _table(("model", "states", "inputs", "outputs"), rows())
+
+
+def _names(record: type) -> str:
+    from heli_jax import naming
+
+    return " ".join(f"`{name}`" for name in naming.names(record))
+
+
+def _symbols() -> str:
+    """Parameters, inputs and outputs of the roll model on its stand and of the whole helicopter."""
+    from heli_jax import models, naming
+
+    records = (
+        *(models.roll_on_stand.Params, models.by_name("helicopter").Params),
+        *(models.roll_on_stand.Inputs, models.by_name("helicopter").Inputs),
+        *(models.roll_on_stand.Outputs, models.by_name("helicopter").Outputs),
+    )
+    # Each name once, and as the first model that has it says.
+    found = {n: r for r in reversed(records) for n in naming.names(r)}
+    order = dict.fromkeys(n for r in records for n in naming.names(r))
+    rows = (
+        (f"`{n}`", naming.unit(found[n], n) or "", _cell(naming.meaning(found[n], n)))
+        for n in order
+    )
+    return _table(("symbol", "unit", "meaning"), rows)
+
+
+def _presets() -> str:
+    from importlib import resources
+
+    names = ("px4-helicopter", "ardupilot-helicopter", "rotorflight")
+    folder = resources.files("heli_jax.flights").joinpath("presets")
+    texts = (folder.joinpath(f"{n}.yaml").read_text(encoding="utf-8") for n in names)
+    parts = (f"## {n}\n\n```yaml\n{t}```" for n, t in zip(names, texts, strict=True))
+    return "\n\n".join(parts)
+
+
+def _api() -> str:
+    import heli_jax
+
+    homes = heli_jax._HOMES
+    placed = {n for names in _API.values() for n in names}
+    further = tuple(n for n in homes if n not in placed)
+    parts = []
+    for heading, names in (_API | ({"Further": further} if further else {})).items():
+        members = "\n\n".join(f"::: heli_jax.{homes[n]}.{n}" for n in names if n != "models")
+        parts.append(f"## {heading}\n\n{members}")
+    return "\n\n".join(parts)
+
+
+_API = {
+    "From a configuration": (
+        *("load_config", "run_check", "run_fit", "FitRun", "compare_models", "run_sweep"),
+        *("write_report", "load_fit", "SavedFit", "compare_runs"),
+    ),
+    "Flights": ("Flight", "Signal", "read_flight"),
+    "Models and vehicles": (
+        *("models", "Model", "LinearModel", "linear_model", "Helicopter", "load_vehicle"),
+    ),
+    "Simulation and analysis": (
+        *("simulate", "SimulationOptions", "Trajectory", "accumulate", "trim", "linearize"),
+        *("c2d", "d2c"),
+    ),
+    "Identification": (
+        *("Problem", "Free", "Prior", "Nuisance", "check", "fit", "Fit", "intervals", "rls"),
+    ),
+    "Sweeps": ("sweep",),
+}
+
+_PARTS: dict[str, Callable[[], str]] = {
+    "keys": _keys,
+    "commands": _commands,
+    "configurations": _configurations,
+    "linear-models": _linear_models,
+    "models": _models,
+    "symbols": _symbols,
+    "presets": _presets,
+    "api": _api,
+}

@@ -1,0 +1,117 @@
+"""The documentation site: every link and anchor holds, and nothing comes from the network."""
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mkdocs", reason="the extra docs is not installed")
+pytest.importorskip("material", reason="the extra docs is not installed")
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built as `make docs` does: what is wrong in a link or an anchor ends it."""
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder
+
+
+class _Loaded(HTMLParser):
+    """What a browser loads for a page, and where its links lead."""
+
+    def __init__(self):
+        super().__init__()
+        self.loaded, self.links, self.anchors = [], [], set()
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.anchors |= {values.get("id"), values.get("name")} - {None}
+        if tag == "a":
+            self.links.append(values.get("href") or "")
+        elif tag == "link":
+            self.loaded.append(values.get("href") or "")
+        elif values.get("src"):
+            self.loaded.append(values["src"])
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    parsed = {}
+    for path in sorted(site.rglob("*.html")):
+        page = _Loaded()
+        page.feed(path.read_text(encoding="utf-8"))
+        parsed[path.relative_to(site).as_posix()] = page
+    return parsed
+
+
+def test_a_browser_loads_nothing_from_the_network(site, pages):
+    assert len(pages) > 30
+    for name, page in pages.items():
+        assert [u for u in page.loaded if re.match(r"(?:\w+:)?//", u)] == [], name
+    for sheet in site.rglob("*.css"):
+        assert re.findall(r"(?:url\(|@import)\s*[\"']?(?:https?:)?//[^)]*", sheet.read_text()) == []
+
+
+def test_every_link_leads_somewhere(site, pages):
+    # mkdocs asks this of Markdown; here of the HTML too that code made.
+    for name, page in pages.items():
+        if name == "404.html":
+            continue
+        for link in page.links:
+            target, _, anchor = link.partition("#")
+            if re.match(r"\w+:", target):
+                continue
+            place = (site / name).parent / target if target else site / name
+            place = place / "index.html" if place.is_dir() else place
+            assert place.exists(), f"{name}: {link}"
+            other = place.resolve().relative_to(site.resolve()).as_posix()
+            if anchor and other in pages:
+                assert anchor in pages[other].anchors, f"{name}: {link}"
+
+
+def test_the_reference_has_what_the_code_has(site, pages):
+    import heli_jax
+    from heli_jax.config.keys import keys
+
+    text = (site / "reference/keys.html").read_text(encoding="utf-8")
+    assert [k.path for k in keys() if f"<code>{k.path}</code>" not in text] == []
+    assert [k.path for k in keys() if not k.meaning] == []
+    anchors = pages["reference/api.html"].anchors
+    described = {a.rsplit(".", 1)[-1] for a in anchors}
+    assert set(heli_jax.__all__) - described == {"models"}  # a module, told in words
+    # Nothing that the build made shows where it was made.
+    assert str(ROOT) not in "".join(p.read_text() for p in site.rglob("*.html"))
+
+
+def test_the_gates_that_the_page_names_are_those_of_the_card():
+    from heli_jax.report import card
+
+    rows = [
+        line.split("|")
+        for line in (ROOT / "docs/reading-a-report.md").read_text(encoding="utf-8").splitlines()
+        if line.startswith("|") and line.count("|") == 5
+    ]
+    asked = {row[1].strip(): row[2].strip() for row in rows}
+    for what, limit in {
+        "Cramér-Rao": f"at most {card.CRAMER_RAO:g} %",
+        "insensitivity": f"at most {card.INSENSITIVITY:g} %",
+        "largest correlation": f"at most {card.CORRELATION:g}",
+        "VAF, NRMSE fit": f"at least {card.VAF:g}, at least {card.NRMSE_FIT:g} %",
+        "Theil coefficient": f"at most {card.THEIL:g}",
+        "Theil bias, variance part": f"at most {card.THEIL_PART:g}",
+        "error power over expected": f"at most {card.EXPECTED:g}",
+        "coherence": f"at least {card.COHERENCE:g}",
+    }.items():
+        assert limit in asked[what], what
