@@ -189,7 +189,7 @@ def _lines(record: Record, ds: Signals) -> Signals:
         flat = at_lines(record, v.reshape(v.shape[0], -1))
         return flat.reshape(flat.shape[0], *v.shape[1:])
 
-    return Signals(*(None if v is None else lines(v) for v in ds))
+    return jax.tree.map(lines, ds)
 
 
 def _slopes(block: _Block, m: Matrices, dm: Matrices, of: _Driven) -> Float[Array, "K a q"]:
