@@ -72,7 +72,7 @@ class FitRun:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
         # Here, since matplotlib takes a second, and a fit without report needs none of it.
-        from heli_jax.report.html import Analysis, drawings
+        from heli_jax.report.drawings import Analysis, drawings
         from heli_jax.report.style import styled
 
         shown = _with_responses(self) if name.startswith("match") else self.supplementary
@@ -320,7 +320,7 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     Raises:
         InputError: `out` exists or cannot be written to.
     """
-    from heli_jax.report.html import Analysis
+    from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
 
     out = Path(out)

@@ -15,8 +15,9 @@ from heli_jax.analysis.trim import is_full_nonlinear
 from heli_jax.dynamics.model import Model
 from heli_jax.report import manoeuvre, style
 from heli_jax.report.animation import animation, size_of
+from heli_jax.report.drawings import MOST_FLIGHTS
 from heli_jax.report.figures import Panels
-from heli_jax.report.html import MOST_FLIGHTS, Picture
+from heli_jax.report.html import Picture
 from heli_jax.report.page import filled
 from heli_jax.simulation.trajectory import Trajectory
 

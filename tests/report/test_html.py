@@ -11,7 +11,8 @@ import pytest
 from heli_jax import numbers
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.report import tables
-from heli_jax.report.html import Analysis, write_report
+from heli_jax.report.drawings import Analysis
+from heli_jax.report.html import write_report
 from heli_jax.vehicle import Constant
 from tests.report.conftest import SCRIPT
 
