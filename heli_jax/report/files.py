@@ -19,6 +19,7 @@ from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import fit_content as content
 from heli_jax.report.card import card
+from heli_jax.report.fit_content import whiteness_note as whiteness_note
 from heli_jax.report.fitted_responses import FittedResponses
 from heli_jax.report.handling_json import handling_json
 from heli_jax.report.method_content import frequency_start_content, methods_content
@@ -93,7 +94,7 @@ def fit_json(
             ),
             "equation_error_start": content.first_guess(problem),
             "frequency_error_start": frequency_start_content(problem),
-            "starts": [row._asdict() for row in fit.starts],
+            "starts": content.starts(fit),
             "steps": fit.steps,
             "notes": list(fit.notes),
             "timing_s": fit.timing,

@@ -160,8 +160,20 @@ def intervals(comparison: Intervals | None) -> dict[str, Any] | None:
 
 
 def parameter(e: Estimate) -> dict[str, Any]:
-    """One estimate."""
-    return {**e._asdict(), "fixed": False}
+    """One estimate; of what the data do not determine the guess and the bounds alone."""
+    # Where the optimiser stopped in a direction that nothing determines is an accident, and a
+    # program that reads the file would take it for an estimate.
+    missing = dict.fromkeys(("value", "sd_white", "sd_alone")) if e.sd is None else {}
+    return {**e._asdict(), **missing, "fixed": False}
+
+
+def starts(fit: Fit) -> list[dict[str, Any]]:
+    """Where each start led; null for what is not determined."""
+    open_ones = {n for n, e in fit.estimates.items() if e.sd is None}
+    return [
+        {**row._asdict(), "end": {n: None if n in open_ones else v for n, v in row.end.items()}}
+        for row in fit.starts
+    ]
 
 
 def fixed(problem: Problem) -> dict[str, Any]:

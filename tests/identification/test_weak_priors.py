@@ -12,7 +12,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit, 
 from heli_jax.identification.identifiability.analysis import analyse
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.verdict import Unknown
-from heli_jax.report.fit_content import whiteness_note
+from heli_jax.report.files import whiteness_note
 from tests.identification.bench import BENCH, record, vehicle
 
 DT, N, SD = 0.05, 200, 0.02
