@@ -322,6 +322,7 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     """
     from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
+    from heli_jax.report.origin import origin
 
     out = Path(out)
     run_directory.require_free(out)
@@ -334,7 +335,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         started = time.perf_counter()
         title = run.config.path.stem
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
-        write_page(folder, analysis, title, vehicle.constants)
+        beside = ("config.yaml", "fit.json", "signals.csv")
+        write_page(folder, analysis, title, vehicle.constants, origin(text, beside))
         run.fit.timing["report"] = time.perf_counter() - started
         # fit.json comes last, since it holds how long all the rest took.
         run.fit.timing["total"] = time.perf_counter() - run.began

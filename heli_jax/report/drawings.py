@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from matplotlib.figure import Figure
 
-from heli_jax import naming
+from heli_jax import naming, units
+from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
@@ -58,6 +59,47 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     if baseline is not None:
         drawings["rls"] = _drawing(figures.rls_history, baseline)
     return drawings
+
+
+def logged_units(analysis: Analysis) -> dict[str, dict[str, tuple[str, float]]]:
+    """By figure and signal: the unit of its log, and what SI is times to be in it.
+
+    Signals that the log has in SI are left out.
+    """
+    fit, problem, _, _ = analysis
+    # In the order of the signals: the fitted flights first.
+    flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
+    parts, by_figure = _parts([s.flight for s in fit.signals]), {}
+    for signals, flight, part in zip(fit.signals, flights, parts, strict=True):
+        if flight.source is None:
+            continue
+        listed = {**flight.source.inputs, **flight.source.outputs}
+        factors = {n: (s.unit, factor) for n, s in listed.items() if (factor := from_si(s)) != 1.0}
+        for output in signals.measured:
+            own = factors.get(output)
+            by_figure[f"response{part}_{output}"] = factors | ({"residual": own} if own else {})
+    return by_figure
+
+
+def logged_outputs(analysis: Analysis) -> dict[str, tuple[str, float]]:
+    """By output the unit of the logs, and what SI is times to be in it; those alone that all
+    flights have in one unit other than SI."""
+    by_output: dict[str, set[tuple[str, float]]] = {}
+    for flight in analysis.problem.flights:
+        listed = flight.source.outputs if flight.source else {}
+        for name in flight.outputs:
+            unit = (listed[name].unit, from_si(listed[name])) if name in listed else ("", 1.0)
+            by_output.setdefault(name, set()).add(unit)
+    alike = {name: next(iter(units)) for name, units in by_output.items() if len(units) == 1}
+    return {name: unit for name, unit in alike.items() if unit[1] != 1.0}
+
+
+def from_si(signal: Signal) -> float:
+    """What a number in SI is times to be in the unit that the configuration states for it."""
+    try:
+        return 1.0 / units.factor(signal.unit, signal.si)
+    except ValueError:  # of no known unit: it was never converted
+        return 1.0
 
 
 def _drawn(hold_out: list[bool]) -> list[int]:

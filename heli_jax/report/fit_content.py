@@ -15,6 +15,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE, Adequacy
 from heli_jax.identification.validation.feedback import LEVEL
+from heli_jax.numbers import percent
 
 
 def adequate_unjudged(fit: Fit) -> bool:
@@ -45,8 +46,8 @@ def whiteness_note(fit: Fit) -> str:
         consequence = "The intervals count every sample as news and are too narrow."
     return (
         f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
-        f"at one sample, {worst.outside:.0%} of the lags outside the 99 % band): a disturbance or "
-        f"dynamics that the model lacks is in them. {consequence}"
+        f"at one sample, {percent(worst.outside, 0)} of the lags outside the 99 % band): "
+        f"a disturbance or dynamics that the model lacks is in them. {consequence}"
     )
 
 

@@ -1,66 +1,33 @@
 """The report of a fit: one HTML file that holds everything, and its figures as files."""
 
-import base64
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from heli_jax.report import card, style, tables
-from heli_jax.report.drawings import MOST_FLIGHTS, Analysis, drawings
+from heli_jax.report import card, tables
+from heli_jax.report.captions import GROUPS, alt_text, caption
+from heli_jax.report.drawings import MOST_FLIGHTS, Analysis, drawings, logged_outputs, logged_units
+from heli_jax.report.embedded import Numbers
+from heli_jax.report.origin import Origin
 from heli_jax.report.page import filled
+from heli_jax.report.pictures import Picture, picture
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
 
-_CAPTIONS = {
-    "response": "From above, over time: measured and simulated, what is left between them, inputs.",
-    "residual": "From above, by lag: its correlation with itself, then with each input; of white "
-    "noise 99 % of the lags lie within the band.",
-    "bode": "Magnitude and phase of the fitted model, of the recursive least squares where there "
-    "are some, and of the record where its coherence allows.",
-    "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
-    "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
-    "did not notice (Wood and Hodgkinson, 1980).",
-    "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
-    "starts": "The misfit that each start of the optimiser reached, best first.",
-    "rls": "Each coefficient while the record goes by: one to be trusted settles.",
-    "intervals": "Of each parameter, by every method; the dotted line is the estimate.",
-}
-"""by group, what a figure shows, after its title"""
-_GROUPS = tuple(_CAPTIONS)
-# The template asks for figures by what their names begin with: no group may begin another's name.
-
-
-class Picture(NamedTuple):
-    """A figure as the page holds it."""
-
-    name: str
-    title: str
-    data: str
-    """SVG in base64"""
-
-    @property
-    def alt(self) -> str:
-        """What a reader who does not see the figure is told."""
-        if self.name.startswith("match"):
-            return (
-                f"{self.title}: Bode plot of both with intervals, coherence, and the error between "
-                "them within the envelopes of mismatch"
-            )
-        return self.title
-
-    @property
-    def caption(self) -> str:
-        """What the figure shows, and the name of its files."""
-        [words] = [w for group, w in _CAPTIONS.items() if self.name.startswith(group)]
-        return f"{self.title}. {words} (figures/{self.name}.svg, .png)"
+_LIVE = ("response", "bode", "match", "rls")
+"""figures that the page draws itself, to be zoomed: those over time and over frequency"""
 
 
 def write_report(
-    directory: Path, analysis: Analysis, title: str, vehicle_constants: Mapping[str, Constant]
+    directory: Path,
+    analysis: Analysis,
+    title: str,
+    vehicle_constants: Mapping[str, Constant],
+    origin: Origin | None = None,
 ) -> list[str]:
     """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
 
-    The page refers to nothing outside itself. Whatever comes from logs and configurations is
+    The page loads nothing from outside itself. Whatever comes from logs and configurations is
     escaped.
 
     Args:
@@ -68,24 +35,23 @@ def write_report(
         analysis: the fit and what belongs to it.
         title: of the page.
         vehicle_constants: the vehicle file's, by name.
+        origin: command, configuration and files beside the page; nothing of them unless given.
 
     Raises:
         OSError: the directory cannot be written to.
     """
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = []
+    numbers, shown, logged = Numbers(), [], logged_units(analysis)
     # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
-        saved = style.save(draw, folder / name)
-        if saved is not None:
-            # In the page itself, as base64: a report is one file, to be mailed or archived, and a
-            # browser opens it from anywhere.
-            picture_title, svg = saved
-            pictures.append(Picture(name, picture_title, base64.b64encode(svg).decode("ascii")))
-    page = render(analysis, title, vehicle_constants, pictures)
+        live = name.startswith(_LIVE)
+        made = picture(name, draw, numbers, folder=folder, logged=logged.get(name), live=live)
+        if made is not None:
+            shown.append(made._replace(alt=alt_text(made, analysis)))
+    page = render(analysis, title, vehicle_constants, shown, numbers, origin)
     (directory / "report.html").write_text(page, encoding="utf-8")
-    return [picture.name for picture in pictures]
+    return [made.name for made in shown]
 
 
 def render(
@@ -93,6 +59,8 @@ def render(
     title: str,
     vehicle_constants: Mapping[str, Constant],
     pictures: list[Picture],
+    numbers: Numbers | None = None,
+    origin: Origin | None = None,
 ) -> str:
     """The page as text.
 
@@ -101,6 +69,8 @@ def render(
         title: of the page.
         vehicle_constants: the vehicle file's, by name.
         pictures: the figures that were drawn.
+        numbers: those that the page draws itself.
+        origin: as of `write_report`.
     """
     return filled(
         "report.html.j2",
@@ -108,9 +78,13 @@ def render(
         **_results(analysis),
         **_more_results(analysis),
         **_provenance(analysis, vehicle_constants),
+        origin=origin,
         unshown=max(0, len(analysis.fit.signals) - MOST_FLIGHTS),
-        pictures={group: [p for p in pictures if p.name.startswith(group)] for group in _GROUPS},
-        NOT_DETERMINED=tables.NOT_DETERMINED,
+        pictures={
+            group: [(p, caption(p)) for p in pictures if p.name.startswith(group)]
+            for group in GROUPS
+        },
+        numbers=(numbers or Numbers()).content(),
     )
 
 
@@ -132,7 +106,7 @@ def _results(analysis: Analysis) -> dict[str, Any]:
         "prior_note": tables.prior_note(problem, fit),
         "nuisances": tables.nuisances(fit),
         "combinations": tables.combinations(fit),
-        "agreement": tables.agreement(fit, baseline),
+        "agreement": tables.agreement(fit, baseline, logged_outputs(analysis)),
         "fitted_to": tables.responses(fit),
         "acceptance": tables.acceptance(lines),
         "summary": card.summary(lines),
