@@ -118,17 +118,11 @@ def browser(profile: Path) -> Iterator[Browser]:
     theirs_in, ours_out = os.pipe()
     ours_in, theirs_out = os.pipe()
 
-    # The protocol is spoken over the descriptors 3 and 4.
-    def pipes() -> None:
-        spare = (os.dup(theirs_in), os.dup(theirs_out))
-        os.dup2(spare[0], 3)
-        os.dup2(spare[1], 4)
-
+    # The protocol is spoken over the descriptors 3 and 4, where the shell puts the pipes.
     command = [CHROMIUM, *_OPTIONS.split(), f"--user-data-dir={profile}"]
     process = subprocess.Popen(
-        command,
-        preexec_fn=pipes,
-        close_fds=False,
+        ["sh", "-c", f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}', *command],
+        pass_fds=(theirs_in, theirs_out),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

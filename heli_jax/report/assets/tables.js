@@ -72,8 +72,10 @@
 
   let closed = [];
   addEventListener("beforeprint", () => {
-    closed = [...document.querySelectorAll("details:not([open])")];
-    for (const d of closed) d.open = true;
+    for (const d of document.querySelectorAll("details:not([open])")) {
+      d.open = true;
+      closed.push(d);
+    }
   });
   addEventListener("afterprint", () => {
     for (const d of closed) d.open = false;
