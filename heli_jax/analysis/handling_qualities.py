@@ -21,7 +21,6 @@ rotorcraft handling qualities characteristics, of whom the least-squares line is
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.optimize
 
 from heli_jax.analysis.response_curves import Curve, Point
 
@@ -170,7 +169,10 @@ class _Response:
         if ends[0] * ends[1] > 0:  # rounding, where a point of the grid lies on the level
             x = low if abs(ends[0]) < abs(ends[1]) else high
         else:
-            x = scipy.optimize.root_scalar(off, bracket=(low, high), xtol=1e-13).root
+            # Here: a third of a second to load.
+            from scipy.optimize import root_scalar
+
+            x = root_scalar(off, bracket=(low, high), xtol=1e-13).root
         return float(np.exp(x))
 
     def place(self, omega: float, quantity: str, by_level: np.ndarray | float = 0.0) -> _Place:

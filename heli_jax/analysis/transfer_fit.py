@@ -11,7 +11,6 @@ the weights and the covariance; Tischler and Remple (2012), chapter 11, for the 
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Complex, Float
 
 _ROUNDS = 12
@@ -255,6 +254,9 @@ def _cost(scaled: _Scaled, x: np.ndarray, zeros: int) -> float:
 
 # Any: SciPy's OptimizeResult has no types.
 def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
+    # Here: a third of a second to load, for what few commands come to.
+    from scipy.optimize import least_squares
+
     kept = x.size if delay else x.size - 1
 
     def whole(part: np.ndarray) -> np.ndarray:
@@ -268,7 +270,7 @@ def _search(scaled: _Scaled, x: np.ndarray, zeros: int, delay: bool):
         return _rows(scaled.weight[:, None] * derivatives)[:, :kept]
 
     with np.errstate(all="ignore"):
-        return scipy.optimize.least_squares(
+        return least_squares(
             residuals,
             x[:kept],
             jacobian,  # pyright: ignore[reportArgumentType]

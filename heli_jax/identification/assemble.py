@@ -9,7 +9,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
-from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.agreement import (
     correlated_residuals,
@@ -19,24 +18,18 @@ from heli_jax.identification.agreement import (
     whiteness_of,
 )
 from heli_jax.identification.estimation.arrival import unless_stuck
-from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
-from heli_jax.identification.identifiability.disturbances import of_disturbances
+from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
-    bound_notes,
-    delay_notes,
     estimates_of,
-    extreme_noise_notes,
     flight_nuisances,
-    prior_notes,
-    stated_noise_notes,
 )
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
@@ -58,7 +51,6 @@ from heli_jax.identification.validation.feedback import (
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
-from heli_jax.identification.validation.other_hold import other_hold
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
 
@@ -113,26 +105,13 @@ def _held_out(problem: Problem, search: Search, optimum: RelaxedOptimum) -> _Hel
     return _HeldOut(signals_of(checked.e, flights), free_run, checked.notes)
 
 
-class _Numbers(NamedTuple):
-    """All that was estimated."""
-
-    of_interest: dict[str, Estimate]
-    """free parameters, gains of the inputs, time shift"""
-    nuisance: dict[str, Estimate]
-    """all but the free parameters"""
-    noise: dict[str, float]
-    """standard deviations as 'flight/output'"""
-    ill: bool
-    """whether the numbers are rounding"""
-
-
 def _numbers(
     problem: Problem,
     at: Solution,
     e: Evaluation,
     errors: StandardErrors,
     absent: tuple[str, ...],
-) -> _Numbers:
+) -> Numbers:
     """The estimates; `absent`: the parameters of disturbances that do not show."""
     layout = at.layout
     verdict, wider, quantiles, _ = errors
@@ -142,7 +121,7 @@ def _numbers(
     nuisance |= {n: _absent(nuisance[n], gone=n in layout.sigmas) for n in absent}
     sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
-    return _Numbers(of_interest, nuisance, sds, ill)
+    return Numbers(of_interest, nuisance, sds, ill)
 
 
 def assemble(
@@ -159,7 +138,7 @@ def assemble(
     e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
     optimum = unless_stuck(search.layout, optimum, e)
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
-    signals, absent = signals_of(e, problem.training), _absent_names(layout, optimum)
+    signals, absent = signals_of(e, problem.training), absent_names(layout, optimum)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
     # Outputs whose residuals go together count one piece of news twice, as autocorrelation does.
     all_white = not correlated and all(w.white for w in white.values())
@@ -180,7 +159,7 @@ def assemble(
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     in_time = (problem, params, signals, white, against, layout.determined)
     adequacy = by_responses(responses) or _adequacy(*in_time)
-    notes = _notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
+    notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(
@@ -240,7 +219,7 @@ def _against_expected(
 
 
 def _feedback(
-    problem: Problem, white: dict[str, Whiteness], arrived: _Numbers | None
+    problem: Problem, white: dict[str, Whiteness], arrived: Numbers | None
 ) -> tuple[tuple[Feedback, ...], tuple[str, ...]]:
     """Whether inputs follow the outputs, and what is to be said of it."""
     # Whether feedback does harm depends on the residuals: with white innovations the direct method
@@ -268,22 +247,12 @@ def _missing(
     )
 
 
-def _no_disturbance(optimum: RelaxedOptimum) -> bool:
-    """Whether a disturbance was looked for and does not show."""
-    return optimum.ratio is not None and optimum.ratio < NO_DISTURBANCE
-
-
 def _params(problem: Problem, estimates: dict[str, Estimate]) -> Any:
     """The vehicle with the estimates in place."""
     # Parameters alone: offsets, gains and shifts belong to the log, and a model that flies by
     # itself has none of them.
     values = {k: jnp.asarray(v.value, jnp.result_type(float)) for k, v in estimates.items()}
     return naming.replace(problem.vehicle, **values)
-
-
-def _absent_names(layout: Layout, optimum: RelaxedOptimum) -> tuple[str, ...]:
-    """The parameters of all disturbances that do not show."""
-    return layout.disturbance if _no_disturbance(optimum) else optimum.absent
 
 
 def _unknowns(layout: Layout, absent: int) -> int:
@@ -294,41 +263,7 @@ def _unknowns(layout: Layout, absent: int) -> int:
     return estimated - absent
 
 
-def _notes(
-    problem: Problem,
-    search: Search,
-    optimum: RelaxedOptimum,
-    e: Evaluation,
-    numbers: _Numbers,
-    correlated: dict[str, float],
-) -> list[str]:
-    """Of the optimum, of what the method takes for granted, and of the numbers.
-
-    Args:
-        e: at the optimum.
-        correlated: by pair of outputs the correlations that the intervals allow for.
-    """
-    layout, data, best = search.layout, search.data, optimum.best
-    none, absent = _no_disturbance(optimum), _absent_names(layout, optimum)
-    # An optimiser that has not arrived comes first: it makes all else doubtful.
-    return [
-        *_stopped_notes(layout, best, optimum),
-        *_disturbance_notes(optimum.ratio if none else None),
-        *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
-        *_absent_notes(layout, optimum.absent),
-        *of_disturbances(layout, e, absent),
-        *optimum.notes,
-        *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
-        *stated_noise_notes(problem, numbers.noise),
-        *_correlation_notes(correlated),
-        *bound_notes(numbers.of_interest),
-        *delay_notes(problem, numbers.of_interest),
-        *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
-        *_hold_notes(problem, search, optimum, e, numbers.of_interest),
-    ]
-
-
-def _status(best: Optimum, e: Evaluation, numbers: _Numbers, verdict: Verdict) -> Status:
+def _status(best: Optimum, e: Evaluation, numbers: Numbers, verdict: Verdict) -> Status:
     # A point whose numbers are rounding is no optimum, however small the last step to it was.
     usable = bool(np.all(np.isfinite(e.J))) and not numbers.ill
     if not bool(best.converged) or not usable:
@@ -341,29 +276,6 @@ def _absent(estimate: Estimate, *, gone: bool) -> Estimate:
     # Its size is then zero, at its bound; its correlation time means nothing.
     value = 0.0 if gone else estimate.value
     return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
-
-
-def _hold_notes(
-    problem: Problem,
-    search: Search,
-    optimum: RelaxedOptimum,
-    e: Evaluation,
-    estimates: dict[str, Estimate],
-) -> list[str]:
-    """Where the log let inputs be taken as linear between samples, and it matters."""
-    # Elsewhere a step of Gauss and Newton tells how far the optimum is, not what the hold does.
-    if not bool(optimum.best.converged):
-        return []
-    sd = {n: estimate.sd for n, estimate in estimates.items() if estimate.sd is not None}
-    at = Solution(search.layout, search.data, optimum.noise, optimum.best.z)
-    return other_hold(problem, at, e, sd, in_doubt=True)
-
-
-def _correlation_notes(correlated: dict[str, float]) -> list[str]:
-    if not correlated:
-        return []
-    words = "; ".join(f"{names}: {rho:+.2f}" for names, rho in correlated.items())
-    return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
 
 
 def _adequacy(
@@ -380,41 +292,3 @@ def _adequacy(
     )
     evidence = Evidence(records, pooled_metrics(signals), white, against, unknowns)
     return assess(problem, params, evidence)
-
-
-def _disturbance_notes(ratio: float | None) -> list[str]:
-    if ratio is None:
-        return []
-    return [
-        "No disturbance shows in the record (twice the log-likelihood gained by one is "
-        f"{ratio:.2g}): output error suffices, and these are its numbers."
-    ]
-
-
-def _absent_notes(layout: Layout, absent: tuple[str, ...]) -> list[str]:
-    """Which of several disturbances do not show."""
-    names = [d.name for d in disturbances_of(layout.model) if d.sigma in absent]
-    if not names:
-        return []
-    return [
-        f"No disturbance shows on {', '.join(names)} (twice the log-likelihood gained by each is "
-        f"below {NO_DISTURBANCE:g}): the fit goes without."
-    ]
-
-
-def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> list[str]:
-    """What to do where the optimiser has not arrived."""
-    if bool(best.converged):
-        return []
-    steps = sum(s for s, _ in optimum.trace)
-    windows = sum(count for count, _ in layout.windows)
-    remedy = "start nearer, with bounds or several starts, or allow more steps"
-    if windows > len(layout.windows) and layout.continuity is None:
-        remedy = (
-            "tie the windows together (continuity), since a state that no output shows is free in "
-            f"each of them; or {remedy}"
-        )
-    return [
-        f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
-        f"Remedy: {remedy}."
-    ]

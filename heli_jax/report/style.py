@@ -18,6 +18,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import ArrayLike
 
+from heli_jax.report.unit_symbols import pretty
+
 # Okabe and Ito's palette: told apart with every common kind of colour blindness, and in grey.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
@@ -176,13 +178,6 @@ def samples(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
         line_style = {**line_style, "lw": 0.0, "ls": "none", "marker": "o", "ms": 2.2}
         x, y = x[seen], y[seen]
     line(ax, x, y, **line_style)
-
-
-def pretty(unit: str | None) -> str:
-    """A unit as it is printed: kg m², 1/s²; `–` for a plain number."""
-    if unit is None or unit in ("", "1"):
-        return "–"
-    return unit.replace("^2", "²").replace("^3", "³").replace("^4", "⁴").replace("*", " ")
 
 
 def label(name: str, unit: str | None) -> str:

@@ -6,8 +6,9 @@ from jaxtyping import Array, Float
 
 from heli_jax.dynamics.disturbance import disturbances_of
 from heli_jax.dynamics.model import Disturbance
-from heli_jax.identification.estimation.estimator import Evaluation, measured_count
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.multistart import Search, gauss_newton_gain
 from heli_jax.identification.estimation.noise_covariance import (
     RelaxedOptimum,

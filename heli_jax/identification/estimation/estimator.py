@@ -18,6 +18,11 @@ from jaxtyping import Array, Float
 from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
+from heli_jax.identification.estimation.measured_signals import (
+    measured_count,
+    signal_numbers,
+    signals,
+)
 from heli_jax.identification.estimation.simulated_flights import Run
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
@@ -382,40 +387,3 @@ class Estimator(abc.ABC):
             ill: whether it is ill-conditioned.
         """
         return []
-
-
-def signals(layout: Layout) -> list[tuple[int, str]]:
-    """What is measured, as (flight, output), in the order of the rows."""
-    return [(i, n) for i, names in enumerate(layout.outputs) for n in names]
-
-
-def signal_numbers(layout: Layout, data: Data) -> np.ndarray:
-    """Of every measured number its signal."""
-    # From shapes alone: a constant to whatever is traced.
-    sizes = [data.flights[i].outputs[n].shape[0] for i, n in signals(layout)]
-    return np.repeat(np.arange(len(sizes)), sizes)
-
-
-def measured_signals(layout: Layout, data: Data, noise: Noise) -> tuple[Array, Array]:
-    """All that is measured, and its sd, each (n,).
-
-    Args:
-        layout: what the unknowns are.
-        data: the numbers of the problem.
-        noise: of the measurements, by flight and output.
-    """
-    # Joined, since XLA makes a kernel of every signal that is treated by itself.
-    at = signals(layout)
-    sd = jnp.stack([noise.sd[i][n] for i, n in at])
-    y = jnp.concatenate([data.flights[i].outputs[n] for i, n in at])
-    return y, sd[signal_numbers(layout, data)]
-
-
-def measured_count(data: Data) -> int:
-    """How many measured numbers there are."""
-    # In NumPy, outside of what is compiled: the optimiser's program does not depend on it.
-    return sum(
-        int(np.isfinite(np.asarray(y)).sum())
-        for flight in data.flights
-        for y in flight.outputs.values()
-    )

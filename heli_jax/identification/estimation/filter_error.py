@@ -16,16 +16,14 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
 from heli_jax.dynamics.model import correlation_of, initial_sd_of
-from heli_jax.identification.estimation.estimator import (
-    Estimator,
-    Evaluation,
-    Residuals,
+from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
+from heli_jax.identification.estimation.measured_signals import (
     measured_count,
     measured_signals,
     signals,
 )
-from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
 from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import Drive, driven
 from heli_jax.identification.problem import Problem

@@ -35,9 +35,10 @@ from heli_jax.analysis.response_agreement import (
 from heli_jax.analysis.response_errors import noise_density, response_of
 from heli_jax.analysis.windowed import window_transforms
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals, signals
+from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linear_machine import Machine, machine_of
+from heli_jax.identification.estimation.measured_signals import signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,

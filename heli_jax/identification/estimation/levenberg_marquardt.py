@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.estimator import measured_count
+from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.optimiser_step import (
     BATCHED,
     SINGLE,

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.identification.estimation.estimator import Evaluation, signal_numbers, signals
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.measured_signals import signal_numbers, signals
 from heli_jax.identification.identifiability.expected import (
     Sensitivity,
     expected_sd,

@@ -17,8 +17,9 @@ from jaxtyping import Float
 
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.estimator import Evaluation, signal_numbers
+from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.measured_signals import signal_numbers
 from heli_jax.identification.identifiability.expected import (
     Sensitivity,
     expected_sd,

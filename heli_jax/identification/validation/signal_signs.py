@@ -7,7 +7,6 @@ as much. And with start values of the right signs the simulated outputs move wit
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.integrate
 from jaxtyping import Float
 
 from heli_jax.dynamics.model import axes_of
@@ -103,7 +102,8 @@ def angle_over_rate(
         return None
     # Headings jump by a turn where they pass south.
     turned = np.unwrap(filled[0])
-    integral = scipy.integrate.cumulative_trapezoid(filled[1], dx=dt, initial=0.0)
+    halves = 0.5 * dt * (filled[1][1:] + filled[1][:-1])
+    integral = np.concatenate([np.zeros(1), np.cumsum(halves)])
     # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
     # is not divided by a sample time.
     changes = [v[steps:] - v[:-steps] for v in (turned, integral)]

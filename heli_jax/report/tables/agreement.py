@@ -12,8 +12,8 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.metrics import Metrics, Whiteness, diverges
 from heli_jax.numbers import NOTHING, number, percent
 from heli_jax.report.card import Gate, shown
-from heli_jax.report.style import pretty
 from heli_jax.report.tables.table import Table
+from heli_jax.report.unit_symbols import pretty
 
 
 def agreement(

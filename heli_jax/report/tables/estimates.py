@@ -8,8 +8,8 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.numbers import NOTHING, measured, number, percent, relative
-from heli_jax.report.style import pretty
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
+from heli_jax.report.unit_symbols import pretty
 
 _SHARE = 0.005
 """of the posterior precision: less is 0 % in the table, or 0.00"""

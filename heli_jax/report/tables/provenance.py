@@ -9,8 +9,8 @@ from heli_jax.flights.origins import in_words
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.numbers import number
-from heli_jax.report.style import pretty
 from heli_jax.report.tables.table import Table
+from heli_jax.report.unit_symbols import pretty
 from heli_jax.vehicle import Constant
 
 

@@ -1,0 +1,153 @@
+"""What a fit says in sentences: of its optimum, of what its method assumes, of its numbers."""
+
+from typing import NamedTuple
+
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.identification.estimation.disturbance_search import NO_DISTURBANCE
+from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum
+from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.identifiability.disturbances import of_disturbances
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.result import Estimate
+from heli_jax.identification.uncertainty.estimates import (
+    bound_notes,
+    delay_notes,
+    extreme_noise_notes,
+    prior_notes,
+    stated_noise_notes,
+)
+from heli_jax.identification.unknowns.layout import Layout, Solution
+from heli_jax.identification.validation.other_hold import other_hold
+
+
+class Numbers(NamedTuple):
+    """All that was estimated."""
+
+    of_interest: dict[str, Estimate]
+    """free parameters, gains of the inputs, time shift"""
+    nuisance: dict[str, Estimate]
+    """all but the free parameters"""
+    noise: dict[str, float]
+    """standard deviations as 'flight/output'"""
+    ill: bool
+    """whether the numbers are rounding"""
+
+
+def no_disturbance(optimum: RelaxedOptimum) -> bool:
+    """Whether a disturbance was looked for and does not show.
+
+    Args:
+        optimum: where the optimiser ended.
+    """
+    return optimum.ratio is not None and optimum.ratio < NO_DISTURBANCE
+
+
+def absent_names(layout: Layout, optimum: RelaxedOptimum) -> tuple[str, ...]:
+    """The parameters of all disturbances that do not show.
+
+    Args:
+        layout: what the unknowns are.
+        optimum: where the optimiser ended.
+    """
+    return layout.disturbance if no_disturbance(optimum) else optimum.absent
+
+
+def fit_notes(
+    problem: Problem,
+    search: Search,
+    optimum: RelaxedOptimum,
+    e: Evaluation,
+    numbers: Numbers,
+    correlated: dict[str, float],
+) -> list[str]:
+    """Of the optimum, of what the method takes for granted, and of the numbers.
+
+    Args:
+        problem: what was fitted.
+        search: with its layout and data.
+        optimum: where the optimiser ended, with the measurement noise there.
+        e: at the optimum.
+        numbers: all that was estimated.
+        correlated: by pair of outputs the correlations that the intervals allow for.
+    """
+    layout, data, best = search.layout, search.data, optimum.best
+    none, absent = no_disturbance(optimum), absent_names(layout, optimum)
+    # An optimiser that has not arrived comes first: it makes all else doubtful.
+    return [
+        *_stopped_notes(layout, best, optimum),
+        *_disturbance_notes(optimum.ratio if none else None),
+        *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
+        *_absent_notes(layout, optimum.absent),
+        *of_disturbances(layout, e, absent),
+        *optimum.notes,
+        *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
+        *stated_noise_notes(problem, numbers.noise),
+        *_correlation_notes(correlated),
+        *bound_notes(numbers.of_interest),
+        *delay_notes(problem, numbers.of_interest),
+        *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
+        *_hold_notes(problem, search, optimum, e, numbers.of_interest),
+    ]
+
+
+def _hold_notes(
+    problem: Problem,
+    search: Search,
+    optimum: RelaxedOptimum,
+    e: Evaluation,
+    estimates: dict[str, Estimate],
+) -> list[str]:
+    """Where the log let inputs be taken as linear between samples, and it matters."""
+    # Elsewhere a step of Gauss and Newton tells how far the optimum is, not what the hold does.
+    if not bool(optimum.best.converged):
+        return []
+    sd = {n: estimate.sd for n, estimate in estimates.items() if estimate.sd is not None}
+    at = Solution(search.layout, search.data, optimum.noise, optimum.best.z)
+    return other_hold(problem, at, e, sd, in_doubt=True)
+
+
+def _correlation_notes(correlated: dict[str, float]) -> list[str]:
+    if not correlated:
+        return []
+    words = "; ".join(f"{names}: {rho:+.2f}" for names, rho in correlated.items())
+    return [f"Residuals of outputs are correlated ({words}): the intervals allow for it."]
+
+
+def _disturbance_notes(ratio: float | None) -> list[str]:
+    if ratio is None:
+        return []
+    return [
+        "No disturbance shows in the record (twice the log-likelihood gained by one is "
+        f"{ratio:.2g}): output error suffices, and these are its numbers."
+    ]
+
+
+def _absent_notes(layout: Layout, absent: tuple[str, ...]) -> list[str]:
+    """Which of several disturbances do not show."""
+    names = [d.name for d in disturbances_of(layout.model) if d.sigma in absent]
+    if not names:
+        return []
+    return [
+        f"No disturbance shows on {', '.join(names)} (twice the log-likelihood gained by each is "
+        f"below {NO_DISTURBANCE:g}): the fit goes without."
+    ]
+
+
+def _stopped_notes(layout: Layout, best: Optimum, optimum: RelaxedOptimum) -> list[str]:
+    """What to do where the optimiser has not arrived."""
+    if bool(best.converged):
+        return []
+    steps = sum(s for s, _ in optimum.trace)
+    windows = sum(count for count, _ in layout.windows)
+    remedy = "start nearer, with bounds or several starts, or allow more steps"
+    if windows > len(layout.windows) and layout.continuity is None:
+        remedy = (
+            "tie the windows together (continuity), since a state that no output shows is free in "
+            f"each of them; or {remedy}"
+        )
+    return [
+        f"The optimiser stopped after {steps} steps without arriving: these numbers are no result. "
+        f"Remedy: {remedy}."
+    ]
