@@ -13,6 +13,7 @@ from heli_jax.report import style
 from heli_jax.report.compared_runs import ComparedRuns
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.panels import panels
+from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, picture
 
@@ -39,6 +40,7 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
         notes=compared.notes,
         pictures=pictures,
         numbers=numbers.content(),
+        origin=origin(),
     )
     path.write_text(page, encoding="utf-8")
 

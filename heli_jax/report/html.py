@@ -10,12 +10,18 @@ from heli_jax.report.drawings import MOST_FLIGHTS, Analysis, drawings, logged_ou
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.origin import Origin
 from heli_jax.report.page import filled
-from heli_jax.report.pictures import Picture, picture
+from heli_jax.report.pictures import Kind, Picture, picture
 from heli_jax.vehicle import Constant
 from heli_jax.versions import versions
 
 _LIVE = ("response", "bode", "match", "rls")
 """figures that the page draws itself, to be zoomed: those over time and over frequency"""
+
+
+def _kind(name: str) -> Kind:
+    if name.startswith(_LIVE):
+        return "live"
+    return "panels" if name.startswith("residual") else "image"
 
 
 def write_report(
@@ -45,8 +51,9 @@ def write_report(
     numbers, shown, logged = Numbers(), [], logged_units(analysis)
     # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
-        live = name.startswith(_LIVE)
-        made = picture(name, draw, numbers, folder=folder, logged=logged.get(name), live=live)
+        made = picture(
+            name, draw, numbers, folder=folder, logged=logged.get(name), kind=_kind(name)
+        )
         if made is not None:
             shown.append(made._replace(alt=alt_text(made, analysis)))
     page = render(analysis, title, vehicle_constants, shown, numbers, origin)

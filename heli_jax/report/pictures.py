@@ -5,7 +5,7 @@ import base64
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -21,6 +21,7 @@ _HEAVY = 45_000
 _COLOURS = 16
 """of that PNG"""
 type Draw = Callable[[], Figure | None]
+type Kind = Literal["live", "panels", "image"]
 
 
 class Picture(NamedTuple):
@@ -45,7 +46,7 @@ def picture(
     *,
     folder: Path | None = None,
     logged: Mapping[str, tuple[str, float]] | None = None,
-    live: bool = True,
+    kind: Kind = "live",
 ) -> Picture | None:
     """Draw a figure for a page.
 
@@ -55,7 +56,8 @@ def picture(
         numbers: the page's, to which it is added.
         folder: for NAME.svg and NAME.png; no files unless given.
         logged: by signal the unit of its log, and what SI is times to be in it.
-        live: whether the page draws it anew, to be zoomed; only figures over one x axis can be.
+        kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
+            `panels` words are made alone; of an `image` the title is all.
 
     Returns:
         None where there is nothing to draw.
@@ -64,7 +66,7 @@ def picture(
         drawn = draw()
         if drawn is None:
             return None
-        chart = chart_of(drawn) if live else None
+        chart = None if kind == "image" else chart_of(drawn)
         title = drawn.axes[0].get_title("left")
         # Saving thins the lines: the chart has been taken from them before.
         svg = style.as_svg(drawn) if folder is None else style.saved(drawn, folder / name)
@@ -80,7 +82,7 @@ def picture(
         image,
         (width, height),
         title if chart is None else described(chart),
-        None if chart is None else numbers.add_chart(chart, dict(logged or {})),
+        None if chart is None or kind != "live" else numbers.add_chart(chart, dict(logged or {})),
     )
 
 

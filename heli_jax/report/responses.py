@@ -18,6 +18,7 @@ from heli_jax.report.coherence import COHERENT
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.responses import draw_response
 from heli_jax.report.handling_json import handling_json
+from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import picture
 from heli_jax.report.tables.handling import handling as handling_table
@@ -66,6 +67,7 @@ def write_responses(
         title=title,
         pictures=[p for p in pictures if p is not None],
         numbers=numbers.content(),
+        origin=origin(),
         notes=found.notes,
         fits=Table(
             ("input", "output", "averages", *FIT_HEAD),

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,17 @@ _OPTIONS = (
     "--disable-background-networking --disable-component-update --disable-sync --hide-scrollbars "
     "--remote-debugging-pipe"
 )
+
+# The protocol is spoken over the descriptors 3 and 4. A process of its own puts the pipes there,
+# since a fork of this one, which holds JAX's threads, is warned of.
+_PIPES = """
+import os, sys
+spare = [os.dup(int(fd)) for fd in sys.argv[1:3]]
+high = [os.dup(fd) for fd in spare]
+os.dup2(high[0], 3)
+os.dup2(high[1], 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 
 
 class Browser:
@@ -118,10 +130,9 @@ def browser(profile: Path) -> Iterator[Browser]:
     theirs_in, ours_out = os.pipe()
     ours_in, theirs_out = os.pipe()
 
-    # The protocol is spoken over the descriptors 3 and 4, where the shell puts the pipes.
     command = [CHROMIUM, *_OPTIONS.split(), f"--user-data-dir={profile}"]
     process = subprocess.Popen(
-        ["sh", "-c", f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}', *command],
+        [sys.executable, "-c", _PIPES, str(theirs_in), str(theirs_out), *command],
         pass_fds=(theirs_in, theirs_out),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

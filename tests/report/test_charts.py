@@ -111,7 +111,7 @@ def test_alt_texts_and_tables_say_numbers_in_both_units(sound):
         "correlation",
         lambda: figures.correlation_matrix(fit.verdict)[0].figure,
         numbers,
-        live=False,
+        kind="image",
     )
     i, j = fit.verdict.correlation[0, 1], fit.verdict.names
     assert f"{j[0]} and {j[1]} {i:.3g}".replace("-", "−") in alt_text(made, analysis)

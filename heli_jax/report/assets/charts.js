@@ -156,7 +156,7 @@
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
       scales: { x: { time: false, distr: chart.log ? 3 : 1, range: (u, low, high) => low === x0 && high === x1 ? chart.xLimits : [low, high] }, y: { range } },
       axes: [{ ...axis, size: last ? 30 : 6, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
-        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: 62, space: 24 }],
+        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: 62, space: 16 }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {

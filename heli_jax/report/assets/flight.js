@@ -218,22 +218,31 @@
       ctx.font = "11px system-ui, sans-serif";
       ctx.textAlign = "center";
       ctx.textBaseline = "middle";
+      const taken = [];
+      // Words that would lie over others are left out: titles come first, then numbers.
+      const put = (text, x, y) => {
+        const half = ctx.measureText(text).width / 2 + 3, right = ctx.textAlign === "right" ? half : 0;
+        const here = { x: x - right, y, half };
+        if (taken.some(o => Math.abs(o.x - here.x) < o.half + half && Math.abs(o.y - y) < 12)) return;
+        taken.push(here);
+        ctx.fillText(text, x, y);
+      };
       const write = (text, p, away) => {
         const [x, y] = this.project(p), [mx, my] = this.project([this.middle[0], this.middle[1], p[2]]);
         const size = Math.hypot(x - mx, y - my) || 1;
-        ctx.fillText(text, x + away * (x - mx) / size, y + away * Math.max(0.3, (y - my) / size));
+        put(text, x + away * (x - mx) / size, y + away * Math.max(0.3, (y - my) / size));
       };
       const text = v => String(+v.toPrecision(6)).replace("-", "−");
-      for (const v of ticks[0]) write(text(v), [v, near[1], low[2]], 13);
-      for (const v of ticks[1]) write(text(-v || 0), [near[0], v, low[2]], 13);
-      const [middle] = [this.middle];
+      const middle = this.middle;
       write("forward [m]", [middle[0], near[1], low[2]], 34);
       write("right [m]", [near[0], middle[1], low[2]], 34);
+      for (const v of ticks[0]) write(text(v), [v, near[1], low[2]], 13);
+      for (const v of ticks[1]) write(text(-v || 0), [near[0], v, low[2]], 13);
       // Height stands at the edge that is furthest to the left.
       const corners = [[far[0], near[1]], [near[0], far[1]]].map(c => [...c, low[2]]);
       const [edge] = corners.sort((a, b) => this.project(a)[0] - this.project(b)[0]);
       ctx.textAlign = "right";
-      for (const v of ticks[2]) { const [x, y] = this.project([edge[0], edge[1], v]); ctx.fillText(text(v), x - 6, y); }
+      for (const v of ticks[2]) { const [x, y] = this.project([edge[0], edge[1], v]); put(text(v), x - 6, y); }
       const [x, y] = this.project([edge[0], edge[1], high[2]]);
       ctx.textAlign = "left";
       ctx.fillText("height [m]", Math.max(2, x - 30), y - 12);
