@@ -26,7 +26,17 @@ def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
         config: the configuration in full, as YAML.
         files: beside the page, by their names relative to it.
     """
-    # The program by its name alone: where it is installed is nobody's business.
-    words = [Path(sys.argv[0]).name or "python", *sys.argv[1:]] if sys.argv else ["python"]
     now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-    return Origin(shlex.join(words), now, config, files)
+    return Origin(_command(sys.argv), now, config, files)
+
+
+def _command(words: list[str]) -> str:
+    """What was typed, as a shell would take it."""
+    # The program by its name alone: where it is installed is nobody's business.
+    program = Path(words[0] if words else "")
+    if program.name.startswith(("ipykernel", "colab_kernel")):
+        return "in a notebook"
+    if program.name in ("", "-", "-c"):
+        return "in a Python session"
+    name = "heli-jax" if program.parts[-2:] == ("heli_jax", "__main__.py") else program.name
+    return shlex.join([*(["python"] if name.endswith(".py") else []), name, *words[1:]])

@@ -7,7 +7,7 @@ import pytest
 
 from heli_jax import models
 from heli_jax.identification.result import Signals
-from heli_jax.report import figures, style
+from heli_jax.report import figures, origin, style
 from heli_jax.report.alt_text import described
 from heli_jax.report.captions import alt_text
 from heli_jax.report.charts import chart_of
@@ -119,3 +119,18 @@ def test_alt_texts_and_tables_say_numbers_in_both_units(sound):
     rmse = fit.metrics["roll"].rmse
     assert table.head[-1] == "RMSE as logged"
     assert table.rows[0][-1] == f"{np.degrees(rmse):.4g} deg"
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["/opt/bin/heli-jax", "fit", "a b.yaml"], "heli-jax fit 'a b.yaml'"),
+        (["/opt/x/heli_jax/__main__.py", "check"], "heli-jax check"),
+        (["work/fit.py", "1"], "python fit.py 1"),
+        (["/opt/ipykernel_launcher.py", "-f", "/home/me/k.json"], "in a notebook"),
+        ([""], "in a Python session"),
+    ],
+)
+def test_the_command_is_named_without_its_place(monkeypatch, words, command):
+    monkeypatch.setattr(origin.sys, "argv", words)
+    assert origin.origin().command == command
