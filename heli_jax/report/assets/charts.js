@@ -29,11 +29,25 @@
     return decoded.get(i);
   }
 
+  // As the tables of the page have it: 1.7·10⁻⁴, with a true minus sign.
+  function powered(value, power, digits) {
+    const raised = [...String(power)].map(c => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]).join("");
+    const size = +(value / 10 ** power).toFixed(digits);
+    return size ? `${size}·10${raised}`.replace("-", "−") : "0";
+  }
+
+  // The numbers of an axis; all with one power of ten.
+  function ticks(splits) {
+    const size = Math.max(...splits.map(v => Math.abs(v ?? 0))), power = Math.floor(Math.log10(size || 1));
+    if (power < -3 || power > 5) return splits.map(v => v == null ? null : powered(v, power, 4));
+    return splits.map(v => v == null ? null : String(+v.toFixed(8)).replace("-", "−"));
+  }
+
   // As many digits as the range leaves sense to: five.
   function text(value, span) {
     if (value == null || !Number.isFinite(value)) return "–";
     const size = Math.max(span, 1e-12), power = Math.floor(Math.log10(size));
-    if (power < -4 || power > 5) return value.toPrecision(4).replace("-", "−");
+    if (power < -4 || power > 5) return powered(value, power, 3);
     return value.toFixed(Math.max(0, 4 - power)).replace("-", "−");
   }
 
@@ -144,7 +158,8 @@
       value: (u, v) => v == null ? "–" : `${text(v, u.scales.x.max - u.scales.x.min)} ${(/\[(.*)\]/.exec(chart.xLabel) ?? [])[1] ?? ""}` };
     // The limits of the figure while all is seen; zoomed, what is seen.
     const range = (u, low, high) => {
-      const whole = u.scales.x.min <= chart.xLimits[0] * (1 + 1e-9) && u.scales.x.max >= chart.xLimits[1] * (1 - 1e-9);
+      const [first, last] = chart.xLimits, hair = 1e-9 * (last - first);
+      const whole = u.scales.x.min <= first + hair && u.scales.x.max >= last - hair;
       if (whole || low == null) return panel.limits;
       const margin = 0.06 * (high - low) || 0.05 * Math.abs(high) || 1;
       return [low - margin, high + margin];
@@ -156,7 +171,7 @@
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
       scales: { x: { time: false, distr: chart.log ? 3 : 1, range: (u, low, high) => low === x0 && high === x1 ? chart.xLimits : [low, high] }, y: { range } },
       axes: [{ ...axis, size: last ? 30 : 6, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
-        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: 62, space: 16 }],
+        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: 62, space: 16, values: (u, splits) => ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {
@@ -173,12 +188,13 @@
   }
 
   const inGroup = chart => groups.get(chart.group);
+  const own = chart => inGroup(chart).find(u => u.chart === chart);
   const zoom = (chart, low, high) => inGroup(chart).forEach(u => u.setScale("x", { min: low, max: high }));
   const reset = chart => inGroup(chart).forEach(u => u.setScale("x", { min: u.chart.xLimits[0], max: u.chart.xLimits[1] }));
 
   // Of a logarithmic axis in powers: half of it is half of its decades.
   function closer(chart, factor, about) {
-    const u = inGroup(chart).find(u => u.chart === chart), { min, max } = u.scales.x;
+    const { min, max } = own(chart).scales.x;
     const to = chart.log ? Math.log : v => v, back = chart.log ? Math.exp : v => v;
     const a = to(min), b = to(max), [first, last] = chart.xLimits.map(to), m = about == null ? (a + b) / 2 : to(about);
     const low = Math.max(first, m - (m - a) * factor), high = Math.min(last, m + (b - m) * factor);
@@ -186,7 +202,7 @@
   }
 
   function pan(chart, part) {
-    const u = inGroup(chart).find(u => u.chart === chart), { min, max } = u.scales.x;
+    const { min, max } = own(chart).scales.x;
     const to = chart.log ? Math.log : v => v, back = chart.log ? Math.exp : v => v;
     const [a, b, first, last] = [min, max, ...chart.xLimits].map(to);
     const by = Math.max(first - a, Math.min(last - b, part * (b - a)));
@@ -205,7 +221,7 @@
   function keys(chart, box, spoken) {
     let at = null;
     box.addEventListener("keydown", event => {
-      const u = inGroup(chart).find(u => u.chart === chart), { min, max } = u.scales.x;
+      const u = own(chart), { min, max } = u.scales.x;
       if (event.ctrlKey || event.metaKey || event.altKey || event.target !== box) return;
       const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
       if (step && event.shiftKey) pan(chart, 0.2 * step);
@@ -245,6 +261,8 @@
 
   function build(figure) {
     const chart = numbers.charts[+figure.dataset.chart];
+    // Of a figure without any line the image says as much.
+    if (!chart.panels.some(p => p.series.length)) return;
     // Figures over the same quantity move together.
     chart.group = chart.xLabel || "x";
     const box = document.createElement("div");
