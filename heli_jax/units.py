@@ -81,7 +81,8 @@ _EXAMPLES = (
 @functools.cache
 def _parse(unit: str) -> Any:
     registry = _registry()
-    text = unit.strip().replace("·", "*")
+    # The Greek letter looks like the micro sign.
+    text = unit.strip().replace("·", "*").replace("μ", "µ")
     if text in ("", "1", "-", "dimensionless"):
         return registry.Quantity(1.0)
     try:

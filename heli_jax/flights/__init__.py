@@ -2,7 +2,12 @@
 
 from heli_jax.flights.describe import ColumnInfo, Gap, LogInfo, TimeInfo, describe_log
 from heli_jax.flights.flight import Flight, Signal, Source
-from heli_jax.flights.read import read_flight, read_parts, require_moving_inputs
+from heli_jax.flights.read import (
+    read_flight,
+    read_parts,
+    require_moving_inputs,
+    require_moving_outputs,
+)
 from heli_jax.flights.request import Also, ReadOptions
 
 __all__ = [
@@ -19,4 +24,5 @@ __all__ = [
     "read_flight",
     "read_parts",
     "require_moving_inputs",
+    "require_moving_outputs",
 ]

@@ -20,6 +20,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
+from heli_jax.flights.time_units import time_unit
 from heli_jax.regular_file import read_regular
 
 _LARGEST = 10**9
@@ -100,10 +101,7 @@ class ArrayTable:
         """The unit that the file states, where it is one of time."""
         # The CF conventions write a clock's unit as 'seconds since 1970-01-01', of which the epoch
         # does not matter: times count from the first sample.
-        unit = self.units.get(name, "").split(" since ")[0].strip()
-        words = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
-        unit = words.get(unit, unit)
-        return unit if unit in words.values() else None
+        return time_unit(self.units.get(name, "").split(" since ")[0])
 
 
 def open_mat(path: Path) -> ArrayTable:

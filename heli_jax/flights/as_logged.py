@@ -6,36 +6,27 @@ no value, and the jump of an angle from 180 deg to -180 deg.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from heli_jax import units
 from heli_jax.flights.flight import Signal, Source
+from heli_jax.flights.marks import (
+    Counts,
+    at_marks,
+    counted,
+    mark_words,
+    suspect_notes,
+    without_marks,
+)
 from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.request import Request
 from heli_jax.flights.signal_facts import SignalFacts, facts_of_all
 from heli_jax.flights.slower import Timed
+from heli_jax.flights.strays import Strays, stray_words, strays
 from heli_jax.flights.table import column, shown, wrong
 
-_MARKS = (
-    *(sign * nines for nines in (999.0, 9999.0, 99999.0, 999999.0) for sign in (1.0, -1.0)),
-    *(sign * nines for nines in (999.9, 9999.9, 999.99) for sign in (1.0, -1.0)),
-    *(2.0**bits - 1 for bits in (15, 16, 31, 32)),
-    *(-(2.0**bits) for bits in (15, 31)),
-    *(655.35, 327.67, -327.68),
-)
-"""numbers that loggers write where they have none: nines, and the ends of integers"""
-_SORTED = np.sort(_MARKS)
-_SINGLE = 1e-6
-"""of a mark, by which its number may miss it: single precision, and units that are converted"""
-_ABSURD = 1e9
-"""in the log's own numbers: larger ones are no measurement, such as 1e10 and 3.4e38"""
-_APART = 1.0
-"""times the range of all other values, by which a mark lies outside of it"""
-_LEVELS = 4
-"""distinct values that a signal has beside its marks, at least"""
-_MOST = 0.2
-"""part of the samples that are marks, at most: what is there more often may be a value"""
 _JUMP = (0.75, 1.001)
 """of a turn: by how much a wrapped angle jumps from a sample to the next, at least and at most"""
 _STEP = 0.125
@@ -46,6 +37,7 @@ _NEARLY = 0.9
 """turns that an angle of no stated unit has to go over"""
 _TURN = 1.001
 """turns that a wrapped angle goes over, at most; its ends may be rounded"""
+_NONE: Mapping[Key, Mapping[str, Counts]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,44 +57,96 @@ class AsLogged:
         return replace(source, facts=facts)
 
 
-def as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
+def as_logged(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    of_sources: Mapping[Key, Mapping[str, Counts]] = _NONE,
+) -> AsLogged:
     """The signals without marks and turns, and what they were.
 
     Args:
         request: names them.
         signals: by key, in SI, each on its own clock.
+        of_sources: of derived ones by key, the marks that their sources had, by channel.
 
     Raises:
         InputError: an input has marks; it acts all the time, so that none of it may be missing.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # differences of huge values
-        return _as_logged(request, signals)
+        return _as_logged(request, signals, of_sources)
 
 
-def _as_logged(request: Request, signals: Mapping[Key, Timed]) -> AsLogged:
-    made, marks, notes = {}, {}, []
+def _as_logged(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    of_sources: Mapping[Key, Mapping[str, Counts]],
+) -> AsLogged:
+    made, marks, odd, notes = {}, {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = _in_log(signal, timed.values)
         at = at_marks(numbers)
-        marks[key] = counted(numbers, at)
+        marks[key] = _of_both(counted(numbers[at]), of_sources.get(key, {}))
         if at.any():
+            words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
                 first = float(timed.seconds[np.flatnonzero(at)[0]])
-                problem = f"has {mark_words(marks[key])}, first at {first:.6g} s"
+                problem = f"has {words}, first at {first:.6g} s"
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
-            notes.append(f"{name} has {mark_words(marks[key])}: taken as missing")
+            notes.append(f"{name} has {words}: taken as missing")
+        notes += source_notes(name, of_sources.get(key, {}))
         values = np.where(at, np.nan, timed.values)
         turn = _turn(signal)
         if turn is not None and is_wrapped(values, turn):
             values, note = unwrapped(values, turn)
             notes.append(f"{name} {note}")
+        # Behind the turns: a heading of about 180 deg may be -180 deg for a sample.
+        odd[key] = strays(timed.seconds, _in_log(signal, values), key[1])
+        notes += [f"{name} has {stray_words(found)}: kept as measured" for found in odd[key]]
         made[key] = Timed(timed.seconds, values)
+    return AsLogged(made, _facts(made, marks, odd), tuple(notes))
+
+
+def _facts(
+    made: Mapping[Key, Timed],
+    marks: Mapping[Key, Counts],
+    odd: Mapping[Key, tuple[Strays, ...]],
+) -> dict[Key, SignalFacts]:
     outputs = frozenset(key for key in made if key[1] == "output")
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
-    facts = {key: replace(f, marks=marks[key]) for key, f in facts.items()}
-    return AsLogged(made, facts, tuple(notes))
+    return {key: replace(f, marks=marks[key], strays=odd[key]) for key, f in facts.items()}
+
+
+def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
+    """Notes on the marks in the channels that a derived one is computed from.
+
+    Args:
+        name: of the derived one, as it is shown.
+        marks: by channel.
+    """
+    # The four parts of a quaternion are lost together: one note says it of all.
+    alike: dict[Counts, list[str]] = {}
+    for source, counts in marks.items():
+        alike.setdefault(counts, []).append(shown(source))
+    return [
+        f"{name}: {', '.join(sources)} {'has' if len(sources) == 1 else 'each have'} "
+        f"{mark_words(counts)}: taken as missing"
+        for counts, sources in alike.items()
+    ]
+
+
+def _of_both(own: Counts, sources: Mapping[str, Counts]) -> Counts:
+    """A signal's own marks and those of its sources, each as often as where it is most often."""
+    most = dict(own)
+    for value, count in (pair for counts in sources.values() for pair in counts):
+        most[value] = max(most.get(value, 0), count)
+    return tuple(sorted(most.items()))
+
+
+def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
+    """Values (N,) in SI of a signal, NaN where one stands for no value."""
+    return np.where(np.isnan(without_marks(_in_log(signal, values))), np.nan, values)
 
 
 def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
@@ -110,8 +154,10 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
     that are surely some, and what was done in words."""
     notes, at = [], at_marks(numbers)
     if at.any():
-        notes.append(f"has {mark_words(counted(numbers, at))}: taken as missing")
+        size = int(np.sum(~np.isnan(numbers)))
+        notes.append(f"has {mark_words(counted(numbers[at]), size)}: taken as missing")
         numbers = np.where(at, np.nan, numbers)
+    notes += suspect_notes(numbers)
     for turn in _TURNS:
         y = numbers[np.isfinite(numbers)]
         if y.size and np.ptp(y) > _NEARLY * turn and is_wrapped(numbers, turn):
@@ -127,38 +173,6 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
 def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:
     """What stands in the log for values (N,) in SI."""
     return signal.from_si(values)
-
-
-def at_marks(numbers: np.ndarray) -> np.ndarray:
-    """Which of the numbers (N,) of a log stand for no value, far outside of all others."""
-    with np.errstate(invalid="ignore"):
-        at = np.abs(numbers) > _ABSURD
-    i = np.clip(np.searchsorted(_SORTED, numbers), 1, _SORTED.size - 1)
-    for mark in (_SORTED[i - 1], _SORTED[i]):
-        at |= np.abs(numbers - mark) <= _SINGLE * np.abs(mark)
-    rest = numbers[np.isfinite(numbers) & ~at]
-    if not at.any() or rest.size < FEWEST or at.sum() > _MOST * (at.sum() + rest.size):
-        return np.zeros(numbers.shape, bool)
-    # Of a switch between a few values any of them may be one.
-    if np.unique(rest).size < _LEVELS:
-        return np.zeros(numbers.shape, bool)
-    low, high = float(rest.min()), float(rest.max())
-    away = _APART * (high - low)
-    return at & ((numbers > high + away) | (numbers < low - away))
-
-
-def counted(numbers: np.ndarray, at: np.ndarray) -> tuple[tuple[float, int], ...]:
-    """The marks in numbers (N,) of a log, and how many of each there are."""
-    values, counts = np.unique(numbers[at], return_counts=True)
-    return tuple((float(f"{v:.7g}"), int(n)) for v, n in zip(values, counts, strict=True))
-
-
-def mark_words(marks: tuple[tuple[float, int], ...]) -> str:
-    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`."""
-    listed = [f"{n} of {v:.7g}" for v, n in marks[:3]]
-    listed[0] = listed[0].replace(" of", " sample of" if marks[0][1] == 1 else " samples of", 1)
-    more = f" and {len(marks) - 3} more such values" if len(marks) > 3 else ""
-    return " and ".join(listed) + more + ", far outside of all others"
 
 
 def _turn(signal: Signal) -> float | None:

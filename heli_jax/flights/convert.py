@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from heli_jax.errors import InputError, nearest
-from heli_jax.flights.as_logged import without_marks_and_turns
+from heli_jax.flights.as_logged import source_notes, without_marks_and_turns
 from heli_jax.flights.ccpm import Swashplate
-from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
+from heli_jax.flights.derived import DerivedLog, DerivedTable, marks_of_sources, with_derived
 from heli_jax.flights.holds import decide
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.marks import at_marks, counted, mark_words, suspect_notes
 from heli_jax.flights.named import NamedBy
 from heli_jax.flights.onto_grid import window_note
 from heli_jax.flights.open_log import open_log
@@ -102,7 +103,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     names = [name for name in names if log.topic_of(name).name in clocks]
     # Nothing is resampled that was not asked to be: a copy at the log's own samples loses nothing.
     if selection.rate is None:
-        columns = _as_logged(log, names, clocks)
+        columns = _as_logged(log, names, clocks, named is not None, notes)
     else:
         columns = _resampled(log, names, clocks, selection.rate, notes)
         for clock in clocks.values():
@@ -110,6 +111,10 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
             # A table has a value in every row; a fit takes slow outputs as missing in between.
             if selection.rate * clock.usual > _INTERPOLATED:
                 notes.append(f"{clock.words}: interpolated, so its noise is no longer white")
+    for name in names:
+        times = log.channel(name).times[clocks[log.topic_of(name).name].rows]
+        marks = marks_of_sources(log, name, (times[0], times[-1]))
+        notes += source_notes(shown(name), marks)
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
     if named is not None:
         taken = {n: s for n, s in named.signals.items() if s.name in columns}
@@ -219,17 +224,30 @@ def _missing(columns: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _as_logged(
-    log: ChannelLog, names: Sequence[str], clocks: Mapping[str, TopicClock]
+    log: ChannelLog,
+    names: Sequence[str],
+    clocks: Mapping[str, TopicClock],
+    converted: bool,
+    notes: list[str],
 ) -> dict[str, np.ndarray]:
-    """The samples as they are, which needs one clock for all."""
+    """The samples as they are, which needs one clock for all; marks are missing where the numbers
+    are `converted` to another unit, in which nobody would know them again."""
     if len(clocks) > 1:
         few = ", ".join(clock.words for clock in list(clocks.values())[:4])
         more = ", ..." if len(clocks) > 4 else ""
         problem = f"the signals have {len(clocks)} clocks ({few}{more}), expected --rate, to which"
         raise wrong(log.path, f"{problem} they are resampled, or signals of one topic")
     (clock,) = clocks.values()
-    values = {name: _finite(log.channel(name).values[clock.rows]) for name in names}
-    return {TIME: clock.seconds} | values
+    columns = {TIME: clock.seconds}
+    for name in names:
+        values = _finite(log.channel(name).values[clock.rows])
+        if (at := at_marks(values)).any():
+            words = mark_words(counted(values[at]), int(np.sum(~np.isnan(values))))
+            done = "taken as missing" if converted else "kept; with --rate they are missing"
+            notes.append(f"{shown(name)} has {words}: {done}")
+        notes += [f"{shown(name)} {said}" for said in suspect_notes(np.where(at, np.nan, values))]
+        columns[name] = np.where(at, np.nan, values) if converted else values
+    return columns
 
 
 def _resampled(

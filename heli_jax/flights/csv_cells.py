@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.time_units import time_unit
 
 MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A")
 """cells that say that there is no value, beside NaN, which is a number"""
@@ -92,6 +93,6 @@ def row_of_units(cells: Sequence[str]) -> tuple[str, ...] | None:
     # A row of marks for nothing says nothing of units.
     if not words or any(is_number(word) or word in MISSING for word in words):
         return None
-    known = [unit for unit in words if units.is_unit(unit)]
+    known = [unit for unit in words if time_unit(unit) or units.is_unit(unit)]
     # One of them may be written as only its author does.
     return tuple(bare) if 2 * len(known) > len(words) else None

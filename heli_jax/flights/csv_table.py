@@ -43,6 +43,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
+from heli_jax.flights.time_units import time_unit
 from heli_jax.regular_file import read_regular, size_words
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
@@ -224,8 +225,7 @@ class CsvTable:
         """Seconds of a column of dates; else what a row of units says, where it is one of time."""
         if name in self._dates:
             return "s"
-        unit = self.units.get(name, "").replace("µ", "u").replace("sec", "s")
-        return unit if unit in ("s", "ms", "us", "ns", "min") else None
+        return time_unit(self.units.get(name, ""))
 
     def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
         """A column's numbers (N,), or the first row that holds none."""

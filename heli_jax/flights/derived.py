@@ -6,14 +6,16 @@ written here.
 
 import dataclasses
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.errors import nearest
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.marks import Counts, at_sure_or_suspected, counted, mark_words
 from heli_jax.flights.resample import longest_gap
 from heli_jax.flights.table import Survey, Table, shown, wrong
 
@@ -28,6 +30,19 @@ FORMS = (
 )
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\((.*)\)(?:\.(\w+))?\s*")
 _LONGEST_NAME = 400
+
+
+class Marked(NamedTuple):
+    """Samples (K,) of a channel that stand for no value, and their places: rows of a table, or
+    times [s] of a topic."""
+
+    places: np.ndarray
+    values: np.ndarray
+
+    def within(self, span: tuple[float, float] | None) -> Counts:
+        """How many there are from the first place to the last, both included."""
+        first, last = span or (-np.inf, np.inf)
+        return counted(self.values[(self.places >= first) & (self.places <= last)])
 
 
 @dataclass(frozen=True)
@@ -214,7 +229,14 @@ class DerivedLog(ChannelLog):
                 problem = f"{shown(names[0])} and {shown(name)} are of different topics, expected"
                 raise wrong(self.path, f"{problem} channels of one", place)
         values = [as_floats(t.columns[n]) for n, t in zip(names, topics, strict=True)]
-        return topics[0], np.stack(values)
+        # Before anything is computed: what comes of a -9999 looks like an angle or a speed.
+        return topics[0], np.stack([_without_marks(x) for x in values])
+
+    def source_marks(self, name: str) -> dict[str, Marked]:
+        """The marks in the channels that a derived one is computed from, by channel."""
+        known = frozenset(self.names)
+        needed = [] if name in known else sources(name, known, self.swashplate)
+        return _marked({n: self.channel(n) for n in needed})
 
 
 def _on_clock(times: np.ndarray, clock: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -240,6 +262,7 @@ class DerivedTable:
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
         self.notes, self.units = table.notes, table.units
+        self._marks: dict[str, dict[str, Marked]] = {}
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -252,9 +275,17 @@ class DerivedTable:
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
         for name, d in derived.items():
-            groups = [np.stack([columns[n] for n in group]) for group in d.groups]
-            columns[name] = d.compute(*groups)
+            needed = {n: columns[n] for group in d.groups for n in group}
+            rows = {n: (np.arange(x.size), x) for n, x in needed.items()}
+            self._marks[name] = _marked(rows)
+            clean = {n: _without_marks(x) for n, x in needed.items()}
+            columns[name] = d.compute(*(np.stack([clean[n] for n in g]) for g in d.groups))
         return {name: columns[name] for name in names}
+
+    def source_marks(self, name: str) -> dict[str, Marked]:
+        """The marks in the columns that a derived one was computed from, by column; none of one
+        that was not asked for yet."""
+        return self._marks.get(name, {})
 
     def _derivation(self, name: str) -> Derivation | None:
         try:
@@ -279,6 +310,40 @@ class DerivedTable:
     def time_unit(self, name: str) -> str | None:
         """The unit of a column of time stamps."""
         return self.table.time_unit(name) if name in self.names else None
+
+
+def _without_marks(numbers: np.ndarray) -> np.ndarray:
+    return np.where(at_sure_or_suspected(numbers), np.nan, numbers)
+
+
+def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Marked]:
+    """By channel the marks in places and samples (N,), of those that have some."""
+    found = {n: at_sure_or_suspected(x) for n, (_, x) in channels.items()}
+    return {n: Marked(*(x[found[n]] for x in pair)) for n, pair in channels.items()}
+
+
+def marks_of_sources(
+    log: Table | ChannelLog, name: str, span: tuple[float, float] | None = None
+) -> dict[str, Counts]:
+    """The marks in the channels that a derived one is computed from, by channel.
+
+    Args:
+        log: where it is none of `with_derived`, nothing is derived.
+        name: of any channel; of a table's derived one after it was read.
+        span: first and last row of a table, first and last time of an autopilot's log [s], between
+            which they are counted; all of it by default.
+    """
+    if not isinstance(log, DerivedTable | DerivedLog):
+        return {}
+    inside = {n: marked.within(span) for n, marked in log.source_marks(name).items()}
+    return {n: counts for n, counts in inside.items() if counts}
+
+
+def why_missing(log: Table | ChannelLog, name: str) -> str:
+    """Why a derived input has missing samples, where its sources have marks: for a message."""
+    for source, counts in marks_of_sources(log, name).items():
+        return f"; {shown(source)} has {mark_words(counts)}; give a window without them"
+    return ""
 
 
 def with_derived(

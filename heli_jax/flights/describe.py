@@ -21,22 +21,15 @@ from heli_jax.flights.grid import (
     without_overflow,
 )
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
+from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
 from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
+from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
-# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
-# bracket was opened that has to be closed.
-_UNIT_AT_END = re.compile(
-    r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))(s|sec|ms|us|µs|ns|min)(?(open)[\])])$"
-)
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
-_SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
-"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
-_LONGEST_FLIGHT = 6 * 3600.0
-"""s: ticks that would make a longer one are more likely of the next smaller unit"""
 _FILTER = re.compile(
     r"lpf|low_?pass|notch|hntch|hntc2|cutoff|_flt[tde]?$|filt|_nf\d|decimation|looptime|pid_process_denom",
     re.IGNORECASE,
@@ -196,7 +189,7 @@ def _describe_channels(log: ChannelLog) -> LogInfo:
         firmware=log.firmware,
         parameters=log.parameters,
         filters={k: v for k, v in log.parameters.items() if _FILTER.search(k)},
-        notes=log.notes,
+        notes=(*log.notes, *mark_notes(c for topic in log.topics for c in topic.columns.items())),
         vibration=rotor_lines(log),
     )
 
@@ -230,6 +223,7 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
     # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
     return LogInfo(
         path=table.path,
@@ -240,7 +234,7 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         columns=tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
-        notes=(*table.notes, *_other_lengths(surveys)),
+        notes=(*table.notes, *_other_lengths(surveys), *marks),
     )
 
 
@@ -285,10 +279,10 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
     require_columns(table.path, table.names, [signal.name])
     if _values(surveys, signal.name) is None:
         raise wrong(table.path, "holds text, expected times", column(signal.name))
-    if signal.unit not in _SECONDS:
+    if signal.unit not in SECONDS:
         if not units.is_unit(signal.unit):
             # Of the units of time alone: the nearest of all units may be one of capacity.
-            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, _SECONDS)}"
+            problem = f"unknown unit of time {shown(signal.unit)}{nearest(signal.unit, SECONDS)}"
             raise wrong(table.path, problem, column(signal.name))
         try:
             units.factor(signal.unit, "s")
@@ -302,7 +296,7 @@ def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, boo
     numeric = [survey.name for survey in surveys if survey.values is not None]
     # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
-        stem, _ = _split_unit(name)
+        stem, _ = split_unit(name)
         # Of a path, log.roll.time, the last part is the name.
         if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
             return _with_unit(table, surveys, name)
@@ -316,32 +310,11 @@ def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, boo
 
 
 def _with_unit(table: Table, surveys: list[Survey], name: str) -> tuple[Signal, bool]:
-    stated = table.time_unit(name) or _split_unit(name)[1]
+    stated = table.time_unit(name) or split_unit(name)[1]
     if stated:
         return Signal(name, stated, "s"), False
     stamps = _values(surveys, name)
-    return Signal(name, _likely_unit(stamps), "s"), True
-
-
-def _likely_unit(stamps: np.ndarray | None) -> str:
-    """The unit of stamps (N,) by their usual step: no flight is logged once in 5 s, or lasts a
-    day."""
-    if stamps is None or stamps.size < 2:
-        return "s"
-    with np.errstate(all="ignore"):
-        step = float(np.median(np.diff(stamps)))
-        length = float(stamps[-1] - stamps[0])
-    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
-    for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
-        if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
-            return unit
-    return "ns"
-
-
-def _split_unit(name: str) -> tuple[str, str]:
-    """A name without the unit at its end, and this unit, empty where there is none."""
-    match = _UNIT_AT_END.fullmatch(name)
-    return (match[1], match[3]) if match else (name, "")
+    return Signal(name, likely_unit(stamps), "s"), True
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
@@ -357,7 +330,7 @@ def _describe_time(table: Table, surveys: list[Survey], signal: Signal, guessed:
 
 def _describe_stamps(name: str, unit: str, stamps: np.ndarray) -> TimeInfo:
     """What stamps (N,) in a unit of time are as a clock."""
-    scale = _SECONDS[unit] if unit in _SECONDS else units.factor(unit, "s")
+    scale = SECONDS[unit] if unit in SECONDS else units.factor(unit, "s")
     with np.errstate(all="ignore"):
         stamps, _ = without_overflow(stamps)
         seconds = stamps * scale

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.errors import InputError
+from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import DerivedTable
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.holds import Decision
@@ -24,6 +25,8 @@ from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opene
 from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
+_STILL = 1e-100
+"""SI: an output that moves by no more does not move"""
 
 
 type _Log = str | Path | ChannelLog | DerivedTable
@@ -94,7 +97,13 @@ def read_parts(
     """
     options = dataclasses.replace(options, **keywords)
     logs, request, finish = _opened(path, time, inputs, outputs, options)
-    signals = clocked(logs, request)
+    # A slow sensor whose rows are padded with marks is needed at its own instants alone.
+    signals = {
+        key: dataclasses.replace(s, values=measured(request.signals[key], s.values))
+        if key[1] == "output"
+        else s
+        for key, s in clocked(logs, request).items()
+    }
     rate = options.rate
     needed = clocks_of(signals.values()) if rate is None else on_all_the_time(signals, rate)
     clocks = [clock.seconds for clock in needed]
@@ -220,3 +229,19 @@ def require_moving_inputs(flight: Flight) -> None:
         " can be learnt from it; expected an input that moves",
         f"input {name!r}",
     )
+
+
+def require_moving_outputs(flight: Flight) -> None:
+    """Refuse a flight in which no output does anything: gains of zero fit it, without any noise.
+
+    Raises:
+        InputError: naming the outputs and the values they keep.
+    """
+    seen = {n: y[np.isfinite(y)] for n, y in flight.outputs.items()}
+    still = {n: y[0] for n, y in seen.items() if y.size and np.ptp(y) <= _STILL}
+    if not still or len(still) < len(seen):
+        return
+    path = flight.source.path if flight.source else flight.name or "flight"
+    values = ", ".join(f"{n} at {value:.6g}" for n, value in still.items())
+    problem = f"every output stays at one value (SI: {values}) for all of {flight.duration:.6g} s"
+    raise wrong(path, f"{problem}; expected one that moves: look whether the sensor was logged")

@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from heli_jax.flights.as_logged import as_logged
+from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.marks import Counts
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -53,10 +55,12 @@ class TopicClock:
 
 @dataclass(frozen=True, eq=False)
 class ClockedSignal:
-    """Samples (N,) in SI on the clock of a topic."""
+    """Samples (N,) in SI on the clock of a topic, and of a derived signal the marks that the
+    channels had from which it is computed."""
 
     clock: TopicClock
     values: np.ndarray
+    of_sources: Mapping[str, Counts] = field(default_factory=dict)
 
     @property
     def timed(self) -> Timed:
@@ -109,7 +113,8 @@ def flight_of_signals(
     Raises:
         InputError: a rate is needed or makes no sense, or a clock has a gap.
     """
-    logged = as_logged(request, {key: signal.timed for key, signal in signals.items()})
+    marks = {key: signal.of_sources for key, signal in signals.items()}
+    logged = as_logged(request, {key: s.timed for key, s in signals.items()}, marks)
     values = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, values)
@@ -143,8 +148,11 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
         if bad.size:
             at = f"channel {shown(signal.name)}"
             problem = f"got {values[bad[0]]} at {clock.seconds[bad[0]]:.6g} s"
-            raise wrong(log.path, f"{problem}, expected a finite number", at)
-        signals[key, kind] = ClockedSignal(clock, values)
+            why = why_missing(log, signal.name)
+            raise wrong(log.path, f"{problem}, expected a finite number{why}", at)
+        span = tuple(times[clock.rows][[0, -1]])
+        marks = marks_of_sources(log, signal.name, span)
+        signals[key, kind] = ClockedSignal(clock, values, marks)
     return signals
 
 

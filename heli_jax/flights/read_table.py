@@ -1,8 +1,9 @@
 """From a table of rows, one column of which is the time, to a `Flight`."""
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
+from heli_jax.flights.derived import marks_of_sources, why_missing
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -23,6 +25,7 @@ from heli_jax.flights.grid import (
     without_overflow,
 )
 from heli_jax.flights.holds import Decision
+from heli_jax.flights.marks import Counts
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -41,6 +44,7 @@ from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.slower import Timed
 from heli_jax.flights.table import Table, column, shown, wrong
+from heli_jax.flights.time_units import split_unit
 
 _MANY = 0.1
 """part of the stamps that are not later than the one before, which no hand takes out"""
@@ -92,7 +96,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     assert request.time is not None  # or `load_table` would have refused it
     # The window before anything else is asked of the samples: what lies outside of it may be as
     # wrong as it likes.
-    rows, notes = _rows(table.path, clock.elapsed, options.window)
+    with clock.hinting():
+        rows, notes = _rows(table.path, clock.elapsed, options.window)
     signals = _to_si(table, request, loaded.numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     # Before the grid, whose rounding is a part of a step: steps of a wrong unit would make it
@@ -101,12 +106,14 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     grid = uniform_grid(stamps.seconds, rounding_of(clock.stamps[rows]) * clock.scale)
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
-    logged = as_logged(request, {key: Timed(stamps.seconds, x) for key, x in signals.items()})
+    timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
+    logged = as_logged(request, timed, _of_sources(table, request, rows))
     signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
-    dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
+    with clock.hinting():
+        dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
     notes = (*table.notes, *clock.notes, *_other_units(table, request), *notes)
     notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
@@ -114,6 +121,11 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
     t0 = float(clock.stamps[rows.start] * clock.scale)
     return flight_of(request, samples, dt, t0, holds, source)
+
+
+def _of_sources(table: Table, request: Request, rows: slice) -> dict[Key, dict[str, Counts]]:
+    span = (rows.start, rows.stop - 1)
+    return {key: marks_of_sources(table, s.name, span) for key, s in request.signals.items()}
 
 
 def _other_units(table: Table, request: Request) -> list[str]:
@@ -144,12 +156,14 @@ def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSig
     """
     table, clock = loaded.table, loaded.clock
     assert request.time is not None  # or `load_table` would have refused it
-    rows, _ = _rows(table.path, clock.elapsed, request.options.window)
+    with clock.hinting():
+        rows, _ = _rows(table.path, clock.elapsed, request.options.window)
     signals = _to_si(table, request, loaded.numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     _check_step(stamps)
     topic = TopicClock(Path(table.path).name, stamps.seconds, rows)
-    return {key: ClockedSignal(topic, x) for key, x in signals.items()}
+    marks = _of_sources(table, request, rows)
+    return {key: ClockedSignal(topic, x, marks[key]) for key, x in signals.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +173,18 @@ class _Clock:
     stamps: np.ndarray
     scale: float
     notes: tuple[str, ...] = ()
+    unit_notes: tuple[str, ...] = ()
+    """where the file or a name says another unit"""
+
+    @contextlib.contextmanager
+    def hinting(self) -> Iterator[None]:
+        """What is said of the unit behind errors that a wrong one makes."""
+        try:
+            yield
+        except InputError as e:
+            if not self.unit_notes:
+                raise
+            raise InputError("; ".join([str(e), *self.unit_notes])) from e
 
     @property
     def elapsed(self) -> np.ndarray:
@@ -186,7 +212,10 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
     """The stamps, finite and increasing."""
     place = column(time.name)
     # A column of time stamps says by its type what its ticks are, whatever the user thinks.
-    scale = units.factor(table.time_unit(time.name) or time.unit, "s")
+    stated = table.time_unit(time.name)
+    scale = units.factor(stated or time.unit, "s")
+    # A type is unmistakable; only words may be meant for something else.
+    said = () if stated and not table.units.get(time.name) else _unit_notes(time, stated)
     with np.errstate(over="ignore"):
         bad = np.flatnonzero(~(np.abs(stamps * scale) <= LATEST))  # NaN is bad too
     if bad.size:
@@ -201,7 +230,25 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         problem = f"the time {fault}, got {now} after {after}, expected increasing times"
         remedy = _remedy(table, stamps, row)
         raise wrong(table.path, f"{problem}; {remedy}", table.place(row), place)
-    return _Clock(stamps, scale, notes)
+    return _Clock(stamps, scale, (*notes, *said), said)
+
+
+def _unit_notes(time: Signal, stated: str | None) -> tuple[str, ...]:
+    """A note where the file, or the name of its clock, says another unit than the configuration.
+
+    Args:
+        time: the clock and its unit, as configured.
+        stated: its unit, as the file has it.
+    """
+    named = split_unit(time.name)[1]
+    factor = units.factor(time.unit, "s")
+    if stated and not math.isclose(units.factor(stated, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {stated}, as the file says"
+        return (f"{words}, and not in {time.unit}",)
+    if not stated and named and not math.isclose(units.factor(named, "s"), factor):
+        words = f"time: {shown(time.name)} is taken in {time.unit}, though its name says {named}"
+        return (f"{words}: if that is right, state unit: {named} beside it",)
+    return ()
 
 
 def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
@@ -263,6 +310,7 @@ def _to_si(
         if bad.size:
             row = rows.start + int(bad[0])
             problem = f"got {table.cell_text(signal.name, row)}, expected a finite number"
+            problem += why_missing(table, signal.name)
             raise wrong(table.path, problem, table.place(row), column(signal.name))
         samples[key, kind] = values
     return samples

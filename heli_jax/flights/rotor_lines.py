@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.flights.log import Channel, ChannelLog
+from heli_jax.flights.marks import without_marks
 from heli_jax.flights.preset import Preset, choose, fitting_presets, preset
 from heli_jax.flights.vibration import SEGMENT, Line, lines
 
@@ -69,7 +70,7 @@ def _by_preset(log: ChannelLog, table: Preset) -> RotorLines | None:
     if speed is None or speed.unit not in _TURNS:
         return None
     times, values = log.channel(speed.channel)
-    hz = (values - speed.offset) * speed.scale * _TURNS[speed.unit]
+    hz = (without_marks(values) - speed.offset) * speed.scale * _TURNS[speed.unit]
     span = _steady(times, hz)
     if span is None:
         return RotorLines(speed.channel, np.nan, np.nan, np.nan, ())
@@ -106,8 +107,9 @@ def _steady(times: np.ndarray, hz: np.ndarray) -> tuple[float, float] | None:
 
 def _evenly(channel: Channel, start: float, end: float) -> tuple[np.ndarray, float] | None:
     """The samples (N,) of a time at even steps, and the step [s]; None where there are few."""
-    inside = (channel.times >= start) & (channel.times <= end) & np.isfinite(channel.values)
-    times, values = channel.times[inside], channel.values[inside]
+    values = without_marks(channel.values)
+    inside = (channel.times >= start) & (channel.times <= end) & np.isfinite(values)
+    times, values = channel.times[inside], values[inside]
     if times.size < 64 or np.any(np.diff(times) <= 0):
         return None
     step, length = float(np.median(np.diff(times))), float(times[-1] - times[0])

@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from heli_jax.flights.marks import Counts
+from heli_jax.flights.strays import Strays
+
 FEW = 8
 """distinct values of a signal below which its extremes are no rails: steps between a few levels"""
 _PILE = 5.0
@@ -97,6 +100,7 @@ class SignalFacts:
         dropouts: where an output jumps to one value from anywhere.
         marks: values that stand for none, such as -9999, as the log has them, and how many there
             were; they are missing in the flight.
+        strays: samples that may stand for none, and are kept.
     """
 
     size: int
@@ -108,7 +112,8 @@ class SignalFacts:
     usual: float
     stretches: tuple[Stuck, ...] = ()
     dropouts: Dropouts | None = None
-    marks: tuple[tuple[float, int], ...] = ()
+    marks: Counts = ()
+    strays: tuple[Strays, ...] = ()
 
     @property
     def stuck(self) -> Stuck | None:
@@ -145,8 +150,16 @@ class SignalFacts:
             times = drops.times[(drops.times >= begin) & (drops.times <= end)]
             drops = replace(drops, times=times - begin) if times.size else None
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
-        cut_off = {"low": cut(self.low), "high": cut(self.high)}
-        return replace(self, size=size, **cut_off, stretches=tuple(stretches), dropouts=drops)
+        strays = (s.within(begin, end) for s in self.strays)
+        return replace(
+            self,
+            size=size,
+            low=cut(self.low),
+            high=cut(self.high),
+            stretches=tuple(stretches),
+            dropouts=drops,
+            strays=tuple(s for s in strays if s.times.size),
+        )
 
 
 def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:

@@ -9,9 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.flights.align import Lag, NotAligned, lag_between
+from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import with_derived
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.marks import without_marks
 from heli_jax.flights.onto_grid import FEWEST, Key
 from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import (
@@ -153,10 +155,11 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Besi
     other = _open(alone, also.log)
     reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
     (twin,) = _clocked(other, alone).values()
+    reference = reference._replace(values=measured(request.signals[key], reference.values))
+    # A scale does not matter for it, so that no unit is asked for.
+    motion = (-1.0 if also.reverse else 1.0) * without_marks(twin.values)
     try:
-        # A scale does not matter for it, so that no unit is asked for.
-        sign = -1.0 if also.reverse else 1.0
-        lag = lag_between(reference, twin.timed._replace(values=sign * twin.values))
+        lag = lag_between(reference, twin.timed._replace(values=motion))
     except NotAligned as e:
         what = f"{also.same} of {Path(request.path).name} and {shown(also.to)}"
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
@@ -189,7 +192,7 @@ def _shifted(signal: ClockedSignal, lag: float, name: str) -> ClockedSignal:
     # Two files may well have topics of the same name.
     topic = signal.clock.topic if signal.clock.topic == name else f"{name}, {signal.clock.topic}"
     clock = TopicClock(topic, signal.clock.seconds + lag, signal.clock.rows)
-    return ClockedSignal(clock, signal.values)
+    return dataclasses.replace(signal, clock=clock)
 
 
 def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
@@ -202,4 +205,5 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     if seconds.size < FEWEST:
         problem = f"holds {seconds.size} samples from {window[0]:g} s to {window[1]:g} s"
         raise wrong(request.path, f"{problem}, expected at least {FEWEST}", signal.clock.topic)
-    return ClockedSignal(TopicClock(signal.clock.topic, seconds, rows), signal.values[rows])
+    clock = TopicClock(signal.clock.topic, seconds, rows)
+    return dataclasses.replace(signal, clock=clock, values=signal.values[rows])

@@ -11,6 +11,7 @@ from heli_jax import models, naming
 from heli_jax.errors import InputError
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
+from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.preset import fitting_presets, model_inputs, model_outputs
 from heli_jax.flights.table import Table, shown, wrong
@@ -116,7 +117,7 @@ def _read(path: Path, number: int | None) -> _Log:
         return _read_table(opened)
     first, *others = opened
     series = {
-        name: Series(topic.times, as_floats(values), topic.units.get(name, ""))
+        name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
         for topic in first.topics
         if topic.clock and topic.times.size >= _FEWEST
         for name, values in topic.columns.items()
@@ -138,7 +139,11 @@ def _read_table(table: Table) -> _Log:
     values = table.numbers([clock, *(n for n in names if n != clock)])
     # Seconds from the first stamp: their count does not matter to a guess.
     times = np.linspace(0.0, info.time.duration, values[clock].size)
-    series = {n: Series(times, values[n], table.units.get(n, "")) for n in names if n != clock}
+    series = {
+        n: Series(times, without_marks(values[n]), table.units.get(n, ""))
+        for n in names
+        if n != clock
+    }
     return _Log(table.path, table.format, series, info.time, None, False)
 
 

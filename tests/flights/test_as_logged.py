@@ -2,13 +2,20 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from heli_jax.errors import InputError
 from heli_jax.flights.cut import part
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
 from heli_jax.flights.signal_facts import signal_facts
-from heli_jax.identification.validation.signal_quality import quantisation, saturation, stuck
+from heli_jax.flights.strays import strays as strays_of
+from heli_jax.identification.validation.signal_quality import (
+    quantisation,
+    saturation,
+    strays,
+    stuck,
+)
 
 N, DT = 2000, 0.01
 T = DT * np.arange(N)
@@ -85,9 +92,46 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     assert stuck([("one", f)])[0].severity == "doubt"
     with pytest.raises(InputError, match=r"'u'.*2 samples of 65535"):
         read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
+    # However often: of a sensor at 5 Hz most rows hold nothing else.
+    f = read(tmp_path, p=np.where(np.arange(N) % 20 == 0, RATE, -9999.0), q=RATE)
+    np.testing.assert_array_equal(np.isfinite(f.outputs["p"]), np.arange(N) % 20 == 0)
+    assert "1900 samples of -9999 (95 % of all)" in " ".join(f.source.notes)
+    # Among rotor speeds -9999 is not far, but the only one below zero; 1e20 measures nothing.
+    speed = 6000 + 5500 * np.sin(0.4 * T)
+    speed[500] = -9999.0
+    f = read(tmp_path, p=speed, q=np.where(T > 8, 1e20, RATE))
+    assert np.flatnonzero(np.isnan(f.outputs["p"])).tolist() == [500]
+    np.testing.assert_array_equal(np.isnan(f.outputs["q"]), T > 8)
     # The same number among others of its size is a value.
     near = read(tmp_path, p=1e4 + 10 * np.round(RATE)).outputs["p"]
     assert np.isfinite(near).all()
+
+
+def test_samples_that_no_motion_leads_to_are_said_and_kept(tmp_path):
+    spikes = RATE.copy()
+    spikes[[100, 101, 800]] = -99.0
+    # Among headings in hundredths of a degree 65535 is not far outside, though by itself.
+    heading = 18000 + 17500 * np.sin(0.4 * T)
+    heading[500:505] = 65535.0
+    f = read(tmp_path, p=spikes, q=heading)
+    np.testing.assert_array_equal(f.outputs["p"], spikes)
+    assert f.source is not None
+    said = " ".join(f.source.notes)
+    assert "'p' has 3 samples of -99, the first at 1 s, which no motion leads to" in said
+    assert "'q' has 5 samples of 65535, the first at 5 s, which loggers write" in said
+    found = strays([("one", f)])
+    assert [(s.severity, s.value) for s in found] == [("doubt", 5.0), ("doubt", 3.0)]
+    (found,) = strays([("one", part(f, 0, 400))])
+    assert found.value == 2.0
+    # Doublets out of rest, at any rate, in steps of the log or not, and a landing are motions.
+    u = np.where((T > 5) & (T < 5.2), 0.3, 0.0) - np.where((T > 5.2) & (T < 5.4), 0.3, 0.0)
+    motion = lfilter([0.2], [1, -0.8], u) + 1e-3 * RNG.standard_normal(N)
+    shock = np.where(T > 9, np.exp(-(T - 9) / 0.1) * np.cos(60 * T), 0) + motion
+    for step in (1, 10):
+        t = T[::step] * 1.0
+        for y in (motion, np.round(motion, 2), np.cumsum(motion), shock):
+            assert not strays_of(t, y[::step], "output")
+        assert not strays_of(t, u[::step], "input")
 
 
 @pytest.mark.parametrize("rate", [None, 50.0])

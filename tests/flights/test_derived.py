@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Signal, read_flight
+from heli_jax.flights import Signal, describe_log, read_flight
 from heli_jax.flights.ccpm import Swashplate, unmix
+from heli_jax.flights.convert import Selection, convert_log
 from heli_jax.flights.derived import body_velocity, euler_angles, with_derived
 from heli_jax.flights.open_log import open_log
 
@@ -37,6 +38,54 @@ def test_body_velocity_is_scipys():
     velocity = np.stack([np.cos(np.arange(200) / 7), np.arange(200) / 50, -np.ones(200)])
     want = Rotation.from_euler("ZYX", ANGLES[::-1].T).inv().apply(velocity.T).T
     np.testing.assert_allclose(body_velocity(2 * quaternions(ANGLES), velocity), want, atol=1e-12)
+
+
+def test_marks_in_the_sources_are_missing_in_what_is_derived(tmp_path):
+    t = 0.01 * np.arange(200)
+    q, h, north = quaternions(ANGLES), 100 * t % 360, np.cos(t)
+    q[0, 50:60], q[1:, 50:60], h[80:83], north[20] = -9999, 0.5, -9999, -9999
+    columns = {"t": t, "u": np.sin(9 * t), "n": north, "e": t, "d": -t, "h": h}
+    columns |= dict(zip(("q0", "q1", "q2", "q3"), q, strict=True))
+    path = tmp_path / "log.csv"
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="")
+    roll, speed = "euler(q0, q1, q2, q3).roll", "body_velocity(q0, q1, q2, q3, n, e, d).v"
+    outputs = {
+        "phi": Signal(roll, "rad", "rad"),
+        "v": Signal(speed, "m/s", "m/s"),
+        "psi": Signal("unwrap(h, 360)", "deg", "rad"),
+    }
+    inputs = {"u": Signal("u", "1", "1")}
+    f = read_flight(path, time="t", inputs=inputs, outputs=outputs)
+    for name, rows in (
+        ("phi", {*range(50, 60)}),
+        ("v", {20, *range(50, 60)}),
+        ("psi", {80, 81, 82}),
+    ):
+        assert set(np.flatnonzero(np.isnan(f.outputs[name]))) == rows, name
+    rest = np.isfinite(f.outputs["phi"])
+    np.testing.assert_allclose(f.outputs["phi"][rest], ANGLES[0, rest], atol=1e-12)
+    assert f.source is not None
+    said = f"{roll!r}: 'q0' has 10 samples of -9999, far outside of all others: taken as missing"
+    assert said in f.source.notes
+    assert f.source.facts["phi", "output"].marks == ((-9999.0, 10),)
+    got = convert_log(path, Selection(signals=(roll,)))
+    assert np.isnan(got.columns[roll][50:60]).all()
+    assert said in got.notes
+    # Of another part of the log nothing is said.
+    f = read_flight(path, time="t", inputs=inputs, outputs=outputs, window=(1.0, 1.9))
+    assert f.source is not None
+    assert not any("-9999" in note for note in f.source.notes)
+    said = describe_log(path).notes
+    assert "3 samples of -9999 stand for no value in 'h': a fit takes them as missing" in said
+    inputs = {"u": Signal("unwrap(h, 360)", "deg", "deg")}
+    with pytest.raises(InputError, match=r"line 82.*'h' has 3 samples of -9999"):
+        read_flight(path, time="t", inputs=inputs, outputs={"p": Signal("u", "1", "1")})
+    plate = Swashplate(
+        ("n", "e", "d"), (-60, 60, 180), *((1.0,) * 3, (0.0,) * 3, (1.0,) * 3), (False,) * 3
+    )
+    lift = with_derived(open_log(path), plate).numbers(["ccpm.collective"])["ccpm.collective"]
+    assert np.flatnonzero(np.isnan(lift)).tolist() == [20]
 
 
 ATTITUDE = [("uint64_t", "timestamp"), ("float[4]", "q")]

@@ -65,7 +65,18 @@ def test_a_row_of_units_is_no_sample(tmp_path):
     assert f.dt == pytest.approx(DT * 1e-3)
     assert "line 2 was taken for units" in notes(f)
     assert "the file says 'deg/s'" in notes(f)
+    assert "'t' is taken in ms, as the file says, and not in s" in notes(f)
     assert [c.unit for c in describe_log(path).columns] == ["ms", "-", "deg/s"]
+    # As it is written, whole or short; micro is two letters that look the same.
+    for unit, step in {"Milliseconds": 1e-3, "Ms": 1e-3, "\u00b5s": 1e-6, "\u03bcs": 1e-6}.items():
+        path = written(tmp_path, ["t,u,p", f"{unit},-,rad/s", *ROWS])
+        assert read(path, Signal("t", "s", "s")).dt == pytest.approx(DT * step)
+    # A name is no statement, and a hint.
+    path = written(tmp_path, ["time_ms,u,p", *ROWS])
+    assert "'time_ms' is taken in s, though its name says ms" in notes(read(path, "time_ms"))
+    inputs, outputs = {"u": Signal("u", "1", "1")}, {"p": Signal("p", "1", "1")}
+    with pytest.raises(InputError, match=r"lies outside the log.*state unit: ms"):
+        read_flight(path, time="time_ms", inputs=inputs, outputs=outputs, window=(10.0, 20.0))
     # A line further down, and between blanks.
     rows = [r.replace(",", "  ") for r in ROWS]
     f = read(written(tmp_path, ["t  u  p", "s  -  rad/s", *rows], "log.asc"))

@@ -10,7 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from heli_jax.errors import InputError
-from heli_jax.flights import Flight, Signal, Source, read_flight, require_moving_inputs
+from heli_jax.flights import (
+    Flight,
+    Signal,
+    Source,
+    read_flight,
+    require_moving_inputs,
+    require_moving_outputs,
+)
 from heli_jax.flights.describe import describe_log
 
 STICK = Signal("stick", "mm", "m")
@@ -297,6 +304,9 @@ def test_moving_inputs_of_a_flight_made_by_hand():
     flight = Flight(0.1, {"x_roll": still}, {}, source=Source("bench.csv", "0"))
     with pytest.raises(InputError, match=r"^bench\.csv, input 'x_roll': .*nothing"):
         require_moving_inputs(flight)
+    require_moving_outputs(Flight(0.1, {"x_roll": still}, {"roll": moving, "p": still}))
+    with pytest.raises(InputError, match="every output stays at one value"):
+        require_moving_outputs(Flight(0.1, {"x_roll": moving}, {"roll": still}))
 
 
 def test_a_parquet_file_of_lists_is_described(tmp_path):

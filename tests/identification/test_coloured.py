@@ -122,6 +122,21 @@ def test_few_independent_parts_want_a_larger_quantile():
     assert sandwich(layout, data, e).quantile()[0] == pytest.approx(1.96, abs=0.01)
 
 
+def test_residuals_and_effects_of_any_size_have_the_same_intervals():
+    """No square overflows (warnings are errors), and a unit of either changes nothing else."""
+    J = np.stack([np.ones(400), np.sin(0.01 * np.arange(400))], axis=1)[None]
+    r = ar1(0.9, n=400)[None]
+    plain = sandwich(*case(r, J))
+    for noise, effect in ((1e90, 1.0), (1e-80, 1.0), (1.0, 1e-80), (1e60, 1e90)):
+        found = sandwich(*case(noise * r, effect * J))
+        np.testing.assert_allclose(found.inflation(), noise * plain.inflation(), rtol=1e-9)
+        np.testing.assert_allclose(found.quantile(), plain.quantile(), rtol=1e-5)
+    for nothing in (0.0 * r, np.eye(1, 400, 200)):
+        found = sandwich(*case(nothing, J))
+        assert np.all(np.diag(found.covariance(np.eye(2))) >= 0.0)
+        assert np.isfinite(found.quantile()).all()
+
+
 def test_two_flights_are_independent():
     r = ar1(0.9)
     whole = inflation(*case(r[None], np.ones((1, N, 1))))[0]

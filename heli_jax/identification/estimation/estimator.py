@@ -19,6 +19,7 @@ from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.kalman import Innovations
 from heli_jax.identification.estimation.measured_signals import (
+    least_noise,
     measured_count,
     signal_numbers,
     signals,
@@ -207,9 +208,7 @@ class Estimator(abc.ABC):
             signals(layout), self.errors_of(layout, data, noise, e), strict=True
         ):
             y = np.asarray(data.flights[i].outputs[name])
-            # A residual that is all rounding would make the next rows infinite.
-            floor = 1e-12 * np.sqrt(np.mean(np.square(y[np.isfinite(y)]))) + 1e-300
-            size = max(np.sqrt(np.mean(np.square(r)) * freedom), floor)
+            size = max(np.sqrt(np.mean(np.square(r)) * freedom), least_noise(y))
             sd[i][name] = np.asarray(size, np.asarray(y).dtype)
         return z, Noise(tuple(sd), noise.log_variance_ratio)
 

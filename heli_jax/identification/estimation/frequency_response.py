@@ -38,7 +38,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linear_machine import Machine, machine_of
-from heli_jax.identification.estimation.measured_signals import signals
+from heli_jax.identification.estimation.measured_signals import least_noise, signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
     ResponseWeights,
@@ -338,8 +338,7 @@ def _sd(layout: Layout, data: Data, weights: ResponseWeights, z: Array) -> tuple
         if not np.isfinite(size):
             j = w.outputs.index(name) if name in w.outputs else 0
             size = float(in_band[j])
-        floor = 1e-12 * float(np.sqrt(np.mean(np.square(y[np.isfinite(y)])))) + 1e-300
-        sd[i][name] = np.asarray(max(size, floor), y.dtype)
+        sd[i][name] = np.asarray(max(size, least_noise(y)), y.dtype)
     return tuple(sd)
 
 

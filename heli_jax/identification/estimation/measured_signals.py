@@ -42,3 +42,11 @@ def measured_count(data: Data) -> int:
         for flight in data.flights
         for y in flight.outputs.values()
     )
+
+
+def least_noise(y: np.ndarray) -> float:
+    """The sd, SI, below which what is left of an output (N,) is rounding; NaN is missing."""
+    # A residual that is all rounding would make the next rows infinite; of an output that is
+    # nothing at all even 1e-12 of its unit is plenty.
+    rms = float(np.sqrt(np.mean(np.square(y[np.isfinite(y)]))))
+    return 1e-12 * (rms if rms > 1e-100 else 1.0)

@@ -100,7 +100,8 @@ def _determined(
     if reported is not None:
         wide = single_too_wide if null else reported_too_wide
         null += further(wide(reported, unknowns), null)
-    sd = np.sqrt(np.diag(covariance if reported is None else reported))
+    # A variance of nothing may be rounding of either sign.
+    sd = np.sqrt(np.maximum(np.diag(covariance if reported is None else reported), 0.0))
     return _Determined(null, covariance, without_weak, total, int(kept.sum()), sd)
 
 

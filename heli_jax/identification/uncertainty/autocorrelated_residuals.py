@@ -32,6 +32,10 @@ _LONGEST = 0.5
 """of the window, as a part of the record"""
 _RESOLVED = 1e-3
 """singular value over the largest below which finite differences tell no curvature"""
+_NO_EFFECT = 1e-100
+"""of the largest column of J: a smaller one is rounding of no effect"""
+_ENDLESS = 1e140
+"""standard deviation of an unknown of no effect, whose square is still a number"""
 _FLATTEST = 0.05
 """curvature over that of J'J that is believed at least"""
 
@@ -48,37 +52,49 @@ class Sandwich(NamedTuple):
     parts: tuple["_Part", ...]
     """by flight"""
     rest: Float[np.ndarray, "q q"]
-    """J'J of the rows that are no measurements (priors), whose variance is known"""
+    """J'J of the rows that are no measurements (priors), whose variance is known, over size^2"""
+    size: float
+    """largest residual, by which those in `parts` are divided"""
 
     def inflation(self, along: np.ndarray | None = None) -> np.ndarray:
         """How much wider than white noise says the standard deviations of the combinations
         `along` (k, q) of unknowns are, or without it of every unknown; (k,) or (q,)."""
-        along = self._scaled(along)
+        along, _ = self._scaled(along)
         by_white = np.sum(along @ self.white * along, axis=1)
         variance, _ = self._variance(along)
         ratio = variance / np.where(by_white > 0, by_white, 1.0)
-        return np.sqrt(np.maximum(ratio, 0.0))
+        return self.size * np.sqrt(np.maximum(ratio, 0.0))
 
     def quantile(self, along: np.ndarray | None = None) -> np.ndarray:
         """Student's 97.5 % quantile of each combination, as `inflation` has them."""
-        _, freedom = self._variance(self._scaled(along))
+        _, freedom = self._variance(self._scaled(along)[0])
         # Below one degree of freedom the quantile has no use: 12.7 standard deviations are enough.
         return scipy.special.stdtrit(np.maximum(freedom, 1.0), 0.975)
 
     def covariance(self, along: np.ndarray) -> np.ndarray:
         """(k, k) of combinations, with the variances that `inflation` has."""
-        along = self._scaled(along)
+        along, sizes = self._scaled(along)
         D = along @ self.bread
         whole = D @ (self.rest + sum(p.meat for p in self.parts)) @ D.T
         variance, _ = self._variance(along)
         plain = np.diag(whole)
         # `_variance` allows on each variance for what the fit took; the correlations stay.
-        factor = np.sqrt(np.divide(variance, plain, out=np.ones_like(plain), where=plain > 0))
-        return whole * np.outer(factor, factor)
+        factor = np.sqrt(np.divide(variance, plain, out=np.zeros_like(plain), where=plain > 0))
+        whole *= np.outer(factor, factor)
+        # Where there is none, rounding has left a little of either sign.
+        np.fill_diagonal(whole, variance)
+        sizes = np.minimum(self.size * sizes, _ENDLESS)
+        return whole * np.outer(sizes, sizes)
 
-    def _scaled(self, along: np.ndarray | None) -> np.ndarray:
+    def _scaled(self, along: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The combinations (k, q) by unknowns of unit columns, and their sizes (k,), by which they
+        are divided: squares of variances would not hold those of an unknown of hardly any
+        effect."""
         along = np.eye(self.norms.size) if along is None else along
-        return along / np.where(self.norms > 0, self.norms, 1.0)
+        along = along / self.norms
+        sizes = np.max(np.abs(along), axis=1)
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        return along / sizes[:, None], sizes
 
     def _variance(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(k,) of combinations, and the degrees of freedom with which they are known."""
@@ -120,12 +136,13 @@ class _Part(NamedTuple):
         # Its value at lag zero is the variance; what the window passes of its square says from how
         # many independent parts of the spectrum that was made.
         p = np.fft.irfft(power, self.window.size, axis=0)
-        spent = np.sum(np.square(self.window[:, None] * p), axis=0)
+        whole = np.where(p[0] > 0, p[0], 1.0)
+        spent = np.sum(np.square(self.window[:, None] * (p / whole)), axis=0)
         # As many samples as those outputs have that the combination is known from: what a slow
         # sensor tells has no more freedom for a fast one beside it.
         share = np.maximum(np.sum(by_output, axis=0), 0.0)
         seen = self.seen @ share / np.maximum(np.sum(share, axis=0), 1e-300)
-        freedom = seen * p[0] ** 2 / np.where(spent > 0, spent, 1.0)
+        freedom = np.where(p[0] > 0, seen / np.where(spent > 0, spent, 1.0), 1.0)
         white = np.sum(D * (self.plain @ D), axis=0)
         taken = np.sum(D * (self.taken @ D), axis=0) / np.where(white > 0, white, 1.0)
         # HC2 divides by what the fit leaves. Where it leaves next to nothing that is rounding, so
@@ -148,16 +165,18 @@ def sandwich(
             nothing unless given.
     """
     J, r = np.asarray(e.J, np.float64), np.asarray(e.r, np.float64)
-    norms = np.linalg.norm(J, axis=0)
-    scale = np.where(norms > 0, norms, 1.0)
-    J = J / scale
+    norms = _norms(J)
+    J = J / norms
+    # Their spectrum is squared, and squared again for the degrees of freedom.
+    size = max(float(np.max(np.abs(r))), 1.0)
+    r = r / size
     # The singular values of J are those of its triangle, which is (q, q) however long the record.
     _, singular, right = np.linalg.svd(np.linalg.qr(J, mode="r"), full_matrices=False)
     kept = singular > 1e-10 * max(singular[0], 1e-300)
     T = right[kept].T / singular[kept]
     bread = white = T @ T.T
     if curvature is not None:
-        bread = _bread(T, singular[kept], curvature / np.outer(scale, scale))
+        bread = _bread(T, singular[kept], curvature / np.outer(norms, norms))
     # Rows stand flight after flight, output after output; those of the priors come last.
     at, parts = 0, []
     for flight, outputs in zip(data.flights, layout.outputs, strict=True):
@@ -168,8 +187,15 @@ def sandwich(
             _part(J[rows].reshape(k, n, -1), r[rows].reshape(k, n), ~np.isnan(measured), T)
         )
         at += k * n
-    rest = J[at:]
-    return Sandwich(norms, white, bread, tuple(parts), rest.T @ rest)
+    rest = J[at:] / size
+    return Sandwich(norms, white, bread, tuple(parts), rest.T @ rest, size)
+
+
+def _norms(J: Float[np.ndarray, "n q"]) -> Float[np.ndarray, " q"]:
+    """Of the columns, without squares that overflow; 1 where one has next to no effect."""
+    most = np.max(np.abs(J), axis=0)
+    norms = most * np.linalg.norm(J / np.where(most > 0, most, 1.0), axis=0)
+    return np.where(norms > _NO_EFFECT * max(norms.max(), 1e-300), norms, 1.0)
 
 
 def residual_curvature(

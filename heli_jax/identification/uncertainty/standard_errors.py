@@ -53,7 +53,7 @@ def standard_errors(
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
     """
     layout, estimator = at.layout, at.layout.estimator
-    usable = bool(np.all(np.isfinite(e.J)))
+    usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
     verdict = verdict_of(problem, layout, e, aliased=aliased) if usable else before
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
     freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)

@@ -22,7 +22,12 @@ from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
-from heli_jax.identification.validation.signal_quality import quantisation, saturation, stuck
+from heli_jax.identification.validation.signal_quality import (
+    quantisation,
+    saturation,
+    strays,
+    stuck,
+)
 from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
@@ -54,6 +59,7 @@ def is_it_enough(
         *_of_feedback(problem, feedback),
         *saturation(flights),
         *stuck(flights),
+        *strays(flights),
         *quantisation(flights, at.noise.sd),
         *rate_against_angle(problem),
         *against_start(flights, e.simulated),

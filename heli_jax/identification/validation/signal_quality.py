@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.flights.as_logged import mark_words
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.marks import mark_words
 from heli_jax.flights.signal_facts import (
     DROP_SHARE,
     RAIL_SHARE,
@@ -21,9 +21,10 @@ from heli_jax.flights.signal_facts import (
     facts_of_all,
     quantum,
 )
+from heli_jax.flights.strays import stray_words
 from heli_jax.identification.validation.finding import Finding
 
-__all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "stuck"]
+__all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "strays", "stuck"]
 
 _RAIL_LIMIT = f"share of the samples at a rail, {RAIL_SHARE}"
 _COARSE = 16
@@ -31,6 +32,7 @@ _COARSE = 16
 _MOVES = 0.2
 """part of the samples at which an input moves, from which on it is no sequence of steps"""
 _STUCK_LIMIT = f"seconds at one value while others change, {STUCK_SECONDS}"
+_STRAY_LIMIT = "samples that no motion leads to, 0"
 _MOST_NAMED = 4
 """signals in a sentence"""
 
@@ -135,6 +137,29 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     return [
         Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
         for length, words in found[:_MOST_NAMED]
+    ]
+
+
+def strays(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
+    """Samples that may stand for no value and are kept, the most first.
+
+    Args:
+        flights: by what each is called.
+    """
+    found = [
+        (odd.times.size, f"{label}: {name} has {stray_words(odd)}: kept, and fitted as measured; ")
+        for label, flight in flights
+        for (name, _), facts in facts_of(flight).items()
+        for odd in facts.strays
+    ]
+    if not found:
+        words = "no sample stands far outside of all others."
+        return [Finding("stray samples", "ok", words, 0.0, _STRAY_LIMIT)]
+    found.sort(key=lambda f: -f[0])
+    remedy = "empty these cells of the log, or give a window without them."
+    return [
+        Finding("stray samples", "doubt", words + remedy, float(count), _STRAY_LIMIT)
+        for count, words in found[:_MOST_NAMED]
     ]
 
 

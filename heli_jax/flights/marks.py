@@ -1,0 +1,178 @@
+"""Numbers of a log that stand for no value, such as -9999."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from heli_jax.flights.table import shown
+
+_FEWEST = 8
+"""samples of a signal beside its marks, at least"""
+_NINES = tuple(
+    sign * nines
+    for nines in (999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 99999.9, 999.99, 9999.99)
+    for sign in (1.0, -1.0)
+)
+_DECIMAL = np.sort([*_NINES, -7777.0, -8888.0, -88888.0])
+"""numbers that people choose for none: nines and eights"""
+_BINARY = np.sort([*(2.0**b - 1 for b in (15, 16, 31, 32)), *(-(2.0**b) for b in (15, 31))])
+"""the ends of integers"""
+_HUNDREDTHS = np.array([-327.68, 327.67, 655.35])
+_KNOWN = np.sort(np.concatenate([_DECIMAL, _BINARY, _HUNDREDTHS]))
+_SMALLEST = 300.0
+"""below which there are none: nearly all signals are done with by that"""
+_SINGLE = 1e-6
+"""of a mark, by which its number may miss it: single precision, and units that are converted"""
+_ABSURD = 1e9
+"""in the log's own numbers: larger ones are no measurement, such as 1e10 and 3.4e38"""
+_MOST, _FEW = 0.2, 2
+"""part of the samples that are absurd, at most, unless they are so few values: a counter may be as
+large for half of its time"""
+_APART = 1.0
+"""times the range of all other values, by which a mark lies outside of it"""
+_ASIDE = 0.25
+"""the same of a number that may be one"""
+_LEVELS = 4
+"""distinct values that a signal has beside its marks, at least"""
+_FAR = 10.0
+"""times the range of fewer values, from which on a number may be a mark"""
+_SPACING = 3.0
+"""times the largest distance between neighbouring values, by which what may be a mark is off"""
+_MOST_NOTES = 6
+WHY_SUSPECTED = "which loggers write where they have no value"
+
+Counts = tuple[tuple[float, int], ...]
+"""values, as the log has them, and how many of each there are"""
+
+
+def at_marks(numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) of a log surely stand for no value: known marks far outside of all
+    others or of a sign that no other number has, and numbers that nothing measures."""
+    absurd, known = is_absurd(numbers), _is_one_of(_KNOWN, numbers)
+    none = np.zeros(numbers.shape, bool)
+    if not (absurd.any() or known.any()):
+        return none
+    # Known marks at any share: of a slow sensor, most rows of a table hold nothing else.
+    at = known | absurd if _is_mark(numbers, absurd & ~known) else known
+    rest = numbers[np.isfinite(numbers) & ~at]
+    # Of a switch between a few values any of them may be one.
+    if rest.size < _FEWEST or np.unique(rest).size < _LEVELS:
+        return none
+    low, high = float(rest.min()), float(rest.max())
+    away = _APART * (high - low)
+    far = (numbers > high + away) | (numbers < low - away)
+    # Among rotor speeds -9999 is not far, but the only one below zero.
+    other_sign = (numbers < 0) if low >= 0 else (numbers > 0) if high <= 0 else none
+    return at & (far | (other_sign & _is_one_of(_DECIMAL, numbers)))
+
+
+def is_absurd(numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) of a log nothing measures, whatever their unit."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(numbers) > _ABSURD
+
+
+def _is_mark(numbers: np.ndarray, absurd: np.ndarray) -> bool:
+    """Whether absurd numbers are few, or nearly always the same."""
+    count = np.count_nonzero(absurd)
+    if count <= _MOST * np.count_nonzero(np.isfinite(numbers) | absurd):
+        return True
+    return np.unique(numbers[absurd]).size <= _FEW
+
+
+def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    at = np.zeros(numbers.shape, bool)
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero(np.abs(numbers) > _SMALLEST)
+    large = numbers[rows]
+    i = np.clip(np.searchsorted(marks, large), 1, marks.size - 1)
+    nearest = np.minimum(
+        np.abs(large - marks[i - 1]) / np.abs(marks[i - 1]),
+        np.abs(large - marks[i]) / np.abs(marks[i]),
+    )
+    at[rows[nearest <= _SINGLE]] = True
+    return at
+
+
+def suspected(numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) of a log may be marks and are not sure to be: repeated outside of
+    all others, though not far, or beside so few values that each may mean something."""
+    known, none = _is_one_of(_KNOWN, numbers), np.zeros(numbers.shape, bool)
+    if not known.any():
+        return none
+    rest = numbers[np.isfinite(numbers) & ~known]
+    levels = np.unique(rest)
+    if not levels.size:
+        return none
+    low, high = float(levels[0]), float(levels[-1])
+    if levels.size < _LEVELS or rest.size < _FEWEST:
+        below = (numbers < 0) & _is_one_of(_DECIMAL, numbers) & (low >= 0)
+        far = (np.abs(numbers - low) > _FAR * (high - low)) & (levels.size > 1)
+        return known & (below | far)
+    aside = max(_SPACING * float(np.diff(levels).max()), _ASIDE * (high - low))
+    at = known & ((numbers > high + aside) | (numbers < low - aside))
+    # A peak may be any number, but hardly twice the same.
+    for value in np.unique(numbers[at]):
+        if np.count_nonzero(numbers == value) < 2:
+            at &= numbers != value
+    return at
+
+
+def suspect_notes(numbers: np.ndarray) -> list[str]:
+    """What is said of numbers (N,) that may be marks, behind the name of their channel."""
+    at = suspected(numbers)
+    return [f"has {listed(counted(numbers[at]))}, {WHY_SUSPECTED}: kept"] if at.any() else []
+
+
+def at_sure_or_suspected(numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) are not to be computed with: of what comes of a -9999 that was
+    kept nobody would know any more that it was one."""
+    at = at_marks(numbers)
+    return at | suspected(np.where(at, np.nan, numbers))
+
+
+def without_marks(numbers: np.ndarray) -> np.ndarray:
+    """Numbers (N,) of a log, NaN where one stands for no value."""
+    at = at_marks(numbers)
+    return np.where(at, np.nan, numbers) if at.any() else numbers
+
+
+def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
+    """Notes on the marks that channels have, each of a name and numbers (N,) of any kind."""
+    notes = []
+    for name, numbers in channels:
+        x = np.asarray(numbers)
+        # Of what was never logged nothing else is there, and a switch may have any value.
+        if x.dtype.kind in "biuf" and (at := at_marks(x := x.astype(np.float64))).any():
+            # What counts first: a terminal shows the beginning.
+            stand = "stands" if np.count_nonzero(at) == 1 else "stand"
+            words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
+            notes.append(f"{words}: a fit takes them as missing")
+    more = len(notes) - _MOST_NOTES
+    return [*notes[:_MOST_NOTES], f"{more} more channels have such samples"] if more > 0 else notes
+
+
+def counted(values: np.ndarray) -> Counts:
+    """Each of the values (K,) of a log once, and how often it is there."""
+    numbers, counts = np.unique(values, return_counts=True)
+    return tuple((float(f"{v:.7g}"), int(n)) for v, n in zip(numbers, counts, strict=True))
+
+
+def mark_words(marks: Counts, size: int | None = None) -> str:
+    """`10 samples of -9999 and 1 of 1e+10, far outside of all others`.
+
+    Args:
+        marks: at least one.
+        size: of all samples, theirs among them; a large share is said.
+    """
+    share = sum(n for _, n in marks) / max(size, 1) if size is not None else 0.0
+    often = f" ({100 * share:.0f} % of all)" if share > _MOST else ""
+    return f"{listed(marks)}{often}, far outside of all others"
+
+
+def listed(counts: Counts) -> str:
+    """`10 samples of -9999 and 1 of 1e+10`; of at least one value."""
+    words = [f"{n} of {v:.7g}" for v, n in counts[:3]]
+    words[0] = words[0].replace(" of", " sample of" if counts[0][1] == 1 else " samples of", 1)
+    more = f" and {len(counts) - 3} more such values" if len(counts) > 3 else ""
+    return " and ".join(words) + more

@@ -1,0 +1,54 @@
+"""Units of clocks as files write them: words, abbreviations, at the end of a column's name."""
+
+import re
+
+import numpy as np
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+"""of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
+_WORDS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"),
+    "us": ("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+}
+_UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
+# A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
+# bracket was opened that has to be closed.
+_AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
+_LONGEST_FLIGHT = 6 * 3600.0
+"""s: ticks that would make a longer one are more likely of the next smaller unit"""
+
+
+def time_unit(text: str) -> str | None:
+    """The unit of time that a text means: `ms` of Milliseconds, msec and Ms; None for others.
+
+    Of a clock, a capital is a way of writing: megaseconds nobody logs.
+    """
+    # The micro sign, and the Greek letter that looks the same.
+    word = text.strip().casefold().replace("µ", "u").replace("μ", "u")
+    return _UNITS.get(word)
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A column's name without the unit of time at its end, and this unit, empty where there is
+    none."""
+    match = _AT_END.fullmatch(name)
+    unit = time_unit(match[3]) if match else None
+    return (match[1], unit) if match and unit else (name, "")
+
+
+def likely_unit(stamps: np.ndarray | None) -> str:
+    """The unit of stamps (N,) by their usual step: no flight is logged once in 5 s, or lasts a
+    day."""
+    if stamps is None or stamps.size < 2:
+        return "s"
+    with np.errstate(all="ignore"):
+        step = float(np.median(np.diff(stamps)))
+        length = float(stamps[-1] - stamps[0])
+    # From the coarsest unit on: the first in which the usual step is that of a log is taken.
+    for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
+        if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
+            return unit
+    return "ns"
