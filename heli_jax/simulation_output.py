@@ -46,12 +46,11 @@ def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simu
         InputError: the place cannot be written to.
     """
     # Imported here: no other command needs the page.
-    from heli_jax.report.origin import origin
     from heli_jax.report.view import write_view as write
 
     title, params = experiment.path.stem, experiment.vehicle.params
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes, origin())
+        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes)
 
 
 @contextlib.contextmanager

@@ -80,10 +80,7 @@ def fit_json(
             "methods": methods_content(supplementary.methods),
             "intervals": content.intervals(supplementary.intervals),
             "record": [f._asdict() for f in supplementary.findings],
-            "log_likelihood": fit.log_likelihood,
-            "unknowns": fit.unknowns,
-            "aic": fit.aic,
-            "bic": fit.bic,
+            **content.likelihood(fit),
             # The words of the format, with which programs compare: not to be polished.
             "covariance": "coloured residuals" if fit.coloured else "white",
             **content.residuals(fit),
@@ -97,13 +94,19 @@ def fit_json(
             "starts": content.starts(fit),
             "steps": fit.steps,
             "notes": list(fit.notes),
-            "timing_s": fit.timing,
-            "versions": versions(),
-            "data": [content.source(f) for f in problem.flights],
-            "inputs": [content.holds(f) for f in problem.flights],
-            "seed": fit.seed,
+            **_provenance(fit, problem),
         }
     )
+
+
+def _provenance(fit: Fit, problem: Problem) -> dict[str, Any]:
+    return {
+        "timing_s": fit.timing,
+        "versions": versions(),
+        "data": [content.source(f) for f in problem.flights],
+        "inputs": [content.holds(f) for f in problem.flights],
+        "seed": fit.seed,
+    }
 
 
 def check_json(check: Check, log_notes: Sequence[str] = ()) -> dict[str, Any]:

@@ -109,6 +109,16 @@ def metrics(fit: Fit) -> dict[str, Any]:
     }
 
 
+def likelihood(fit: Fit) -> dict[str, Any]:
+    """Log-likelihood, how many unknowns it took, and the criteria of both."""
+    return {
+        "log_likelihood": fit.log_likelihood,
+        "unknowns": fit.unknowns,
+        "aic": fit.aic,
+        "bic": fit.bic,
+    }
+
+
 def adequacy(adequacy: Adequacy) -> dict[str, Any]:
     """Whether the model explains what was measured."""
     return {
