@@ -70,7 +70,7 @@ class FitRun:
             ValueError: the report has no figure of that name; the sentence lists those it has.
         """
         # Here, since matplotlib takes a second, and a fit without report needs none of it.
-        from heli_jax.report.html import Analysis, drawings
+        from heli_jax.report.drawings import Analysis, drawings
         from heli_jax.report.style import styled
 
         shown = _with_responses(self) if name.startswith("match") else self.supplementary
@@ -335,8 +335,9 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     Raises:
         InputError: `out` exists or cannot be written to.
     """
-    from heli_jax.report.html import Analysis
+    from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
+    from heli_jax.report.origin import origin
 
     out = Path(out)
     run_directory.require_free(out)
@@ -349,7 +350,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
-        write_page(folder, analysis, title, vehicle.constants)
+        beside = ("config.yaml", "fit.json", "signals.csv")
+        write_page(folder, analysis, title, vehicle.constants, origin(text, beside))
         run.fit.timing["report"] = time.perf_counter() - started
         # fit.json comes last, since it holds how long all the rest took.
         run.fit.timing["total"] = time.perf_counter() - run.began

@@ -1,4 +1,5 @@
-"""A flight in 3D: a plotly figure with the path and a machine that flies along it."""
+"""A flight in 3D as plain data: the path, the attitude, and the shape of a machine that flies
+along it. The page draws them (`assets/flight.js`)."""
 
 from typing import Any
 
@@ -7,40 +8,27 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from heli_jax.report import style
+from heli_jax.report.embedded import Numbers
 from heli_jax.simulation.trajectory import Trajectory
 
-MOST_FRAMES = 200
-"""moments that are shown at most"""
-_PATH_POINTS = 2000
-_DIAGONAL = 1.45
-"""of the box in plotly's units: from `_VIEWS` all of it is seen, with the titles of its axes, also
-where the page is as narrow as a telephone"""
-_CENTRE = {"x": 0.0, "y": 0.0, "z": -0.12}
-"""of the box as it is looked at: a little low, so that the titles below it are in the picture"""
+MOST_MOMENTS = 3000
+"""of a flight, between which the page interpolates"""
 _SMALLEST = 0.1
 """rotor diameter over the length of the path: a smaller machine is drawn larger"""
 _AROUND = 16
 """corners of what is round"""
 _DIGITS = 4
-"""of a coordinate [m]: a tenth of a millimetre is more than a screen shows"""
-_LIGHT = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.1}
-_VIEWS = {
-    "side": {"x": 0.3, "y": -1.9, "z": 0.5},
-    "behind": {"x": -1.9, "y": 0.0, "z": 0.6},
-    # Not straight from above: there plotly cannot tell which way is up.
-    "above": {"x": -0.01, "y": 0.0, "z": 2.3},
-    "three-quarter": {"x": -1.3, "y": -1.3, "z": 0.9},
-}
+"""of a coordinate of the shape [m]: a tenth of a millimetre is more than a screen shows"""
 
 type Points = Float[np.ndarray, "n 3"]
 
 # States and parameters are records of a model, which may be a user's own class: annotated Any.
 
 
-def frames_of(n: int) -> np.ndarray:
-    """Which of n samples are shown: all, or at most `MOST_FRAMES` evenly among them."""
+def moments_of(n: int) -> np.ndarray:
+    """Which of n samples are kept: all, or at most `MOST_MOMENTS` evenly among them."""
     # Rounded, not truncated: the first and the last sample are among them.
-    return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_FRAMES))).astype(int))
+    return np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_MOMENTS))).astype(int))
 
 
 def size_of(run: Trajectory, R: float) -> float:
@@ -65,51 +53,47 @@ def placed(shape: Points, turn: Rotation, at: np.ndarray) -> Points:
         turn: of the body.
         at: (3,) position of the body's origin in the figure [m].
     """
-    # Forward, left and up are right-handed, as plotly takes its axes to be; forward, right and up
+    # Forward, left and up are right-handed, as a viewer takes axes to be; forward, right and up
     # are not, and the machine would be its mirror image.
     return turn.apply(shape) * np.array([1.0, -1.0, -1.0]) + at
 
 
-def animation(run: Trajectory, params: Any) -> dict[str, Any]:
-    """The flight as a plotly figure, in plain data: data, layout and frames.
+def scene(run: Trajectory, params: Any, numbers: Numbers, name: str = "") -> dict[str, Any]:
+    """The flight as plain data; its arrays go to the page's numbers.
 
-    `run` is of a whole helicopter with NumPy arrays, `params` its Helicopter.
+    Args:
+        run: of a whole helicopter, with NumPy arrays.
+        params: its Helicopter.
+        numbers: the page's.
+        name: of the run.
     """
-    # Plain data and not plotly's objects, which check every value of every frame: seconds.
-    path, turns = _path(run.states), attitude(run.states)
-    R = float(params.R)
-    size = size_of(run, R)
-    pod, disk, outline = (size * p for p in (_pod(R), _disk(params), _outline(params)))
-    shown = frames_of(path.shape[0])
+    path, size, R = _path(run.states), size_of(run, float(params.R)), float(params.R)
+    kept = moments_of(path.shape[0])
+    bounds = np.stack([path.min(axis=0) - 2.2 * size * R, path.max(axis=0) + 2.2 * size * R])
+    # Quaternions and not angles: between two headings of 359 and 1 degree lie two degrees.
+    turns = _continuous(attitude(run.states).as_quat()[kept])
+    return {
+        "name": name,
+        "times": numbers.array(np.asarray(run.times)[kept], exact=True),
+        "path": [numbers.array(v) for v in path[kept].T],
+        "turns": [numbers.array(v) for v in turns.T],
+        "bounds": bounds.tolist(),
+        "ticks": [_ticks(low, high).tolist() for low, high in bounds.T],
+        "parts": [
+            {"faces": _pod_faces().tolist(), "points": _rounded(size * _pod(R)),
+             "color": style.VERMILLION, "alpha": 1.0},
+            {"faces": _disk_faces().tolist(), "points": _rounded(size * _disk(params)),
+             "color": style.GREY, "alpha": 0.4},
+        ],
+        "outlines": [_rounded(size * line) for line in _outlines(params)],
+    }  # fmt: skip
 
-    # The frames hold points alone: colours and faces stay those of the traces that they move.
-    def moving(k: int) -> list[dict[str, Any]]:
-        flown = path[shown[shown <= k]]
-        parts = [placed(p, turns[k], path[k]) for p in (pod, disk, outline)]
-        kinds = ("scatter3d", "mesh3d", "mesh3d", "scatter3d")
-        return [{"type": kind, **_xyz(p)} for kind, p in zip(kinds, (flown, *parts), strict=True)]
 
-    bounds = _bounds(path, 2.2 * size * R)
-    shadow = path.copy()
-    shadow[:, 2] = bounds[0, 2] + 0.005 * np.ptp(bounds[:, 2])  # on the floor it would be cut
-    still = np.unique(np.linspace(0, path.shape[0] - 1, _PATH_POINTS).astype(int))
-    line = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "showlegend": False}
-    # Traces 2 to 5 are those that the frames move; shadow and path, 0 and 1, stay.
-    first = moving(int(shown[0]))
-    data = [
-        {**line, **_xyz(shadow[still]), "line": {"color": "#C4C4C4", "width": 3}},
-        {**line, **_xyz(path[still]), "line": {"color": style.PALE, "width": 2}},
-        {**line, **first[0], "line": {"color": style.BLUE, "width": 5}},
-        {**_mesh(first[1], _pod_faces()), "color": style.VERMILLION, "lighting": _LIGHT},
-        {**_mesh(first[2], _disk_faces()), "color": style.GREY, "opacity": 0.45},
-        {**line, **first[3], "line": {"color": style.BLACK, "width": 4}},
-    ]
-    times = np.asarray(run.times)[shown]
-    frames = [{"name": str(k), "data": moving(int(k)), "traces": [2, 3, 4, 5]} for k in shown]
-    names = {f["name"]: f"{t:.2f}" for f, t in zip(frames, times, strict=True)}
-    # [ms], so that the flight is played as fast as it was flown.
-    pace = 1000.0 * float(times[-1] - times[0]) / max(1, len(times) - 1)
-    return {"data": data, "layout": _layout(bounds, names, pace), "frames": frames}
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """(n, 4), each of the two signs of a turn that is nearer to the one before."""
+    along = np.sum(quaternions[1:] * quaternions[:-1], axis=1)
+    signs = np.concatenate([[1.0], np.cumprod(np.where(along < 0.0, -1.0, 1.0))])
+    return quaternions * signs[:, None]
 
 
 def _path(states: Any) -> Points:
@@ -118,19 +102,8 @@ def _path(states: Any) -> Points:
     return np.stack([x, -y, z], axis=1)
 
 
-def _xyz(points: Points) -> dict[str, list[float | None]]:
-    """Columns of a trace; NaN, which breaks a line, as None."""
-    columns = np.round(points, _DIGITS).T.tolist()
-    # JSON has no NaN; v != v is true of NaN alone.
-    return {
-        name: [None if v != v else v for v in column]
-        for name, column in zip("xyz", columns, strict=True)
-    }
-
-
-def _mesh(points: dict[str, Any], faces: np.ndarray) -> dict[str, Any]:
-    i, j, k = faces.T.tolist()
-    return {"hoverinfo": "skip", **points, "i": i, "j": j, "k": k}
+def _rounded(points: Points) -> list[list[float]]:
+    return np.round(points, _DIGITS).tolist()
 
 
 def _circle(radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -180,8 +153,8 @@ def _hub(p: Any) -> np.ndarray:
     return np.array([-float(p.lr), 0.0, -max(float(p.hr), 0.3 * float(p.R))])
 
 
-def _outline(p: Any) -> Points:
-    """Mast, tail boom with the tail rotor, fin and skids, as lines broken by NaN."""
+def _outlines(p: Any) -> list[Points]:
+    """Mast, tail boom with fin, tail rotor, rotor's rim, skids and their legs, each a line."""
     R, tail, hub = float(p.R), float(p.L_T), _hub(p)
     a, b = _circle(float(p.R_T))
     wheel = np.stack([a - tail, np.zeros(_AROUND), b], axis=1)
@@ -197,90 +170,7 @@ def _outline(p: Any) -> Points:
         *skids,
         *legs,
     ]
-    gap = np.full((1, 3), np.nan)
-    return np.concatenate([np.concatenate([np.asarray(part), gap]) for part in parts])
-
-
-def _bounds(path: Points, margin: float) -> Float[np.ndarray, "2 3"]:
-    return np.stack([path.min(axis=0) - margin, path.max(axis=0) + margin])
-
-
-def _layout(bounds: np.ndarray, names: dict[str, str], pace: float) -> dict[str, Any]:
-    """`names` are the frames' with their times as text, `pace` the time between two [ms]."""
-    # One scale for all three axes: attitude angles are to be seen as they are.
-    spans = bounds[1] - bounds[0]
-    # By the diagonal: it stays as long whichever way the box is turned, so that nothing is cut.
-    ratio = spans / np.linalg.norm(spans) * _DIAGONAL
-    y = _ticks(-bounds[1, 1], -bounds[0, 1])
-    # The figure's axis points left: its labels say y to the right.
-    mirrored = {"tickvals": (-y).tolist(), "ticktext": [f"{v:g}" for v in y]}
-    scene: dict[str, Any] = {
-        "aspectmode": "manual",
-        "aspectratio": dict(zip("xyz", np.round(ratio, 5).tolist(), strict=True)),
-        "camera": {"eye": _VIEWS["three-quarter"], "center": _CENTRE},
-        "dragmode": "orbit",
-        # A constant: what the reader has turned stays so while frames are played.
-        "uirevision": "kept",
-    }
-    titles = {"x": "forward [m]", "y": "right [m]", "z": "height [m]"}
-    for i, (name, title) in enumerate(titles.items()):
-        scene[f"{name}axis"] = {
-            "title": {"text": title},
-            "range": bounds[:, i].tolist(),
-            "backgroundcolor": "#F6F6F6",
-            "showbackground": True,
-            "gridcolor": "#DDDDDD",
-            "zeroline": False,
-            **(mirrored if name == "y" else {"nticks": 7}),
-        }
-    return {
-        # No height: it is that of the page's style, which knows how wide the screen is.
-        "margin": {"l": 0, "r": 0, "t": 40, "b": 125},
-        "modebar": {"orientation": "v", "remove": ["pan3d", "zoom3d", "orbitRotation"]},
-        "font": {"family": "DejaVu Sans, Arial, sans-serif", "size": 12},
-        "scene": scene,
-        "uirevision": "kept",
-        **_controls(names, pace),
-    }
-
-
-def _camera(eye: dict[str, float]) -> dict[str, Any]:
-    return {"scene.camera": {"eye": eye, "center": _CENTRE}}
-
-
-def _controls(names: dict[str, str], pace: float) -> dict[str, Any]:
-    """Buttons that play and turn, and a slider over the frames."""
-    # Without transitions: a frame is a moment of the run, and nothing was computed between two.
-    at_once = {"mode": "immediate", "transition": {"duration": 0}}
-    # redraw: meshes do not move without.
-    play = {**at_once, "frame": {"duration": pace, "redraw": True}, "fromcurrent": True}
-    jump = {**at_once, "frame": {"duration": 0, "redraw": True}}
-    steps = [
-        {"label": text, "method": "animate", "args": [[name], jump]} for name, text in names.items()
-    ]
-    buttons = [
-        {"label": "play", "method": "animate", "args": [None, play]},
-        {"label": "pause", "method": "animate", "args": [[None], jump]},
-    ]
-    views = [
-        {"label": name, "method": "relayout", "args": [_camera(eye)]}
-        for name, eye in _VIEWS.items()
-    ]
-    # Both rows of buttons lie outside the scene: over it they would take the mouse from it. One
-    # below the other with the slider, since beside it they overlap on a narrow screen.
-    row = {"type": "buttons", "direction": "right", "yanchor": "top", "showactive": False}
-    return {
-        "updatemenus": [
-            {**row, "buttons": buttons, "x": 0.0, "xanchor": "left", "y": 0.0, "pad": {"t": 78}},
-            {**row, "buttons": views, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},
-        ],
-        "sliders": [
-            {
-                "steps": steps, "x": 0.0, "len": 1.0, "y": 0.0, "pad": {"t": 5, "l": 8, "r": 24},
-                "font": {"size": 10}, "currentvalue": {"prefix": "time ", "suffix": " s"},
-            }
-        ],
-    }  # fmt: skip
+    return [np.asarray(part, float) for part in parts]
 
 
 def _ticks(low: float, high: float) -> np.ndarray:

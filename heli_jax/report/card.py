@@ -13,6 +13,7 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import number, percent
 from heli_jax.report import frequency
 from heli_jax.report.coherence import COHERENT, Coherence, coherences
 from heli_jax.report.frequency import FittedFlight
@@ -25,6 +26,7 @@ THEIL, THEIL_PART = 0.3, 0.1
 """Jategaonkar, Flight Vehicle System Identification (2006)"""
 # Nobody's law: what this program asks of a simulation. The page says so.
 VAF, NRMSE_FIT = 0.9, 70.0
+_VAF = "VAF"
 _CORRELATED = "largest correlation"
 _BIAS_PART = "Theil bias part"
 
@@ -46,7 +48,12 @@ class Gate(NamedTuple):
 
 
 def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
-    """Every line: parameters, their relations, agreement, whiteness, excitation."""
+    """Every line: parameters, their relations, agreement, whiteness, excitation.
+
+    None of a fit that stopped before an optimum: its numbers are no result.
+    """
+    if fit.status == "not-converged":
+        return ()
     lines: list[Gate] = []
     for name, estimate in fit.estimates.items():
         lines += _of_parameter(name, estimate, own_prior=problem.free[name].prior is not None)
@@ -78,6 +85,8 @@ def failed(lines: tuple[Gate, ...]) -> tuple[Gate, ...]:
 
 def summary(lines: tuple[Gate, ...]) -> str:
     """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`."""
+    if not lines:
+        return "none, since the optimiser stopped before an optimum"
     asked, missed = [gate for gate in lines if gate.passed is not None], failed(lines)
     text = f"{len(asked) - len(missed)} of {len(asked)} gates passed"
     if missed:
@@ -90,11 +99,14 @@ def shown(gate: Gate) -> str:
     """The value as text."""
     if math.isnan(gate.value):
         return "none"
-    text = f"{gate.value:.3g}"
+    if gate.what == _VAF:
+        return percent(gate.value)
+    text = number(gate.value, 3)
     if gate.what == _CORRELATED:
         # Two digits of what is missing to one, where three in all would say 1.
         missing = max(1.0 - abs(gate.value), 2e-5)
         text = f"{gate.value:+.{max(3, math.ceil(1.0 - math.log10(missing)))}f}"
+        text = text.replace("-", "−")
     return f"{text} {gate.unit}" if gate.unit else text
 
 
@@ -129,6 +141,10 @@ def _of_parameter(name: str, estimate: Estimate, *, own_prior: bool) -> list[Gat
         # Tischler's insensitivity: the sd that it would have were all other parameters known.
         _most("insensitivity", name, share(estimate.sd_alone), "%", INSENSITIVITY, remark),
     ]
+    if estimate.sd is None:
+        # Insensitivity would be passed: with all others known the data might determine it. They
+        # are not, and a tick beside what is not determined would be read as one for it.
+        lines[1] = lines[1]._replace(value=math.nan, passed=False)
     if estimate.prior_share > 0.05:  # less is the weak priors of what is estimated beside it
         remark = "share of the priors in the posterior precision"
         if not own_prior:
@@ -146,14 +162,17 @@ def _of_relations(fit: Fit) -> list[Gate]:
         i, j = np.unravel_index(int(np.nanargmax(size)), size.shape)
         of, value = f"{v.names[min(i, j)]}, {v.names[max(i, j)]}", float(v.correlation[i, j])
         gate = f"at most {CORRELATION:g} in size"
-        lines.append(Gate(_CORRELATED, of, value, "", gate, abs(value) <= CORRELATION))
+        missing = {*v.undetermined, *v.without_effect} & {v.names[i], v.names[j]}
+        passed = abs(value) <= CORRELATION and not missing
+        remark = "the data do not determine both" if missing else ""
+        lines.append(Gate(_CORRELATED, of, value, "", gate, passed, remark))
     return lines
 
 
 def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[Gate]:
     of = f"{name}, {source}"
     lines = [
-        _least("VAF", of, m.vaf, "", VAF),
+        _least(_VAF, of, m.vaf, "", VAF)._replace(gate=f"at least {percent(VAF, 0)}"),
         _least("NRMSE fit", of, m.nrmse_fit_percent, "%", NRMSE_FIT),
         _most("Theil coefficient", of, m.tic, "", THEIL),
         _most(_BIAS_PART, of, m.bias, "", THEIL_PART),
@@ -201,7 +220,7 @@ def _of_disturbance(fit: Fit) -> list[Gate]:
 def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
     lines = []
     for name, w in fit.whiteness.items():
-        remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
+        remark = f"{w.lags} lags, {percent(w.outside, 1)} of them outside the 99 % band"
         lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
     return lines
 
@@ -229,9 +248,8 @@ def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
     remark = f"weighted by the expected response, {coherence.segments} segments"
     what = "partial coherence" if coherence.others else "coherence"
     if not coherence.asked:
-        remark = (
-            f"not asked: the model puts {coherence.share:.0%} of this output down to this input"
-        )
+        share = percent(coherence.share, 0)
+        remark = f"not asked: the model puts {share} of this output down to this input"
     elif coherence.expected < COHERENCE:
         # A simulation has no noise: what it lacks is the segments' doing (leakage, a memory longer
         # than one of them, a nonlinear machine), and no measurement could have more.

@@ -1,26 +1,23 @@
 """The page of several runs side by side: tables, and simulated outputs over the measured."""
 
-import base64
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
 from heli_jax.report.compared_runs import ComparedRuns
+from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.panels import panels
+from heli_jax.report.origin import origin
+from heli_jax.report.page import filled
+from heli_jax.report.pictures import Picture, picture
 
 _MOST_FIGURES = 24
-
-
-class _Picture(NamedTuple):
-    title: str
-    data: str
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
@@ -30,10 +27,10 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
         path: the HTML file.
         compared: the runs.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("heli_jax.report", "."), autoescape=True
-    )
-    page = environment.get_template("compared.html.j2").render(
+    numbers = Numbers()
+    pictures = list(_pictures(compared, numbers))
+    page = filled(
+        "compared.html.j2",
         labels=compared.labels,
         tables=[
             ("Estimates", compared.estimates),
@@ -41,17 +38,18 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
             ("Agreement", compared.agreement),
         ],
         notes=compared.notes,
-        pictures=list(_pictures(compared)),
+        pictures=pictures,
+        numbers=numbers.content(),
+        origin=origin(),
     )
     path.write_text(page, encoding="utf-8")
 
 
-def _pictures(compared: ComparedRuns) -> Iterator[_Picture]:
+def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[Picture]:
     for name, output, found in itertools.islice(_overlaps(compared), _MOST_FIGURES):
-        made = style.svg(lambda f=found, n=name, o=output: _overlay(f, n, o))
+        made = picture("overlay", functools.partial(_overlay, found, name, output), numbers)
         if made is not None:
-            data = base64.b64encode(made[1]).decode("ascii")
-            yield _Picture(f"{output}, {name}", data)
+            yield made
 
 
 def _overlaps(

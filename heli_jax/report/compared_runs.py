@@ -3,13 +3,13 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
-from heli_jax.numbers import rounded
+from heli_jax.numbers import number, percent, rounded
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.summaries import Summary, as_html, as_text
 
@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 NOT_DETERMINED = "not determined"
 _ABSENT = "–"
-_METRICS = (("VAF", "vaf"), ("fit [%]", "nrmse_fit_percent"), ("TIC", "tic"))
+_METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
+    ("VAF", "vaf", percent),
+    ("fit", "nrmse_fit_percent", lambda v: percent(None if v is None else v / 100)),
+    ("TIC", "tic", lambda v: number(v, 3)),
+)
 _LATEX = str.maketrans(
     {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "^": r"\^{}", "–": "--", "±": r"$\pm$"}
     | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
@@ -73,10 +77,10 @@ class ComparedRuns(NamedTuple):
         for held_out in (False, True):
             of = [run.validation if held_out else run.metrics for run in self.runs]
             for output in _in_order(of):
-                for words, key in _METRICS:
+                for words, key, text in _METRICS:
                     values = [getattr(m.get(output), key, None) for m in of]
                     where = "held out" if held_out else "fitted"
-                    rows.append((output, where, words, *map(_number, values)))
+                    rows.append((output, where, words, *map(text, values)))
         return Table(("output", "flights", "metric", *self.labels), tuple(rows))
 
     @property
@@ -204,10 +208,6 @@ def _difference(first: Estimate | None, other: Estimate | None) -> str:
     if first.unit != other.unit or not joint:
         return _ABSENT
     return f"{(other.value - first.value) / joint:+.1f}"
-
-
-def _number(value: float | None) -> str:
-    return _ABSENT if value is None or math.isnan(value) else f"{value:.4g}"
 
 
 def _logs(run: SavedFit) -> set[str]:

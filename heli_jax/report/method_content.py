@@ -5,6 +5,7 @@ from typing import Any
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.method_comparison import MethodComparison
 from heli_jax.identification.problem import Problem
+from heli_jax.report.fit_content import parameter
 
 
 def frequency_start_content(problem: Problem) -> dict[str, Any] | None:
@@ -33,7 +34,7 @@ def methods_content(comparison: MethodComparison | None) -> dict[str, Any] | Non
             "verdict": r.word,
             "reason": r.reason or None,
             "seconds": r.seconds,
-            "parameters": {n: {**e._asdict(), "fixed": False} for n, e in estimates.items()},
+            "parameters": {n: parameter(e) for n, e in estimates.items()},
             "difference_joint_sd": {n: comparison.difference(r, n) for n in estimates},
             "notes": [] if r.fit is None else list(r.fit.notes),
         }

@@ -1,6 +1,5 @@
 """The files of `heli-jax frf`: responses as NetCDF and CSV, transfer functions, figures, a page."""
 
-import base64
 import functools
 import json
 from collections.abc import Mapping, Sequence
@@ -15,13 +14,16 @@ from heli_jax.analysis.transfer_fit import Coefficient, TransferFit
 from heli_jax.flights.write import write_table
 from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number
-from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
+from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.responses import draw_response
 from heli_jax.report.handling_json import handling_json
+from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
+from heli_jax.report.pictures import picture
 from heli_jax.report.tables.handling import handling as handling_table
 from heli_jax.report.tables.handling import handling_sentences
+from heli_jax.report.tables.table import Table
 
 _DB = 20.0 / np.log(10.0)
 
@@ -53,24 +55,27 @@ def write_responses(
         json.dumps(handling_json(handling), indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
     (directory / "figures").mkdir()
-    pictures = []
+    pictures, numbers = [], Numbers()
     for name, output in found.outputs.items():
         for input in output.pairs:
             draw = functools.partial(_draw, found, units, input, name)
-            saved = style.save(draw, directory / "figures" / _stem(input, name))
-            if saved is not None:
-                data = base64.b64encode(saved[1]).decode()
-                pictures.append({"title": saved[0], "data": data})
+            pictures.append(
+                picture(_stem(input, name), draw, numbers, folder=directory / "figures")
+            )
     page = filled(
         "responses.html.j2",
         title=title,
-        pictures=pictures,
+        pictures=[p for p in pictures if p is not None],
+        numbers=numbers.content(),
+        origin=origin(),
         notes=found.notes,
-        head=("input", "output", "averages", *FIT_HEAD),
-        rows=[
-            (w.input, w.output, f"{found.outputs[w.output].averages:.1f}", *fit_row(fit))
-            for w, fit in found.fits
-        ],
+        fits=Table(
+            ("input", "output", "averages", *FIT_HEAD),
+            [
+                (w.input, w.output, number(found.outputs[w.output].averages, 3), *fit_row(fit))
+                for w, fit in found.fits
+            ],
+        ),
         window=f"{found.window:g}",
         handling=handling_table(handling),
         handling_sentences=handling_sentences(handling),

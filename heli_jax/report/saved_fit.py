@@ -119,7 +119,9 @@ def _content(path: Path) -> dict[str, Any]:
 
 def _estimate(saved: Mapping[str, Any]) -> Estimate:
     # By name and these alone: a file may have keys that a later version added.
-    return Estimate(**{name: saved[name] for name in Estimate._fields})
+    fields = {name: saved[name] for name in Estimate._fields}
+    # What the data do not determine has no number in the file.
+    return Estimate(**{**fields, "value": _number(fields["value"])})
 
 
 def _metrics(saved: Mapping[str, float | None]) -> Metrics:

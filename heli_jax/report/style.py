@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import ArrayLike
@@ -134,8 +136,21 @@ def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.n
     return x[keep], y[keep]
 
 
+_LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()
+"""lines that may be thinned: their x ascends"""
+
+
+def thin(drawn: Figure) -> None:
+    """Thin the long lines of a figure to what can be seen of them."""
+    # Not when they are drawn: the page's own drawing of a figure, which is zoomed, has all points.
+    for ax in drawn.axes:
+        for long in ax.get_lines():
+            if long in _LONG and np.size(long.get_xdata()) > MOST_POINTS:
+                long.set_data(*thinned(np.asarray(long.get_xdata()), np.asarray(long.get_ydata())))
+
+
 def line(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
-    """Draw a line of any length, thinned.
+    """Draw a line of any length; it is thinned when the figure is saved.
 
     Args:
         ax: where.
@@ -143,7 +158,7 @@ def line(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
         y: (N,)
         **line_style: as of matplotlib's `plot`.
     """
-    ax.plot(*thinned(np.asarray(x), np.asarray(y)), **line_style)
+    _LONG.update(ax.plot(np.asarray(x), np.asarray(y), **line_style))
 
 
 def samples(ax: Axes, x: ArrayLike, y: ArrayLike, **line_style: Any) -> None:
@@ -230,14 +245,32 @@ def svg(draw: Callable[[], Figure | None]) -> tuple[str, bytes] | None:
     """Draw a figure in the style: its first title and the SVG; None where there is none."""
     with matplotlib.rc_context(STYLE):
         drawn = draw()
-        return None if drawn is None else (drawn.axes[0].get_title("left"), _svg(drawn))
+        return None if drawn is None else (drawn.axes[0].get_title("left"), as_svg(drawn))
 
 
-def _svg(drawn: Figure) -> bytes:
+def as_svg(drawn: Figure) -> bytes:
+    """A figure that was drawn in the style, within it, as SVG."""
+    thin(drawn)
     buffer = io.BytesIO()
     # Without a date: the same fit gives the same file.
     drawn.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
+
+
+def as_png(drawn: Figure) -> bytes:
+    """A figure that was drawn in the style, within it, as PNG."""
+    thin(drawn)
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format="png", dpi=_DPI)
+    return buffer.getvalue()
+
+
+def saved(drawn: Figure, path: Path) -> bytes:
+    """Write a figure that was drawn in the style, within it, as `path`.svg and .png; the SVG."""
+    data = as_svg(drawn)
+    path.with_suffix(".png").write_bytes(as_png(drawn))
+    path.with_suffix(".svg").write_bytes(data)
+    return data
 
 
 def save(draw: Callable[[], Figure | None], path: Path) -> tuple[str, bytes] | None:
@@ -250,7 +283,5 @@ def save(draw: Callable[[], Figure | None], path: Path) -> tuple[str, bytes] | N
         drawn = draw()
         if drawn is None:
             return None
-        data = _svg(drawn)
-        drawn.savefig(path.with_suffix(".png"), dpi=_DPI)
-    path.with_suffix(".svg").write_bytes(data)
+        data = saved(drawn, path)
     return drawn.axes[0].get_title("left"), data

@@ -1,34 +1,28 @@
 """A simulated manoeuvre as a page: its figures, and the flight in 3D, in one file."""
 
-import base64
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import markupsafe
 import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax.analysis.trim import is_full_nonlinear
 from heli_jax.dynamics.model import Model
-from heli_jax.report import manoeuvre, style
-from heli_jax.report.animation import animation, size_of
+from heli_jax.report import manoeuvre
+from heli_jax.report.animation import scene, size_of
+from heli_jax.report.drawings import MOST_FLIGHTS
+from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures import Panels
-from heli_jax.report.html import MOST_FLIGHTS, Picture
+from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
+from heli_jax.report.pictures import Picture, picture
 from heli_jax.simulation.trajectory import Trajectory
 
 _HUGE = 1e9
 """what no state of a machine reaches, and no figure can draw"""
-# Unless told otherwise plotly offers a button that uploads the data.
-_SETTINGS = {
-    "displaylogo": False,
-    "responsive": True,
-    "showSendToCloud": False,
-    "plotlyServerURL": "",
-}
 
 
 # Parameters of a model are a class of the user's own: they are annotated Any.
@@ -39,8 +33,8 @@ class Shown(NamedTuple):
 
     name: str
     pictures: list[Picture]
-    flight: markupsafe.Markup | None
-    """the flight in 3D, of a whole helicopter"""
+    scene: int | None
+    """the flight in 3D, of a whole helicopter: its number among the page's scenes"""
     size: float
     """how many times its size the machine is drawn there"""
 
@@ -55,7 +49,7 @@ def write_view(
 ) -> None:
     """Write the page of some runs of a model, with NumPy arrays, by their names.
 
-    It refers to nothing outside itself, and titles and names are escaped.
+    It loads nothing from outside itself, and titles and names are escaped.
 
     Args:
         path: of the page.
@@ -69,17 +63,15 @@ def write_view(
         OSError: the place cannot be written to.
     """
     whole = is_full_nonlinear(model)
-    shown = []
+    shown, numbers = [], Numbers()
     for name, whole_run in list(runs.items())[:MOST_FLIGHTS]:
         run = _finite(whole_run)
-        flight, size = None, 1.0
+        number, size = None, 1.0
         # Of two samples one may still not be finite: figures leave it out, a 3D scene cannot.
         if whole and _good(run).all():
-            # plotly's program is 4 MB: the first figure brings it for all.
-            first = all(other.flight is None for other in shown)
-            flight = _flight(run, params, len(shown) + 1, first)
-            size = size_of(run, float(params.R))
-        shown.append(Shown(name, _pictures(run, model), flight, size))
+            number, size = len(numbers.scenes), size_of(run, float(params.R))
+            numbers.scenes.append(scene(run, params, numbers, name))
+        shown.append(Shown(name, _pictures(run, model, numbers), number, size))
     # Flights that are not drawn are counted on the page, so that nobody takes those shown for all.
     page = filled(
         "view.html.j2",
@@ -89,6 +81,8 @@ def write_view(
         runs=shown,
         whole=whole,
         unshown=max(0, len(runs) - MOST_FLIGHTS),
+        origin=origin(),
+        numbers=numbers.content(),
     )
     path.write_text(page, encoding="utf-8")
 
@@ -105,15 +99,12 @@ def _finite(run: Trajectory) -> Trajectory:
     return run if good.all() else run.first(max(2, int(np.argmin(good))))
 
 
-def _pictures(run: Trajectory, model: Model) -> list[Picture]:
-    pictures = []
-    for function in (manoeuvre.motion, manoeuvre.sticks):
-        saved = style.svg(functools.partial(_figure, function, run, model))
-        if saved is not None:
-            title, svg = saved
-            data = base64.b64encode(svg).decode("ascii")
-            pictures.append(Picture(function.__name__, title, data))
-    return pictures
+def _pictures(run: Trajectory, model: Model, numbers: Numbers) -> list[Picture]:
+    made = [
+        picture(function.__name__, functools.partial(_figure, function, run, model), numbers)
+        for function in (manoeuvre.motion, manoeuvre.sticks)
+    ]
+    return [p for p in made if p is not None]
 
 
 def _figure(
@@ -121,22 +112,3 @@ def _figure(
 ) -> Figure | None:
     figure = function(run, model)[0].figure
     return figure if isinstance(figure, Figure) else None
-
-
-def _flight(run: Trajectory, params: Any, number: int, first: bool) -> markupsafe.Markup:
-    """The 3D figure; the first one brings plotly's own program with it."""
-    import plotly.io  # not at the start: only this page needs it, and it takes its time
-
-    text = plotly.io.to_html(
-        animation(run, params),
-        config=_SETTINGS,
-        include_plotlyjs=first,
-        full_html=False,
-        # Several flights on a page would else all begin at once.
-        auto_play=False,
-        # Its checks take seconds; a test holds that the figure is one of plotly's.
-        validate=False,
-        # plotly's own ids are random; the same run shall give the same page.
-        div_id=f"flight{number}",
-    )
-    return markupsafe.Markup(text)

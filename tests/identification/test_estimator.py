@@ -10,7 +10,8 @@ from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.methods import METHODS, Method
 from heli_jax.identification.uncertainty.comparison import intervals
 from heli_jax.report.card import card
-from heli_jax.report.html import Analysis, write_report
+from heli_jax.report.drawings import Analysis
+from heli_jax.report.html import write_report
 from tests.identification.bench import BENCH, record, vehicle
 
 

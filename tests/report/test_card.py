@@ -44,8 +44,8 @@ def test_a_correlation_keeps_its_sign_and_the_digits_that_tell_it_from_one(sound
     close = dataclasses.replace(fit, verdict=dataclasses.replace(v, correlation=correlation))
     [line] = [g for g in card(problem, close) if g.what == "largest correlation"]
     assert (line.value, line.passed) == (-0.99986, False)
-    assert shown(line) == "-0.99986"
-    for value, text in ((-1.0, "-1.000000"), (0.42, "+0.420"), (0.9972, "+0.9972")):
+    assert shown(line) == "−0.99986"
+    for value, text in ((-1.0, "−1.000000"), (0.42, "+0.420"), (0.9972, "+0.9972")):
         assert shown(line._replace(value=value)) == text
 
 

@@ -8,9 +8,10 @@ from heli_jax.analysis.attitude_responses import handling_pairs
 from heli_jax.analysis.flight_responses import Settings
 from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import frequency
+from heli_jax.report.drawings import Analysis, drawings
 from heli_jax.report.files import SupplementaryAnalyses, fit_json
 from heli_jax.report.fitted_responses import fitted_responses
-from heli_jax.report.html import Analysis, drawings, render
+from heli_jax.report.html import render
 from heli_jax.report.style import styled
 from heli_jax.report.tables.handling import handling_lines
 

@@ -1,5 +1,7 @@
 """The page of a manoeuvre: whole in itself, escaped, and a machine that is turned the right way."""
 
+import base64
+import json
 import re
 from types import SimpleNamespace
 
@@ -7,10 +9,12 @@ import diffrax as dfx
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from heli_jax import models
 from heli_jax.dynamics.helicopter import HelicopterInputs, HelicopterOutputs
 from heli_jax.report import animation, manoeuvre
+from heli_jax.report.embedded import Numbers
 from heli_jax.report.view import write_view
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.vehicle import load_vehicle
@@ -68,42 +72,43 @@ def test_the_mast_points_where_the_thrust_does(xcell):
     np.testing.assert_allclose(up * [1, -1, 1], pull / np.linalg.norm(pull), atol=1e-9)
 
 
-def test_frames_follow_the_run(xcell):
-    import plotly.graph_objects as go
+def decoded(content, number):
+    """An array of a page, by hand."""
+    a = content["arrays"][number]
+    if "n" in a:
+        return a["from"] + a["step"] * np.arange(a["n"])
+    if "f" in a:
+        return np.frombuffer(base64.b64decode(a["f"]), "<f4").astype(float)
+    parts = np.frombuffer(base64.b64decode(a["q"]), "<u2")
+    return np.where(parts == 65535, np.nan, a["low"] + a["step"] * parts)
 
+
+def test_the_scene_follows_the_run(xcell):
     t = 0.02 * np.arange(1000)
-    run = flown(1000, x=2.0 * t, y=0.5 * t, z=0.1 * t, phi=0.2 * np.sin(t))
-    figure = animation.animation(run, xcell)
-    go.Figure(figure)  # plotly knows every name in it
-    assert len(figure["frames"]) == animation.MOST_FRAMES
-    scene = figure["layout"]["scene"]
-    spans = {a: np.ptp(scene[f"{a}axis"]["range"]) for a in "xyz"}
-    ratio = {a: scene["aspectratio"][a] / spans[a] for a in "xyz"}
-    assert ratio["x"] == pytest.approx(ratio["y"], rel=1e-3)
-    assert ratio["x"] == pytest.approx(ratio["z"], rel=1e-3)
-    # As large whatever the path: all of it is seen at the distance of the views.
-    assert np.linalg.norm(list(scene["aspectratio"].values())) == pytest.approx(1.45, rel=1e-3)
-    last = figure["frames"][-1]
-    steps = figure["layout"]["sliders"][0]["steps"]
-    assert (steps[-1]["label"], steps[-1]["args"][0]) == ("19.98", [last["name"]])
-    assert len({f["name"] for f in figure["frames"]}) == len(steps)
-    path = last["data"][0]
-    assert (path["x"][-1], path["y"][-1]) == pytest.approx((2 * t[-1], -0.5 * t[-1]), abs=1e-3)
-    assert len(figure["frames"][10]["data"][0]["x"]) == 11
-    low, high = scene["yaxis"]["range"]
-    for at, text in zip(scene["yaxis"]["tickvals"], scene["yaxis"]["ticktext"], strict=True):
-        assert low <= at <= high
-        assert float(text) == pytest.approx(-at)
-    disk = np.array([figure["data"][4][a] for a in "xyz"]).T
+    run = flown(1000, x=2.0 * t, y=0.5 * t, z=0.1 * t, phi=0.2 * np.sin(t), psi=0.6 * t)
+    numbers = Numbers()
+    made = animation.scene(run, xcell, numbers)
+    content = numbers.content()
+    path = np.array([decoded(content, n) for n in made["path"]])
+    np.testing.assert_allclose(path, [2.0 * t, -0.5 * t, 0.1 * t], atol=1e-3)
+    turns = np.array([decoded(content, n) for n in made["turns"]]).T
+    # Interpolated between two: they must not change their sign on the way.
+    assert np.all(np.sum(turns[1:] * turns[:-1], axis=1) > 0.9)
+    expected = Rotation.from_euler("ZYX", np.stack([0.6 * t, 0 * t, 0.2 * np.sin(t)], axis=1))
+    assert np.max((Rotation.from_quat(turns) * expected.inv()).magnitude()) < 2e-4
+    disk = np.array(made["parts"][1]["points"])
     radius = np.linalg.norm(disk[1:] - disk[0], axis=1)
     assert radius == pytest.approx(animation.size_of(run, float(xcell.R)) * float(xcell.R), 1e-3)
+    for (low, high), ticks in zip(np.transpose(made["bounds"]), made["ticks"], strict=True):
+        assert 3 <= len(ticks) <= 8
+        assert low <= ticks[0] < ticks[-1] <= high
 
 
-@pytest.mark.parametrize("n", [2, 3, 199, 200, 201, 5000])
-def test_frames_thin_the_record(n):
-    frames = animation.frames_of(n)
-    assert (frames[0], frames[-1]) == (0, n - 1)
-    assert frames.size == min(n, animation.MOST_FRAMES)
+@pytest.mark.parametrize("n", [2, 3, 2999, 3000, 3001, 50000])
+def test_a_scene_thins_the_record(n):
+    kept = animation.moments_of(n)
+    assert (kept[0], kept[-1]) == (0, n - 1)
+    assert kept.size == min(n, animation.MOST_MOMENTS)
 
 
 def test_figures_show_everything_and_shade_what_was_left():
@@ -132,13 +137,12 @@ def test_page_holds_everything_itself_and_escapes(tmp_path, xcell):
     text = path.read_text(encoding="utf-8")
     links = Links(text)
     assert links.addresses
-    assert all(v.startswith("data:image/svg+xml;base64,") for v in links.addresses)
+    assert all(v.startswith("data:image/") for v in links.addresses)
     assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=[\"']?https?:", text)
     assert "<script>alert(1)</script>" not in text
     assert f"<title>x {SCRIPT.replace('<', '&lt;').replace('>', '&gt;')}</title>" in text
-    assert text.count('"showSendToCloud": false') == 2
-    assert text.count("Plotly.newPlot(") >= 2
-    assert len(text) < 9_000_000  # plotly's own program once, not twice
+    assert text.count('class="flight" data-scene=') == 2
+    assert len(text) < 500_000
 
 
 def test_a_run_that_diverges_is_drawn_as_far_as_it_goes(tmp_path, xcell):
@@ -146,7 +150,10 @@ def test_a_run_that_diverges_is_drawn_as_far_as_it_goes(tmp_path, xcell):
     path = tmp_path / "view.html"
     runs = {"never": flown(z=np.full(300, np.nan)), "lost": flown(z=z)}
     write_view(path, runs, HELICOPTER, xcell, "lost")
-    assert path.read_text(encoding="utf-8").count('"traces":[2,3,4,5]') == 100
+    text = path.read_text(encoding="utf-8")
+    [content] = re.findall(r'id="numbers">(.*?)</script>', text)
+    [made] = json.loads(content)["scenes"]
+    assert decoded(json.loads(content), made["path"][2]).size == 100
 
 
 def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
@@ -160,7 +167,7 @@ def test_a_part_of_the_helicopter_has_figures_only(tmp_path, bench30):
     path = tmp_path / "view.html"
     write_view(path, {"roll": run}, model, bench30, "roll")
     text = path.read_text(encoding="utf-8")
-    assert "script" not in Links(text).tags
+    assert "canvas" not in Links(text).tags
     assert Links(text).tags.count("img") == 2
     assert "needs the whole helicopter" in words(text)
     [ax] = manoeuvre.sticks(run, model)

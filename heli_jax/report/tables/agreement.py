@@ -1,5 +1,8 @@
 """Tables of the agreement: metrics, model selection, the acceptance card, residuals."""
 
+import math
+from collections.abc import Iterator, Mapping
+
 from heli_jax import naming
 from heli_jax.analysis.response_agreement import USUAL_J
 from heli_jax.identification.equation_error.baseline import Baseline
@@ -13,35 +16,53 @@ from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
 
 
-def agreement(fit: Fit, baseline: Baseline | None) -> Table:
-    """The same metrics for fit, held-out flights and RLS, output by output."""
+def agreement(
+    fit: Fit, baseline: Baseline | None, logged: Mapping[str, tuple[str, float]] | None = None
+) -> Table:
+    """The same metrics for fit, held-out flights and RLS, output by output.
+
+    Args:
+        fit: the fit.
+        baseline: the RLS, where there is one.
+        logged: by output the unit of its log, and what SI is times to be in it.
+    """
     head = ("output", "of", "VAF", "fit", "RMSE", "Theil")
-    rows = []
+    rows, units = [], logged or {}
     # An output may have been measured in the flights held out alone.
     for output in dict.fromkeys([*fit.metrics, *fit.validation]):
-        if output in fit.metrics:
-            rows.append(_agreement(output, "fit, simulated", fit.metrics[output]))
-        if output in fit.one_step:
-            rows.append(_agreement(output, "fit, one step ahead", fit.one_step[output]))
-        if output in fit.validation:
-            rows.append(_agreement(output, "held out, simulated", fit.validation[output]))
-        if output in fit.validation_free_run:
-            run = fit.validation_free_run[output]
-            row = _agreement(output, "held out, in one piece", run)
-            # Its numbers grow with the length of the record: they would say nothing of the model.
-            rows.append((*row[:2], "diverges", *[NOTHING] * 3) if diverges(run) else row)
-        if output in fit.one_step_validation:
-            one_step = fit.one_step_validation[output]
-            rows.append(_agreement(output, "held out, one step ahead", one_step))
-        if baseline is not None and baseline.output == output:
-            # With its flight, since it saw that one alone and the fit all.
-            rows.append(_agreement(output, f"RLS ({baseline.flight})", baseline.metrics))
-    return Table(head, rows)
+        for of, m in _metrics(fit, baseline, output):
+            row = (output, of, *_cells(m))
+            if of == _IN_ONE_PIECE and diverges(m):
+                # Its numbers grow with the length of the record: they would say nothing of the
+                # model.
+                rows.append((*row[:2], "diverges", *[NOTHING] * 3, *([NOTHING] if units else ())))
+                continue
+            unit, factor = units.get(output, ("", math.nan))
+            rows.append((*row, *([f"{number(m.rmse * factor)} {unit}".strip()] if units else ())))
+    return Table((*head, "RMSE as logged") if units else head, rows)
 
 
-def _agreement(output: str, of: str, m: Metrics) -> tuple[str, ...]:
+_IN_ONE_PIECE = "held out, in one piece"
+
+
+def _metrics(fit: Fit, baseline: Baseline | None, output: str) -> Iterator[tuple[str, Metrics]]:
+    """The metrics of an output that there are, in words of what."""
+    sources = (
+        ("fit, simulated", fit.metrics),
+        ("fit, one step ahead", fit.one_step),
+        ("held out, simulated", fit.validation),
+        (_IN_ONE_PIECE, fit.validation_free_run),
+        ("held out, one step ahead", fit.one_step_validation),
+    )
+    yield from ((of, metrics[output]) for of, metrics in sources if output in metrics)
+    if baseline is not None and baseline.output == output:
+        # With its flight, since it saw that one alone and the fit all.
+        yield f"RLS ({baseline.flight})", baseline.metrics
+
+
+def _cells(m: Metrics) -> tuple[str, ...]:
     fit_percent = percent(m.nrmse_fit_percent / 100)
-    return (output, of, percent(m.vaf, 3), fit_percent, number(m.rmse), number(m.tic, 3))
+    return (percent(m.vaf), fit_percent, number(m.rmse), number(m.tic, 3))
 
 
 def responses(fit: Fit) -> Table | None:

@@ -2,7 +2,7 @@
 
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.frequency_start import FrequencyErrorStart
-from heli_jax.numbers import NOTHING, number, with_sd
+from heli_jax.numbers import NOTHING, number, percent, with_sd
 from heli_jax.report.tables.table import Table
 
 type Start = EquationErrorStart | FrequencyErrorStart
@@ -33,7 +33,7 @@ def selection_steps(start: Start) -> Table:
             str(i + 1),
             f"{s.parameter} {'in' if s.entered else 'out'}",
             number(s.f_ratio, 3),
-            f"{100 * s.r_squared:.2f} %",
+            percent(s.r_squared),
         )
         for i, s in enumerate(steps)
     ]

@@ -8,7 +8,7 @@ from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
-from heli_jax.report.files import adequate_unjudged, whiteness_note
+from heli_jax.report.fit_content import adequate_unjudged, whiteness_note
 from heli_jax.vehicle import of_helicopter
 
 

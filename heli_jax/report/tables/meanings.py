@@ -4,6 +4,7 @@ from heli_jax.identification.identifiability.verdict import FACTOR
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.adequacy import EXPECTED, EXPLAINED, NEARLY_WHITE
 from heli_jax.identification.validation.advice import FAR_FROM_WHITE, GATE
+from heli_jax.numbers import percent
 
 
 def meanings(fit: Fit) -> list[tuple[str, str]]:
@@ -35,14 +36,14 @@ def _adequate(fit: Fit) -> str:
             "yes where the innovations of all outputs are white and the error of the simulation "
             f"has at most {EXPECTED:g} times the power that the estimated disturbance makes; in "
             "size only where innovations are not white but have an autocorrelation below "
-            f"{FAR_FROM_WHITE:g} at one sample, or the simulation explains {EXPLAINED:.0%} of what "
-            "is not white noise; no otherwise."
+            f"{FAR_FROM_WHITE:g} at one sample, or the simulation explains "
+            f"{percent(EXPLAINED, 0)} of what is not white noise; no otherwise."
         )
     return (
         "yes where the residuals of all outputs are white (Ljung-Box at 1 %); in size only where "
-        f"they are not, but the simulation explains at least {EXPLAINED:.0%} of what is not white "
-        f"noise, or at most {NEARLY_WHITE:.0%} of the residual's variance is other than that (a "
-        f"VAF below {GATE:g} is then stated with it); no otherwise."
+        f"they are not, but the simulation explains at least {percent(EXPLAINED, 0)} of what is "
+        f"not white noise, or at most {percent(NEARLY_WHITE, 0)} of the residual's variance is "
+        f"other than that (a VAF below {GATE:g} is then stated with it); no otherwise."
     )
 
 

@@ -1,0 +1,76 @@
+"""The words under the report's figures, and those for who does not see them."""
+
+import numpy as np
+
+from heli_jax.identification.result import Fit
+from heli_jax.numbers import number, percent
+from heli_jax.report.drawings import Analysis
+from heli_jax.report.pictures import Picture
+
+_MOST = 6
+"""correlations that are told one by one"""
+_CAPTIONS = {
+    "response": "From above, over time: measured and simulated, what is left between them, inputs.",
+    "residual": "From above, by lag: its correlation with itself, then with each input; of white "
+    "noise 99 % of the lags lie within the band.",
+    "bode": "Magnitude and phase of the fitted model, of the recursive least squares where there "
+    "are some, and of the record where its coherence allows.",
+    "match": "From above: gain and phase of model and data with 95 % intervals, partial coherence "
+    "of the data, and data over model. Grey: envelopes of what pilots of full-size aeroplanes "
+    "did not notice (Wood and Hodgkinson, 1980).",
+    "correlation": "Near +1 or -1 the data hardly tell two parameters apart.",
+    "starts": "The misfit that each start of the optimiser reached, best first.",
+    "rls": "Each coefficient while the record goes by: one to be trusted settles.",
+    "intervals": "Of each parameter, by every method; the dotted line is the estimate.",
+}
+"""by group, what a figure shows, after its title"""
+GROUPS = tuple(_CAPTIONS)
+# The template asks for figures by what their names begin with: no group may begin another's name.
+
+
+def caption(picture: Picture) -> str:
+    """What a figure shows, and the name of its files."""
+    [words] = [w for group, w in _CAPTIONS.items() if picture.name.startswith(group)]
+    return f"{picture.title}. {words} (figures/{picture.name}.svg, .png)"
+
+
+def alt_text(picture: Picture, analysis: Analysis) -> str:
+    """What a figure of the report shows.
+
+    Args:
+        picture: as it was drawn.
+        analysis: the fit and what belongs to it.
+    """
+    fit, intervals = analysis.fit, analysis.supplementary.intervals
+    if picture.name == "correlation":
+        return f"{picture.title}. {_correlations(fit)}."
+    if picture.name == "starts":
+        costs = [row.cost for row in fit.starts if row.converged]
+        failed = len(fit.starts) - len(costs)
+        best = f"; costs {_between(costs)}" if costs else ""
+        return f"{picture.title}. Of {len(fit.starts)} starts {failed} failed{best}."
+    if picture.name == "intervals" and intervals is not None:
+        words = [
+            f"{name} by {method} {number(low)} to {number(high)}"
+            for name, methods in intervals.by_parameter.items()
+            for method, (low, high) in methods.items()
+        ]
+        return f"{picture.title}. 95 % intervals: {'; '.join(words)}."
+    for output, m in fit.metrics.items():
+        if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
+            return f"{picture.alt} Over the fitted flights: VAF {percent(m.vaf)}."
+    return picture.alt
+
+
+def _correlations(fit: Fit) -> str:
+    names, correlation = fit.verdict.names, fit.verdict.correlation
+    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
+    known = [(i, j) for i, j in pairs if np.isfinite(correlation[i, j])]
+    largest = sorted(known, key=lambda p: -abs(correlation[p]))[:_MOST]
+    words = (f"{names[j]} and {names[i]} {number(float(correlation[i, j]), 3)}" for i, j in largest)
+    return f"Largest: {', '.join(words)}"
+
+
+def _between(values: list[float]) -> str:
+    low, high = number(min(values), 4), number(max(values), 4)
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,42 @@
+"""What made a page: the command, when, and the configuration; and the files beside the page."""
+
+import shlex
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Origin(NamedTuple):
+    """Where a page came from."""
+
+    command: str
+    date: str
+    """with its offset from UTC"""
+    config: str = ""
+    """the configuration in full, as YAML"""
+    files: tuple[str, ...] = ()
+    """beside the page, by their names relative to it"""
+
+
+def origin(config: str = "", files: tuple[str, ...] = ()) -> Origin:
+    """Of a page that this process makes now.
+
+    Args:
+        config: the configuration in full, as YAML.
+        files: beside the page, by their names relative to it.
+    """
+    now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    return Origin(_command(sys.argv), now, config, files)
+
+
+def _command(words: list[str]) -> str:
+    """What was typed, as a shell would take it."""
+    # The program by its name alone: where it is installed is nobody's business.
+    program = Path(words[0] if words else "")
+    if program.name.startswith(("ipykernel", "colab_kernel")):
+        return "in a notebook"
+    if program.name in ("", "-", "-c"):
+        return "in a Python session"
+    name = "heli-jax" if program.parts[-2:] == ("heli_jax", "__main__.py") else program.name
+    return shlex.join([*(["python"] if name.endswith(".py") else []), name, *words[1:]])

@@ -1,0 +1,98 @@
+"""Figures as a page holds them: an image that every browser shows, words for who does not see it,
+and numbers for its own drawing."""
+
+import base64
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import matplotlib
+from matplotlib.figure import Figure
+from PIL import Image
+
+from heli_jax.report import style
+from heli_jax.report.alt_text import described
+from heli_jax.report.charts import chart_of
+from heli_jax.report.embedded import Numbers
+
+_HEAVY = 45_000
+"""bytes of an SVG from which on the page has a PNG in its place: noise has no short outline"""
+_COLOURS = 16
+"""of that PNG"""
+type Draw = Callable[[], Figure | None]
+type Kind = Literal["live", "panels", "image"]
+
+
+class Picture(NamedTuple):
+    """A figure of a page."""
+
+    name: str
+    title: str
+    image: str
+    """a data: address"""
+    size: tuple[int, int]
+    """width and height [pixel]"""
+    alt: str
+    """what the figure shows, in words and numbers"""
+    chart: int | None = None
+    """its number among the page's charts; None where the image is all"""
+
+
+def picture(
+    name: str,
+    draw: Draw,
+    numbers: Numbers,
+    *,
+    folder: Path | None = None,
+    logged: Mapping[str, tuple[str, float]] | None = None,
+    kind: Kind = "live",
+) -> Picture | None:
+    """Draw a figure for a page.
+
+    Args:
+        name: of its files.
+        draw: draws it.
+        numbers: the page's, to which it is added.
+        folder: for NAME.svg and NAME.png; no files unless given.
+        logged: by signal the unit of its log, and what SI is times to be in it.
+        kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
+            `panels` words are made alone; of an `image` the title is all.
+
+    Returns:
+        None where there is nothing to draw.
+    """
+    with matplotlib.rc_context(style.STYLE):
+        drawn = draw()
+        if drawn is None:
+            return None
+        chart = None if kind == "image" else chart_of(drawn)
+        title = drawn.axes[0].get_title("left")
+        # Saving thins the lines: the chart has been taken from them before.
+        svg = style.as_svg(drawn) if folder is None else style.saved(drawn, folder / name)
+        image = _address("svg+xml", svg)
+        if len(svg) > _HEAVY:
+            # The file that was written, where there is one: drawing it again would take as long.
+            file = None if folder is None else folder / f"{name}.png"
+            image = _small(style.as_png(drawn) if file is None else file.read_bytes())
+    width, height = (round(96 * v) for v in drawn.get_size_inches())
+    return Picture(
+        name,
+        title,
+        image,
+        (width, height),
+        title if chart is None else described(chart),
+        None if chart is None or kind != "live" else numbers.add_chart(chart, dict(logged or {})),
+    )
+
+
+def _small(png: bytes) -> str:
+    """With a palette of few colours: lines on white need no more, and it is a third as large."""
+    small = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        image.convert("RGB").quantize(_COLOURS).save(small, format="png", optimize=True)
+    return _address("png", small.getvalue())
+
+
+def _address(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

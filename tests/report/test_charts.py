@@ -1,0 +1,136 @@
+"""Figures as plain data, and what a page embeds of them."""
+
+import base64
+
+import numpy as np
+import pytest
+
+from heli_jax import models
+from heli_jax.identification.result import Signals
+from heli_jax.report import figures, origin, style
+from heli_jax.report.alt_text import described
+from heli_jax.report.captions import alt_text
+from heli_jax.report.charts import chart_of
+from heli_jax.report.drawings import Analysis
+from heli_jax.report.embedded import Numbers
+from heli_jax.report.figures.panels import panels
+from heli_jax.report.pictures import picture
+from heli_jax.report.tables.agreement import agreement
+from tests.report.test_view import decoded
+
+
+def record(n, outputs=1, inputs=4):
+    """A flight of n samples at 100 Hz, all of it noise, which no image holds small."""
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(n)
+    names = ("roll", "pitch", "yaw", "z", "dz")[:outputs]
+    y = {m: np.sin(t) + 0.3 * rng.standard_normal(n) for m in names}
+    u = {m: rng.standard_normal(n) for m in ("x_roll", "x_pitch", "x_yaw", "x_throttle")[:inputs]}
+    return Signals("one", False, t, u, y, {m: np.sin(t) for m in names})
+
+
+def test_a_figure_is_read_back_as_it_was_drawn():
+    signals = record(5000)
+    signals.measured["roll"][100:120] = np.nan
+    axes = figures.response(signals, "roll", models.by_name("helicopter"))
+    chart = chart_of(axes[0].figure)
+    assert chart.x_label == "time [s]"
+    assert [p.label for p in chart.panels[:2]] == ["roll [rad]", "residual [rad]"]
+    measured, simulated = chart.panels[0].series
+    assert (measured.label, simulated.label) == ("measured", "simulated")
+    # All points, although the figure's file has fewer.
+    np.testing.assert_array_equal(measured.y, signals.measured["roll"])
+    assert chart.panels[1].levels == (0.0,)
+    assert chart.panels[2].series[0].kind == "step"
+    style.as_svg(axes[0].figure)
+    assert axes[0].get_lines()[0].get_xdata().size <= style.MOST_POINTS
+    words = described(chart)
+    low, high = np.nanmin(measured.y), np.nanmax(measured.y)
+    assert f"measured −{-low:.3g} to {high:.3g}" in words
+    assert "0 to 50" in words
+
+
+def test_bars_and_bands_keep_their_ends():
+    [ax] = panels(None, 2.0, [1.0])
+    x, y = np.arange(1.0, 6.0), np.array([1.0, 3.0, 2.0, 5.0, 4.0])
+    ax.fill_between(x, y - 0.5, y + 1.5)
+    ax.errorbar(x, y, yerr=[0.1 * y, 0.2 * y], fmt="o", label="data")
+    ax.axvline(2.5)
+    ax.axvspan(3.0, 4.0)
+    [panel] = chart_of(ax.figure).panels
+    band, bars = panel.series
+    np.testing.assert_allclose([band.low, band.high], [y - 0.5, y + 1.5])
+    np.testing.assert_allclose([bars.low, bars.high], [0.9 * y, 1.2 * y])
+    assert (bars.label, bars.kind) == ("data", "bars")
+    assert (panel.marks, panel.shades) == ((2.5,), ((3.0, 4.0),))
+
+
+def test_numbers_come_back_to_a_hundredth_of_a_percent_of_their_range():
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal(500)
+    values[::7] = np.nan
+    numbers = Numbers()
+    once, again = numbers.array(values), numbers.array(values.copy())
+    times, constant = numbers.array(3.0 + 0.02 * np.arange(400)), numbers.array(np.full(9, 2.5))
+    content = numbers.content()
+    assert once == again
+    back = decoded(content, once)
+    np.testing.assert_array_equal(np.isnan(back), np.isnan(values))
+    assert np.nanmax(np.abs(back - values)) < 1e-5 * np.ptp(values[np.isfinite(values)])
+    np.testing.assert_allclose(decoded(content, times), 3.0 + 0.02 * np.arange(400), atol=1e-12)
+    np.testing.assert_array_equal(decoded(content, constant), 2.5)
+
+
+@pytest.mark.slow
+def test_two_minutes_at_100_hz_stay_below_a_page_s_limit():
+    signals, numbers, images = record(12_000, outputs=5), Numbers(), 0
+    model = models.by_name("helicopter")
+    for output in signals.measured:
+        made = picture(
+            output, lambda o=output: figures.response(signals, o, model)[0].figure, numbers
+        )
+        images += len(made.image)
+        data = base64.b64decode(made.image.partition(",")[2])
+        assert data.startswith((b"\x89PNG", b"<?xml"))
+        assert images < 5 * 90_000
+    content = numbers.content()
+    size = sum(len(a.get("q", "") + a.get("f", "")) for a in content["arrays"])
+    assert size + images < 1_100_000
+    # No peak is lost to the thinning.
+    series = content["charts"][0]["panels"][0]["series"][0]
+    assert np.nanmax(decoded(content, series["y"])) == pytest.approx(
+        np.max(signals.measured["roll"]), abs=1e-4
+    )
+
+
+def test_alt_texts_and_tables_say_numbers_in_both_units(sound):
+    fit, problem, baseline = sound
+    analysis = Analysis(fit, problem, baseline)
+    numbers = Numbers()
+    made = picture(
+        "correlation",
+        lambda: figures.correlation_matrix(fit.verdict)[0].figure,
+        numbers,
+        kind="image",
+    )
+    i, j = fit.verdict.correlation[0, 1], fit.verdict.names
+    assert f"{j[0]} and {j[1]} {i:.3g}".replace("-", "−") in alt_text(made, analysis)
+    table = agreement(fit, baseline, {"roll": ("deg", 180.0 / np.pi)})
+    rmse = fit.metrics["roll"].rmse
+    assert table.head[-1] == "RMSE as logged"
+    assert table.rows[0][-1] == f"{np.degrees(rmse):.4g} deg"
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["/opt/bin/heli-jax", "fit", "a b.yaml"], "heli-jax fit 'a b.yaml'"),
+        (["/opt/x/heli_jax/__main__.py", "check"], "heli-jax check"),
+        (["work/fit.py", "1"], "python fit.py 1"),
+        (["/opt/ipykernel_launcher.py", "-f", "/home/me/k.json"], "in a notebook"),
+        ([""], "in a Python session"),
+    ],
+)
+def test_the_command_is_named_without_its_place(monkeypatch, words, command):
+    monkeypatch.setattr(origin.sys, "argv", words)
+    assert origin.origin().command == command

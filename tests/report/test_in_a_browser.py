@@ -1,0 +1,235 @@
+"""The pages in a real browser: console, zoom, hover, keyboard, narrow screens, printing."""
+
+import re
+import zlib
+
+import numpy as np
+import pytest
+
+from heli_jax.report.drawings import Analysis
+from heli_jax.report.html import write_report
+from heli_jax.report.origin import origin
+from heli_jax.report.view import write_view
+from heli_jax.vehicle import load_vehicle
+from tests.report.browser import CHROMIUM, browser
+from tests.report.conftest import SCRIPT
+from tests.report.test_view import HELICOPTER, flown
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
+    pytest.mark.slow,
+]
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def report(sound, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    made = origin(f"a: {SCRIPT} {'long' * 60}", ("config.yaml", "fit.json", "signals.csv"))
+    write_report(folder, Analysis(*sound), f"bench {SCRIPT}", {}, made)
+    return folder / "report.html"
+
+
+@pytest.fixture(scope="module")
+def view(tmp_path_factory, vehicles_folder):
+    t = 0.02 * np.arange(1500)
+    run = flown(1500, x=2.0 * t, y=3.0 * np.sin(t), z=1.0 + 0.1 * t, phi=0.3 * np.sin(t))
+    path = tmp_path_factory.mktemp("view") / "view.html"
+    xcell = load_vehicle(vehicles_folder / "x-cell-60.yaml")
+    write_view(path, {SCRIPT: run}, HELICOPTER, xcell, f"view {SCRIPT}")
+    return path
+
+
+def scales(window, group, k=0):
+    return window.value(
+        f"(({{min, max}}) => [min, max])(heliCharts.groups.get('{group}')[{k}].scales.x)"
+    )
+
+
+def drag(window, plot, start, end):
+    """From one part of a plot's width to another."""
+    window.value(f"{plot}.root.scrollIntoView({{block: 'center'}})")
+    x, y, w, h = window.value(
+        f"(r => [r.x, r.y, r.width, r.height])({plot}.over.getBoundingClientRect())"
+    )
+    window.mouse("Moved", x + start * w, y + h / 2)
+    window.mouse("Pressed", x + start * w, y + h / 2, held=True)
+    for part in np.linspace(start, end, 5):
+        window.mouse("Moved", x + part * w, y + h / 2, held=True)
+    window.mouse("Released", x + end * w, y + h / 2, held=True)
+
+
+def hover(window, plot):
+    """Over the middle of a plot."""
+    box = f"{plot}.over.getBoundingClientRect()"
+    x, y = window.value(f"(r => [r.x + r.width / 2, r.y + 20])({box})")
+    window.mouse("Moved", x, y)
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+@pytest.mark.parametrize("dark", [False, True])
+def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
+    window.size(width)
+    window.dark(dark)
+    for page in (report, view):
+        window.open(page)
+        window.value("new Promise(requestAnimationFrame)")
+        wide, seen = window.value("(d => [d.scrollWidth, d.clientWidth])(document.documentElement)")
+        assert wide <= seen == width
+        assert not window.problems
+        paper = window.value("getComputedStyle(document.body).backgroundColor")
+        assert (sum(map(int, re.findall(r"\d+", paper))) < 200) == dark
+        # Titles from logs are text, and of no chart is the image seen beside the drawing.
+        assert window.value("document.querySelectorAll('figure.drawn > img').length") >= 2
+        hidden = "[...document.querySelectorAll('figure.drawn > img')].every(i => !i.offsetWidth)"
+        assert window.value(hidden)
+
+
+def test_zoom_and_hover_move_all_time_histories_together(window, report):
+    window.size(1200)
+    window.open(report)
+    group, first = "time [s]", "heliCharts.groups.get('time [s]')[0]"
+    low, high = scales(window, group)
+    drag(window, first, 0.25, 0.5)
+    window.until(f"{first}.scales.x.max < {high - 1}")
+    zoomed = scales(window, group)
+    quarter = np.array([0.75 * low + 0.25 * high, 0.5 * (low + high)])
+    assert zoomed == pytest.approx(quarter, abs=0.02 * (high - low))
+    for k in range(window.value(f"heliCharts.groups.get('{group}').length")):
+        assert scales(window, group, k) == pytest.approx(zoomed, abs=0.03 * (high - low))
+    # A hover says the measured value, in the table below the panel.
+    x, y = window.value(
+        f"(r => [r.x + r.width / 2, r.y + 20])({first}.over.getBoundingClientRect())"
+    )
+    window.mouse("Moved", x, y)
+    legend = window.value(f"{first}.root.querySelector('.u-legend').textContent")
+    measured = float(re.search(r"measured:?\s*([−\d.]+) rad", legend)[1].replace("−", "-"))
+    k = window.value(f"{first}.cursor.idx")
+    assert measured == pytest.approx(window.value(f"{first}.data[1][{k}]"), abs=1e-4)
+    others = window.value(f"heliCharts.groups.get('{group}').map(u => u.cursor.left >= 0)")
+    assert all(others)
+    assert not window.problems
+
+
+def test_charts_answer_to_keys(window, report):
+    window.size(1200)
+    window.open(report)
+    group = "time [s]"
+    low, high = scales(window, group)
+    window.value("document.querySelector('.live').focus()")
+    window.press("+")
+    a, b = scales(window, group)
+    assert b - a == pytest.approx(0.5 * (high - low), rel=0.01)
+    window.press("ArrowRight")
+    spoken = window.value("document.querySelector('.live [role=status]').textContent")
+    assert "measured" in spoken
+    assert re.search(r"\d", spoken)
+    window.press("0")
+    assert scales(window, group) == pytest.approx([low, high], abs=1e-6)
+    assert not window.problems
+
+
+def test_tables_copy_as_csv_and_latex(window, report):
+    window.open(report)
+    csv = window.value("heliTables.csv(document.querySelector('table'))")
+    assert csv.startswith("parameter,estimate,sd,")
+    assert re.search(r"^If,1\.\d+e-4,", csv, flags=re.M)
+    tex = window.value("heliTables.tex(document.querySelector('table'))")
+    assert r"\begin{tabular}{lrr" in tex
+    assert r"$\cdot 10^{-4}$" in tex
+    assert r"95 \% interval" in tex
+    # A page that was opened as a file may have no clipboard: then the text stands there, selected.
+    window.value("Object.defineProperty(navigator, 'clipboard', {value: undefined})")
+    window.value("document.execCommand = () => false")
+    window.value("document.querySelector('.copy button').focus()")
+    window.press("Enter")
+    window.value("document.querySelector('.copy button').click()")
+    window.until("document.querySelector('.copy textarea')?.value.startsWith('parameter')")
+    assert not window.problems
+
+
+def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
+    window.size(1200)
+    window.open(view)
+    window.value("document.querySelector('[data-role=speed]').value = '10'")
+    window.value("document.querySelector('canvas').focus()")
+    window.press(" ")
+    window.until("heliFlights[0].time > 1 && heliFlights[0].playing")
+    window.press(" ")
+    assert window.value("heliFlights[0].playing") == 0
+    # The button too, by a key, and the slider.
+    window.value("document.querySelector('[data-role=play]').focus()")
+    window.press("Enter")
+    window.value("document.querySelector('[data-role=time]').focus()")
+    window.press("ArrowRight")
+    assert window.value("heliFlights[0].playing") == 0
+    time = window.value("heliFlights[0].time")
+    cursors = window.value(
+        "heliCharts.groups.get('time [s]').map(u => u.posToVal(u.cursor.left, 'x'))"
+    )
+    assert cursors == pytest.approx([time] * len(cursors), abs=0.1)
+    # From the figures to the flight.
+    plot = "heliCharts.groups.get('time [s]')[0]"
+    window.value(f"{plot}.root.scrollIntoView({{block: 'center'}})")
+    x, y = window.value(
+        f"(r => [r.x + r.width / 2, r.y + 20])({plot}.over.getBoundingClientRect())"
+    )
+    window.mouse("Moved", x, y)
+    assert window.value("heliFlights[0].time") == pytest.approx(0.5 * 29.98, abs=0.1)
+    # The machine moves on the canvas.
+    shown = [
+        window.value(f"heliFlights[0].show({t}) || document.querySelector('canvas').toDataURL()")
+        for t in (0, 20)
+    ]
+    assert shown[0] != shown[1]
+    assert not window.problems
+
+
+def test_all_of_it_is_printed(window, report):
+    window.size(1200)
+    window.dark(False)
+    window.open(report)
+    assert window.value("document.querySelectorAll('details:not([open])').length") > 0
+    # Ours runs after that of the page.
+    count = "document.querySelectorAll('details:not([open])').length"
+    window.value(f"addEventListener('beforeprint', () => {{ window.folded = {count}; }})")
+    data = window.pdf()
+    assert window.value("window.folded") == 0
+    assert window.value(count) > 0
+    assert data.startswith(b"%PDF")
+    streams = re.findall(rb"stream\r?\n(.*?)endstream", data, flags=re.S)
+    drawn = b""
+    for stream in streams:
+        try:
+            drawn += zlib.decompress(stream)
+        except zlib.error:
+            continue
+    assert len(drawn) > 10_000
+    window.call("Emulation.setEmulatedMedia", media="print")
+    assert window.value("[...document.querySelectorAll('figure > img')].every(i => i.offsetWidth)")
+    assert not window.value("document.querySelector('.live').offsetWidth")
+    window.call("Emulation.setEmulatedMedia", media="")
+    assert not window.problems
+
+
+def test_without_scripts_the_images_are_shown(window, report):
+    window.call("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        window.call("Page.navigate", url=report.as_uri())
+        root = window.call("DOM.getDocument")["root"]["nodeId"]
+        for _ in range(100):
+            root = window.call("DOM.getDocument")["root"]["nodeId"]
+            found = window.call("DOM.querySelectorAll", nodeId=root, selector="figure > img")
+            if len(found["nodeIds"]) == 6:
+                break
+        assert len(found["nodeIds"]) == 6
+        for node in found["nodeIds"]:
+            box = window.call("DOM.getBoxModel", nodeId=node)["model"]
+            assert box["width"] > 200
+    finally:
+        window.call("Emulation.setScriptExecutionDisabled", value=False)
