@@ -30,9 +30,14 @@ from heli_jax import Problem, fit
 jax.config.update("jax_enable_x64", True)
 COMPILED = "/jax/core/compile/backend_compile_duration"
 compiled: list[float] = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, seconds, **_: compiled.append(seconds) if event == COMPILED else None
-)
+
+
+def listen(event: str, duration_secs: float, **_: str | int) -> None:
+    if event == COMPILED:
+        compiled.append(duration_secs)
+
+
+jax.monitoring.register_event_duration_secs_listener(listen)
 
 
 class Took(NamedTuple):

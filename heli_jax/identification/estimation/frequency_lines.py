@@ -187,7 +187,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     T, V = jax.scipy.linalg.schur(m.Ad, output="complex")
     H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
     # What the ends of the record explain is found by linear least squares.
-    Q, solution = _span(stacked(z[:, None, None] * H).reshape(-1, H.shape[2]))
+    Q, solution = _span(stacked(jnp.asarray(z)[:, None, None] * H).reshape(-1, H.shape[2]))
     return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
 
 
