@@ -18,6 +18,7 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,6 +67,7 @@ class FrequencyError(Estimator):
     nuisances_in_rows = False
     noise_spectrum = True
     rows_by_flight = False
+    relaxes_rows = False
     least_squares = False
     errors = "residuals"
     by_instrument = True
@@ -148,21 +150,21 @@ class FrequencyError(Estimator):
         return noise._replace(by_instrument=np.ones(()))
 
     def relax(
-        self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum that the errors show, smoothed over frequency and flights.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
-            e: at z with `noise`.
+            e: None: it is not asked for.
             noise: so far.
             z: the unknowns.
         """
         errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
-        spectra = [s * freedom for s in smoothed(errors)]
+        spectra = smoothed([v * freedom**0.5 for v in errors])
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])

@@ -86,4 +86,8 @@ def whitening_of(
     spectra: Iterable[Complex[np.ndarray, "K p p"]],
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record L^-1, where S = L L^H: L^-1 e is white."""
-    return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)
+    # Records of one length share their spectrum.
+    spectra = tuple(spectra)
+    made = {id(S): S for S in spectra}
+    made = {key: np.linalg.inv(np.linalg.cholesky(S)) for key, S in made.items()}
+    return tuple(made[id(S)] for S in spectra)
