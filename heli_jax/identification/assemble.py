@@ -156,6 +156,7 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
     by_instrument = data.flights[0].by_instrument is not None
+    instruments = instruments_of(problem) if by_instrument else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     in_time = (problem, params, signals, white, against, layout.determined)
     adequacy = by_responses(responses) or _adequacy(*in_time)
@@ -191,7 +192,7 @@ def assemble(
         notes=(
             *notes,
             *closed_loop,
-            *feedback_trust_notes(moved, found),
+            *feedback_trust_notes(moved, found, instruments),
             *adequacy.sentences,
             *missing,
             *held.notes,
@@ -199,7 +200,7 @@ def assemble(
         reached=solution,
         feedback=found,
         moved_by_feedback=moved,
-        instruments=instruments_of(problem) if by_instrument else (),
+        instruments=instruments,
         seed=run.seed,
         timing=run.timing,
     )

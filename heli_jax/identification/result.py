@@ -162,7 +162,7 @@ class Fit:
     @property
     def untrusted(self) -> tuple[str, ...]:
         """The parameters that feedback may have biased."""
-        return untrusted(self.moved_by_feedback, self.feedback)
+        return untrusted(self.moved_by_feedback, self.feedback, self.instruments)
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
