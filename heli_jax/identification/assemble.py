@@ -159,7 +159,7 @@ def assemble(
     instruments = instruments_of(problem) if by_instrument else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     in_time = (problem, params, signals, white, against, layout.determined)
-    adequacy = by_responses(responses) or _adequacy(*in_time)
+    adequacy = by_responses(responses, pooled_metrics(signals)) or _adequacy(*in_time)
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
