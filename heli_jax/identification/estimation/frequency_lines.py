@@ -59,7 +59,7 @@ class Machines(NamedTuple):
 
 
 class Resolved(NamedTuple):
-    """What a machine does at every line of a record, signals apart."""
+    """What a machine does at every line of a record, signals apart; without a derivative."""
 
     z: Complex[np.ndarray, " K"]
     T: Complex[Array, "n n"]
@@ -185,7 +185,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
     # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved.
     T, V = jax.scipy.linalg.schur(m.Ad, output="complex")
-    H = whitening @ (_solved(z, T, m.C @ V, left=False) @ jnp.conj(V.T))
+    H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
     # What the ends of the record explain is found by linear least squares.
     Q, solution = _span(stacked(z[:, None, None] * H).reshape(-1, H.shape[2]))
     return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
@@ -263,7 +263,7 @@ def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"
 
 def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> Array:
     """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with a triangle T."""
-    M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype) - T[None]
+    M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype)[None] - T[None]
     b = jnp.broadcast_to(b, (len(z), *b.shape[-2:]))
     return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
 
