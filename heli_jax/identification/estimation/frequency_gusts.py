@@ -40,7 +40,7 @@ LEAST, PART = 12.0, 0.12
 """sd of the Gaussian that smooths what is left: lines at least, and as a part of the frequency"""
 _OCTAVES = 2
 """from one corner of the gusts' spectra to the next"""
-_STEPS = 20
+_STEPS = 10
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
@@ -181,6 +181,7 @@ def _described(
     r = np.maximum(0.3 * np.median(own, axis=0), _NOTHING)
     ends = np.conj(np.swapaxes(cells.H, 1, 2))
     for _ in range(_STEPS):
+        # Without the root that would make sure that each step gains: half as many are enough.
         inverse = np.linalg.inv(_spectrum(cells.H, q @ shapes, r))
         seen = inverse @ cells.power @ inverse
         # By gust what of it the errors show, and what they should.
@@ -188,9 +189,9 @@ def _described(
             np.real(np.sum(ends * np.swapaxes(M @ cells.H, 1, 2), axis=2)) * cells.lines[:, None]
             for M in (seen, inverse)
         )
-        q = q * np.sqrt(_part((shapes @ shown).T, (shapes @ due).T))
+        q = q * _part((shapes @ shown).T, (shapes @ due).T)
         of_r = [np.real(np.einsum("cii,c->i", M, cells.lines)) for M in (seen, inverse)]
-        r = np.maximum(r * np.sqrt(_part(*of_r)), _NOTHING)
+        r = np.maximum(r * _part(*of_r), _NOTHING)
     return q, r
 
 
