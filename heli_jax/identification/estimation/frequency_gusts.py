@@ -38,9 +38,12 @@ from heli_jax.identification.unknowns.layout import Data, Layout, unpack
 
 LEAST, PART = 12.0, 0.12
 """sd of the Gaussian that smooths what is left: lines at least, and as a part of the frequency"""
+_CELLS = 0.16, 6.0
+"""the same of what the description rests on: each line by itself up to the fiftieth, since slow
+modes are no wider, and from there on 4 % of the frequency"""
 _OCTAVES = 2
 """from one corner of the gusts' spectra to the next"""
-_STEPS = 10
+_STEPS = 8
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
@@ -127,7 +130,7 @@ def _before(
     for K, of in at.items():
         S0 = _spectrum(np.nan_to_num(of.H), q @ _shapes(of.f, corners), r)
         root = np.linalg.inv(np.linalg.cholesky(S0))
-        _, (low, share) = knots_of(K)
+        _, (low, share) = knots_of(K, *_CELLS)
         made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
     return made
 
@@ -137,7 +140,7 @@ def _cells(
 ) -> _Cells:
     """A cell around each knot of records of one length."""
     K = len(errors[0])
-    at, _ = knots_of(K)
+    at, _ = knots_of(K, *_CELLS)
     edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
     power = sum(e[:, :, None] * np.conj(e[:, None, :]) for e in errors) / len(errors)
     count = np.diff(np.append(edges, K)).astype(float)
