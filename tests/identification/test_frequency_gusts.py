@@ -9,6 +9,7 @@ from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.identification.estimation.frequency_gusts import Machine, whitening_by
 from heli_jax.identification.estimation.frequency_spectrum import smoothed, whitening_of
 from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
     Moved,
     feedback_trust_notes,
     untrusted,
@@ -110,12 +111,14 @@ def test_intervals_of_an_angle_and_its_rate_hold_in_gusts(tmp_path):
 def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
     moved = {"Mm": Moved(0.0, 0.6), "Ll": Moved(2.0, 0.1), "Lp": Moved(0.0, 0.0)}
     loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
-    assert untrusted(moved, loops) == ("Mm", "Ll")
-    assert untrusted(moved, loops, ("lat", "lon")) == ()
-    assert feedback_trust_notes(moved, loops, ("lat", "lon")) == []
-    [note] = feedback_trust_notes({"Mm": moved["Mm"]}, loops, ("lat",))
+    assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
+    assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
+    assert feedback_trust_notes(moved, Loop(loops, ("lat", "lon"))) == []
+    [note] = feedback_trust_notes({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
     assert note.startswith("Closed loop without an instrument for lon: ")
     # However coherent the residual is with the response: no loop was found.
     open_loop = [one._replace(p_value=0.5) for one in loops]
-    assert untrusted(moved, open_loop) == ()
-    assert feedback_trust_notes(moved, open_loop) == []
+    assert untrusted(moved, Loop(open_loop)) == ()
+    assert feedback_trust_notes(moved, Loop(open_loop)) == []
+    [note] = feedback_trust_notes(moved, Loop(open_loop, held=True))
+    assert "somebody holds the machine): this fit cannot be trusted on Mm, Ll." in note

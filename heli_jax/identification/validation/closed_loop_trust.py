@@ -14,7 +14,8 @@ large in it and sweeps move sticks no more than elsewhere.
 
 Either is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
 there is a loop: gusts leave residuals that a response is coherent with by chance, and so does a
-model that lacks something. Parameters are named where inputs were found to follow the response.
+model that lacks something. Parameters are named where inputs were found to follow the response, or
+where somebody must have held the machine: the model is unstable, and the record does not grow.
 
 Inputs that are taken by instrument bring in nothing; of the others in the same fit only the second
 is told, since equations by instrument leave a residual that feedback makes coherent.
@@ -31,6 +32,7 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.frequency_gusts import machine_of
 from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
@@ -43,6 +45,11 @@ TRUSTED = 1.4
 interval then covers two thirds of the time"""
 MAY_BE = 0.25
 """part of the input that feedback may have brought in, where a parameter that is trusted shows"""
+BESIDE = 0.05
+"""the same where other inputs are taken by instrument: an input's effect is off by that part of it
+at least, in a fit that is taken for one that feedback does no harm to"""
+_GROWS = 3.0
+"""e-foldings over a record of the model's fastest growing mode, from which on somebody holds it"""
 _SEEN = 2.0
 """times the residual's power, above which an output shows the response: only there is it asked how
 large a gain the input leaves room for"""
@@ -91,26 +98,64 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
     }
 
 
-def untrusted(
-    moved: Mapping[str, Moved], found: Sequence[Feedback], instruments: Sequence[str] = ()
-) -> tuple[str, ...]:
-    """The parameters that a fit cannot be trusted on: nothing where no input that is taken for
-    given follows the response.
+def held_upright(at: Solution) -> bool:
+    """Whether the model is unstable and a record does not grow as it would alone.
+
+    Args:
+        at: where the fit ended.
+    """
+    layout, data, *_, z = at
+    if not layout.estimator.by_instrument:
+        return False
+    rate = float(np.log(np.max(np.abs(np.linalg.eigvals(machine_of(layout, data, z).Ad)))))
+    for names, flight in zip(layout.outputs, data.flights, strict=True):
+        y = [np.asarray(flight.outputs[n]) for n in names]
+        half = len(y[0]) // 2
+        grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
+        # Alone it would grow by half of the e-foldings from one half to the other.
+        if 2 * half * rate > _GROWS and np.log(grown) < 0.5 * half * rate:
+            return True
+    return False
+
+
+class Loop(NamedTuple):
+    """Who closes a loop, as far as it is known."""
+
+    found: Sequence[Feedback]
+    """whether inputs follow the response"""
+    instruments: Sequence[str] = ()
+    """the inputs that are taken by instrument"""
+    held: bool = False
+    """whether somebody must hold the machine"""
+
+    @property
+    def closed(self) -> bool:
+        """Whether an input that is taken for given follows the response, or may: where only one
+        with an instrument was found to, whoever closes its loop may move the others as well."""
+        if self.instruments:
+            return bool(self.inputs) and any(one.present for one in self.found)
+        return self.held or any(one.present for one in self.found)
+
+    @property
+    def inputs(self) -> list[str]:
+        """Those without an instrument that follow the response; all that move freely where it was
+        found of none."""
+        direct = [one for one in self.found if one.input not in self.instruments]
+        those = [one for one in direct if one.present] or direct
+        return list(dict.fromkeys(one.input for one in those))
+
+
+def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
+    """The parameters that a fit cannot be trusted on: nothing where no loop is closed.
 
     Args:
         moved: of `moved_by_feedback`.
-        found: whether inputs follow the response.
-        instruments: the inputs that are taken by instrument.
+        loop: who closes it.
     """
-    if not _loops(found, instruments):
+    if not loop.closed:
         return ()
-    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > MAY_BE)
-
-
-def _loops(found: Sequence[Feedback], instruments: Sequence[str]) -> list[str]:
-    """The inputs without an instrument that follow the response."""
-    names = (one.input for one in found if one.present and one.input not in instruments)
-    return list(dict.fromkeys(names))
+    most = BESIDE if loop.instruments else MAY_BE
+    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > most)
 
 
 class _Lines(NamedTuple):
@@ -208,21 +253,19 @@ def _information(
     return J.T @ J
 
 
-def feedback_trust_notes(
-    moved: Mapping[str, Moved], found: Sequence[Feedback], instruments: Sequence[str] = ()
-) -> list[str]:
-    """Which parameters a fit cannot be trusted on, in words; nothing where no loop was found.
+def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
+    """Which parameters a fit cannot be trusted on, in words; nothing where no loop is closed.
 
     Args:
         moved: of `moved_by_feedback`.
-        found: whether inputs follow the response.
-        instruments: the inputs that are taken by instrument.
+        loop: who closes it.
     """
-    loops = _loops(found, instruments)
-    if not (loops and moved):
+    if not (loop.closed and moved):
         return []
-    doubted = untrusted(moved, found, instruments)
-    of = f" for {' and '.join(loops)}" if instruments else ""
+    doubted = untrusted(moved, loop)
+    of = f" for {' and '.join(loop.inputs)}" if loop.instruments else ""
+    if not any(one.present for one in loop.found):
+        of += " (the model is unstable, and the record does not grow: somebody holds the machine)"
     if not doubted:
         return [
             f"Closed loop without an instrument{of}: feedback can hardly have moved these "
@@ -230,7 +273,7 @@ def feedback_trust_notes(
         ]
     words = ", ".join(f"{n} ({100 * moved[n].may_be:.0f} %)" for n in doubted)
     rest = [n for n in moved if n not in doubted]
-    inputs = " and ".join(loops) if instruments else "the inputs"
+    inputs = " and ".join(loop.inputs) if loop.instruments else "the inputs"
     return [
         f"Closed loop without an instrument{of}: this fit cannot be trusted on "
         f"{', '.join(doubted)}. Where these show, so much of {inputs} may be gusts that feedback "
