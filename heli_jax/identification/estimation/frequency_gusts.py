@@ -43,7 +43,7 @@ _CELLS = 0.16, 6.0
 modes are no wider, and from there on 4 % of the frequency"""
 _OCTAVES = 2
 """from one corner of the gusts' spectra to the next"""
-_STEPS = 8
+_STEPS = 24
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
