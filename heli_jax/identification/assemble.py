@@ -39,7 +39,9 @@ from heli_jax.identification.validation.adequacy import Adequacy, Evidence, asse
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
     feedback_trust_notes,
+    held_upright,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.feedback import (
@@ -155,10 +157,12 @@ def assemble(
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
+    stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
+    instruments = instruments_of(problem) if by_instrument else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     in_time = (problem, params, signals, white, against, layout.determined)
-    adequacy = by_responses(responses) or _adequacy(*in_time)
+    adequacy = by_responses(responses, pooled_metrics(signals)) or _adequacy(*in_time)
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
@@ -191,7 +195,7 @@ def assemble(
         notes=(
             *notes,
             *closed_loop,
-            *feedback_trust_notes(moved, found),
+            *feedback_trust_notes(moved, Loop(found, instruments, stays)),
             *adequacy.sentences,
             *missing,
             *held.notes,
@@ -199,7 +203,8 @@ def assemble(
         reached=solution,
         feedback=found,
         moved_by_feedback=moved,
-        instruments=instruments_of(problem) if by_instrument else (),
+        held_upright=stays,
+        instruments=instruments,
         seed=run.seed,
         timing=run.timing,
     )

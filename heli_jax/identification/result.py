@@ -14,7 +14,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
-from heli_jax.identification.validation.closed_loop_trust import Moved, untrusted
+from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, untrusted
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
@@ -147,6 +147,9 @@ class Fit:
     """by flight and input, whether it follows the response"""
     moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
     """frequency error without an instrument: by parameter what feedback may have done to it"""
+    held_upright: bool = False
+    """frequency error: whether the model is unstable and the record does not grow, so that somebody
+    closes a loop even where no input was found to follow the response"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0
@@ -162,7 +165,9 @@ class Fit:
     @property
     def untrusted(self) -> tuple[str, ...]:
         """The parameters that feedback may have biased."""
-        return untrusted(self.moved_by_feedback, self.feedback)
+        return untrusted(
+            self.moved_by_feedback, Loop(self.feedback, self.instruments, self.held_upright)
+        )
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
