@@ -35,8 +35,8 @@ class PairAgreement(NamedTuple):
     chi_squared: float
     """squared errors over their variance, in the mean; 1 is expected"""
     simulated: bool
-    """whether the model was simulated and sent through the windows of the measurement; else its
-    response at each frequency was taken"""
+    """whether the model was simulated from its initial state and sent through the windows of the
+    measurement; else its bounded solution was, and what the ends of the record add taken off"""
 
 
 APART = (

@@ -49,6 +49,7 @@ from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.slow_modes import smoothed_beside_modes
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -162,7 +163,7 @@ class FrequencyError(Estimator):
         errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
-        spectra = [s * freedom for s in smoothed(errors)]
+        spectra = [s * freedom for s in smoothed_beside_modes(layout, data, z, errors)]
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = in_time(layout, data, noise, z)
         logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])

@@ -6,10 +6,11 @@ the measured outputs less the simulated ones, what the model misses of the respo
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
 The model goes through the same windows as the record: what windows do to a response they do to
-both, and nothing is biased. Where it is unstable, or remembers longer than a window, its response
-at each frequency is taken instead, with the inputs as they act between samples. Errors are complex
-and linear, whitened between outputs and inputs by the noise's spectral matrix: what no response
-explains of the errors. Lines of a window count for as much as they are independent.
+both, and nothing is biased. Where it is unstable, or remembers longer than a window, its bounded
+solution is taken in place of a simulation, and what the ends of the record add to it is projected
+out. Errors are complex and linear, whitened between outputs and inputs by the noise's spectral
+matrix: what no response explains of the errors. Lines of a window count for as much as they are
+independent.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
@@ -35,9 +36,14 @@ from heli_jax.analysis.response_agreement import (
 from heli_jax.analysis.response_errors import noise_density, response_of
 from heli_jax.analysis.windowed import window_transforms
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.bounded_solution import (
+    bounded_outputs,
+    ends_outputs,
+    span,
+)
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.linear_machine import Machine, machine_of
+from heli_jax.identification.estimation.linear_machine import machine_of
 from heli_jax.identification.estimation.measured_signals import signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
@@ -209,7 +215,9 @@ class FrequencyResponse(Estimator):
         E = response_of(w, weights.averages, np.asarray(_errors(layout, data, noise.whitening, z)))
         H = response_of(w, weights.averages, w.Y)
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
-        freedom = max(2.0 * weights.numbers - len(layout.of_interest), 1.0)
+        # What the ends of the records add takes its part.
+        ends = 0 if all(weights.simulated) else len(data.flights) * len(layout.states)
+        freedom = max(2.0 * weights.numbers - len(layout.of_interest) - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(
             w, used, H, E, weights.variance(), weights.coherence, weights.simulated
@@ -228,16 +236,25 @@ class FrequencyResponse(Estimator):
 
 
 def _rows(layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns) -> Float[Array, " r"]:
+    still = jax.lax.stop_gradient(u)
+    basis = _ends(layout, data, weights, still)
+    if basis is None:
+        return _whitened(weights, _all_errors(layout, data, weights, u, None))
+    Q, solution = span(jnp.stack([_whitened(weights, v) for v in basis], axis=1))
+    # Variable projection (Golub and Pereyra; Kaufman): about the ends that suit these unknowns
+    # best, whose own effect moves with the unknowns.
+    first = _whitened(weights, _all_errors(layout, data, weights, still, None))
+    ends = jax.lax.stop_gradient(solution @ (Q.T @ first)).reshape(len(data.flights), -1)
+    rows = _whitened(weights, _all_errors(layout, data, weights, u, ends))
+    return rows - Q @ (Q.T @ rows)
+
+
+def _whitened(weights: ResponseWeights, E: Complex[Array, "W k p"]) -> Float[Array, " r"]:
+    """What errors in windows make of the responses, in rows of variance 1."""
     w = weights.windows
-    first, sums = 0, []
-    for i, starts in enumerate(w.starts):
-        part = slice(first, first + len(starts))
-        first += len(starts)
-        if not starts:
-            continue
-        E, Z = _flight_errors(layout, data, weights, u, i), jnp.conj(w.Z[part])
-        sums.append(jnp.einsum("wp,wkz,wkp->kpz", w.seen[part].astype(Z.dtype), Z, E))
-    S = sum(sums[1:], sums[0]) / jnp.sum(w.seen, axis=0).astype(sums[0].dtype)[None, :, None]
+    Z = jnp.conj(w.Z)
+    S = jnp.einsum("wp,wkz,wkp->kpz", w.seen.astype(Z.dtype), Z, E)
+    S = S / jnp.sum(w.seen, axis=0).astype(S.dtype)[None, :, None]
     dH = jnp.einsum("pkmz,kpz->kpm", weights.averages.P, S)
     rows = jnp.einsum("kab,kb->ka", weights.whitening, dH.reshape(dH.shape[0], -1))
     # Of a complex normal error each part has half of the variance.
@@ -250,14 +267,46 @@ def _errors(
 ) -> Complex[Array, "W k p"]:
     """Transforms of measured less modelled outputs; zero where an output is not seen."""
     u, w = unpack(layout, data, z), weights.windows
-    parts = [
-        _flight_errors(layout, data, weights, u, i) for i, starts in enumerate(w.starts) if starts
-    ]
-    return jnp.concatenate(parts) * w.seen[:, None, :].astype(parts[0].dtype)
+    seen = w.seen[:, None, :]
+    E = _all_errors(layout, data, weights, u, None)
+    E = E * seen.astype(E.dtype)
+    basis = _ends(layout, data, weights, u)
+    if basis is None:
+        return E
+    # Of all that is seen in the windows, each output by its noise, and not of the responses alone.
+    power = jnp.real(jnp.einsum("kii->ki", weights.density))
+    scale = (seen / jnp.sqrt(power)[None]).astype(E.dtype)
+
+    def rows(v: Array) -> Array:
+        v = (v * scale).reshape(-1)
+        return jnp.concatenate([jnp.real(v), jnp.imag(v)])
+
+    Q, solution = span(jnp.stack([rows(v) for v in basis], axis=1))
+    ends = solution @ (Q.T @ rows(E))
+    return E - jnp.einsum("e,ewkp->wkp", ends.astype(E.dtype), basis) * seen.astype(E.dtype)
+
+
+def _all_errors(
+    layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns, ends: Array | None
+) -> Complex[Array, "W k p"]:
+    """Of all flights; `ends` (flights, n) of outputs that do not forget, zero unless given."""
+    of_flight = [None] * len(data.flights) if ends is None else ends
+    return jnp.concatenate(
+        [
+            _flight_errors(layout, data, weights, u, i, of_flight[i])
+            for i, starts in enumerate(weights.windows.starts)
+            if starts
+        ]
+    )
 
 
 def _flight_errors(
-    layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns, i: int
+    layout: Layout,
+    data: Data,
+    weights: ResponseWeights,
+    u: Unknowns,
+    i: int,
+    ends: Array | None,
 ) -> Complex[Array, "W k p"]:
     """One flight's, output by output in the order of the windows."""
     w = weights.windows
@@ -268,44 +317,48 @@ def _flight_errors(
     names = layout.outputs[i]
     measured = {n: jnp.nan_to_num(flight.outputs[n]) for n in names}
     through = [n for n, sent in zip(w.outputs, weights.simulated, strict=True) if sent]
-    if any(n in names for n in through):
-        run = machine.simulated(layout.block)
-        for n in through:
-            if n in names:
-                measured[n] = measured[n] - run[names.index(n)]
+    rest = [n for n in names if n in w.outputs and n not in through]
+    runs = [(through, lambda: machine.simulated(layout.block))]
+    runs += [(rest, lambda: bounded_outputs(machine, ends))]
+    for outputs, made in runs:
+        if any(n in names for n in outputs):
+            run = made()
+            for n in outputs:
+                if n in names:
+                    measured[n] = measured[n] - run[names.index(n)]
     absent = jnp.zeros_like(flight.outputs[names[0]])
     y = jnp.stack([measured.get(n, absent) for n in w.outputs])
     E = window_transforms(y, w.starts[i], w.length, w.numbers, w.dt)
-    E = jnp.moveaxis(E, 0, -1)
-    rest = [n for n in names if n in w.outputs and n not in through]
-    return E - _analytic(machine, weights, i, (names, rest)) if rest else E
+    return jnp.moveaxis(E, 0, -1)
 
 
-def _analytic(
-    machine: Machine,
-    weights: ResponseWeights,
-    i: int,
-    outputs: tuple[tuple[str, ...], list[str]],
-) -> Complex[Array, "W k p"]:
-    """Response at each frequency times the transforms of what drives the machine.
-
-    Args:
-        machine: of the i-th flight.
-        weights: with the windows.
-        i: the flight's number.
-        outputs: those that the flight measures, and those that are asked for.
-    """
-    w, (names, asked) = weights.windows, outputs
-    z = np.exp(2j * np.pi * w.lines / w.length)
-    G, D = machine.responses(z)
-    cut = (w.starts[i], w.length, w.numbers, w.dt)
-    # The transforms of late inputs themselves: a delay is then what it is in the record.
-    U = window_transforms(machine.U.T, *cut)
-    acting = window_transforms(machine.acting.T, *cut)
-    Y = jnp.einsum("kpr,rwk->wkp", G, U) + jnp.einsum("pm,mwk->wkp", D, acting)
-    zero = jnp.zeros_like(Y[:, :, 0])
-    columns = [Y[:, :, names.index(n)] if n in asked else zero for n in w.outputs]
-    return jnp.stack(columns, axis=-1)
+def _ends(
+    layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns
+) -> Complex[Array, "e W k p"] | None:
+    """What the ends of each flight add to outputs that do not forget, a state of a flight in
+    a row; None where all outputs forget."""
+    w, blocks = weights.windows, []
+    if all(weights.simulated):
+        return None
+    counts = [len(starts) for starts in w.starts]
+    for i, starts in enumerate(w.starts):
+        names = layout.outputs[i]
+        effects = ends_outputs(machine_of(layout, data, u, i))
+        n, _, N = effects.shape
+        rest = [not sent for sent in weights.simulated]
+        columns = [
+            effects[:, names.index(name)] if name in names and left else jnp.zeros((n, N))
+            for name, left in zip(w.outputs, rest, strict=True)
+        ]
+        if not starts:
+            blocks.append(jnp.zeros((n, sum(counts), len(w.numbers), len(w.outputs)), complex))
+            continue
+        y = jnp.stack(columns, axis=1).reshape(-1, N)
+        E = window_transforms(y, starts, w.length, w.numbers, w.dt)
+        E = jnp.moveaxis(E.reshape(n, len(w.outputs), len(starts), -1), 1, -1)
+        before, after = sum(counts[:i]), sum(counts[i + 1 :])
+        blocks.append(jnp.pad(E, ((0, 0), (before, after), (0, 0), (0, 0))))
+    return jax.lax.stop_gradient(jnp.concatenate(blocks))
 
 
 def _forgetful(
