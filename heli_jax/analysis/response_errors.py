@@ -177,8 +177,8 @@ def noise_density(
 
 
 def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, p, p) smooth spectral matrix of what inputs, or their instruments, leave of errors in the
-    windows seen (W, p); of outputs with other windows than one another only the diagonal is sound."""
+    """(k, p, p) smooth spectral matrix of what inputs (their instruments) leave of errors in the
+    windows seen (W, p); of outputs with different windows only the diagonal is sound."""
     P = []
     for mask in seen.T:
         # By what follows the instruments in the errors themselves, not by a response by instrument:

@@ -147,6 +147,8 @@ class Fit:
     """by flight and input, whether it follows the response"""
     moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
     """frequency error without an instrument: by parameter what feedback may have done to it"""
+    weak_instrument: tuple[str, ...] = ()
+    """the parameters of which an instrument tells too little"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0
@@ -161,8 +163,18 @@ class Fit:
 
     @property
     def untrusted(self) -> tuple[str, ...]:
-        """The parameters that feedback may have biased."""
-        return untrusted(self.moved_by_feedback, self.feedback)
+        """The parameters that feedback may have biased, or of which the instruments say too
+        little."""
+        doubted = (*untrusted(self.moved_by_feedback, self.feedback), *self.weak_instrument)
+        return tuple(n for n in self.estimates if n in doubted)
+
+    @property
+    def distrust(self) -> str:
+        """A sentence that belongs beside what the data determine; empty where all is trusted."""
+        if not self.untrusted or self.status == "not-converged":
+            return ""
+        why = "weak instrument" if self.weak_instrument else "closed loop without an instrument"
+        return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:

@@ -54,7 +54,8 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     estimator = estimator_of(fit.method)
     # With process noise estimated, a simulation departs from the record even with the true
     # parameters: the gates apply to the prediction one step ahead, and the simulation informs.
-    filtered = estimator.process_noise
+    # Where the noise's spectrum is estimated the fit simulates nothing either.
+    filtered = estimator.process_noise or estimator.noise_spectrum
     sources = (
         (fit.metrics, "simulated", not filtered),
         (fit.one_step, "one step ahead", True),

@@ -42,6 +42,7 @@ from heli_jax.identification.estimation.bounded_solution import (
     span,
 )
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linear_machine import machine_of
 from heli_jax.identification.estimation.measured_signals import signals
@@ -74,6 +75,7 @@ class FrequencyResponse(Estimator):
     nuisances_in_rows = False
     noise_spectrum = True
     fits_responses = True
+    by_instrument = True
     errors = "residuals"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -100,6 +102,9 @@ class FrequencyResponse(Estimator):
             return (
                 f"model {problem.model.name} is not linear; expected output-error or filter-error"
             )
+        refused = absent_instrument(problem)
+        if refused is not None:
+            return refused
         try:
             first_weights(problem, problem.training)
         except ValueError as e:

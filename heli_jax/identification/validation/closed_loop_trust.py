@@ -61,11 +61,15 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         at: where the fit ended.
     """
     layout, data, *_ = at
-    if not layout.estimator.by_instrument or data.flights[0].by_instrument is not None:
+    if (
+        not layout.estimator.by_instrument
+        or layout.estimator.fits_responses
+        or data.flights[0].by_instrument is not None
+    ):
         return {}
     lines = _lines(at)
     shares, chances, n = _coherent_with_residual(lines)
-    told = _information(at, [np.ones(len(v)) for v in shares])
+    told = information(at, [np.ones(len(v)) for v in shares])
     sd = np.sqrt(np.diagonal(told))
     # A parameter that is not determined has no standard deviation to be moved by.
     covariance = np.linalg.pinv(told / np.outer(sd, sd), rcond=1e-12, hermitian=True)
@@ -75,8 +79,8 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         with np.errstate(all="ignore"):
             return np.clip(np.nan_to_num(np.diagonal(part) / np.diagonal(covariance)), 0.0, 1.0)
 
-    by = np.sqrt(n * mean(_information(at, shares) - _information(at, chances)))
-    may_be = mean(_information(at, _room_for_feedback(lines)))
+    by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
+    may_be = mean(information(at, _room_for_feedback(lines)))
     return {
         n: Moved(float(b), float(m)) for n, b, m in zip(layout.of_interest, by, may_be, strict=True)
     }
@@ -165,7 +169,7 @@ def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     return rooms
 
 
-def _information(
+def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
     """Of the unknowns of interest, each frequency by its weight."""

@@ -84,6 +84,10 @@ def _doubts(fit: Fit) -> list[str]:
         ("the residuals are not white", fit.coloured and not fit.white),
         # Widened though each residual is white by itself: then several outputs err together.
         ("residuals of outputs are correlated", fit.coloured and fit.white),
+        (
+            f"{listed(fit.untrusted) if fit.untrusted else ''} not to be trusted",
+            bool(fit.untrusted),
+        ),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
