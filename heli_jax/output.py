@@ -37,7 +37,9 @@ def print_fit(run: FitRun) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    print(f"{arrived}: {text} adequate: {report_tables.adequate(fit)}")
+    worse = [f"{n} ({m.vaf:.2g})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
+    print(f"{arrived}: {text} adequate: {report_tables.adequate(fit)}{held}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")

@@ -227,6 +227,8 @@ class Fit:
     @property
     def interval(self) -> str:
         """What to call the intervals."""
+        if self.status == "not-converged":
+            return "95 % where it stopped"
         if self.coloured:
             return "95 % (autocorrelated residuals)"
         return "95 % (too narrow)" if self.overconfident else "95 % interval"
