@@ -15,26 +15,22 @@ def own_instruments(flights: Sequence[Flight], names: Sequence[str]) -> tuple[st
     with all that feedback brings into it.
 
     Args:
-        flights: with an instrument of each of the inputs.
+        flights: of which some may hold instruments.
         names: inputs.
     """
-    return tuple(n for n in names if _is_own(flights, n))
+    held = [n for n in names if all(n in f.instruments and n in f.inputs for f in flights)]
+    return tuple(n for n in held if _is_own(flights, n))
 
 
-def refuse_own(flights: Sequence[Flight], names: Sequence[str]) -> str | None:
-    """Why instruments cannot be used, in words; None where none is its own input.
+def own_said(names: Sequence[str]) -> str:
+    """What is to be said of them.
 
     Args:
-        flights: with an instrument of each of the inputs.
-        names: inputs.
+        names: of `own_instruments`.
     """
-    own = own_instruments(flights, names)
-    if not own:
-        return None
     return (
-        f"instrument of {', '.join(own)}: it is the input itself, and what follows it knows gusts "
-        "as the input does; expected the excitation alone, before pilot or autopilot add to it "
-        "(without any, leave it out of signals.instruments)"
+        f"instrument of {', '.join(names)}: it is the input itself, which knows gusts as far as a "
+        "loop is closed; expected the excitation alone, before pilot or autopilot add to it"
     )
 
 

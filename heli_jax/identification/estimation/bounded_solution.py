@@ -29,7 +29,7 @@ def bounded_outputs(machine: Machine, ends: Float[Array, " n"] | None) -> Float[
     """
     N = machine.U.shape[0]
     z, turns = _lines(N)
-    V = jnp.fft.fft(machine.U * jnp.conj(turns)[:, None], axis=0)[: z.size]
+    V = jnp.fft.fft(machine.U.astype(z.dtype) * np.conj(turns)[:, None], axis=0)[: z.size]
     driving = V @ machine.B.T.astype(z.dtype)
     if ends is not None:
         driving = driving + z[:, None] * ends.astype(z.dtype)[None, :]
@@ -82,7 +82,7 @@ def _resolvent(machine: Machine, z: Complex[np.ndarray, " K"]) -> Complex[Array,
 
 def _in_time(lines: Complex[Array, "K c"], turns: Complex[np.ndarray, " N"]) -> Float[Array, "N c"]:
     N, K = turns.size, lines.shape[0]
-    weights = np.full(K, 2.0)
+    weights = np.full(K, 2.0, turns.dtype)
     if N % 2:
         weights[-1] = 1.0
     whole = jnp.fft.ifft(lines * weights[:, None], N, axis=0)

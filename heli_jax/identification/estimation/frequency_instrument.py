@@ -16,7 +16,7 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.instruments import refuse_own
+from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
 from heli_jax.identification.problem import Problem
@@ -40,7 +40,8 @@ def instruments_of(problem: Problem) -> tuple[str, ...]:
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)
-    return tuple(n for n in known if _lacks(problem.training, n) is None)
+    own = own_instruments(problem.training, known)
+    return tuple(n for n in known if n not in own and _lacks(problem.training, n) is None)
 
 
 def _lacks(flights: Sequence[Flight], name: str) -> str | None:
@@ -69,7 +70,8 @@ def absent_instrument(problem: Problem) -> str | None:
         why = _lacks(problem.training, name)
         if why is not None:
             return f"instrument of {name}: {why}; expected one in every flight, or instrument: none"
-    return refuse_own(problem.training, instruments_of(problem))
+    own = own_instruments(problem.training, problem.instrument or ())
+    return own_said(own) if own else None
 
 
 def instrumented_inputs(

@@ -356,7 +356,7 @@ def _ends(
             for name, left in zip(w.outputs, rest, strict=True)
         ]
         if not starts:
-            blocks.append(jnp.zeros((n, sum(counts), len(w.numbers), len(w.outputs)), complex))
+            blocks.append(jnp.zeros((n, sum(counts), len(w.numbers), len(w.outputs)), w.Z.dtype))
             continue
         y = jnp.stack(columns, axis=1).reshape(-1, N)
         E = window_transforms(y, starts, w.length, w.numbers, w.dt)
