@@ -164,7 +164,7 @@ def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[G
     ]
     if judged:
         return lines
-    remark = "a simulation does not know the disturbance: see its error over what is expected"
+    remark = "not asked: a simulation does not know the disturbance"
     return [line._replace(gate="", passed=None, remark=remark) for line in lines]
 
 
@@ -204,7 +204,10 @@ def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
     for name, w in fit.whiteness.items():
         remark = f"{w.lags} lags, {w.outside:.1%} of them outside the 99 % band"
         lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
-    return lines
+    if not estimator_of(fit.method).noise_spectrum:
+        return lines
+    remark = "not asked: the noise's spectrum is estimated, and need not be white"
+    return [line._replace(gate="", passed=None, remark=remark) for line in lines]
 
 
 def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:

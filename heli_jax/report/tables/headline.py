@@ -6,6 +6,7 @@ import numpy as np
 
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.report.files import adequate_unjudged, whiteness_note
@@ -81,7 +82,8 @@ def _doubts(fit: Fit) -> list[str]:
     doubts = [
         (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
         ("the intervals are too narrow", fit.overconfident),
-        ("the residuals are not white", fit.coloured and not fit.white),
+        # Where the noise's spectrum is estimated nothing asks them to be white.
+        ("the residuals are not white", fit.coloured and not fit.white and not _by_spectrum(fit)),
         # Widened though each residual is white by itself: then several outputs err together.
         ("residuals of outputs are correlated", fit.coloured and fit.white),
         (
@@ -92,6 +94,10 @@ def _doubts(fit: Fit) -> list[str]:
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
     return [words for words, is_so in doubts if is_so]
+
+
+def _by_spectrum(fit: Fit) -> bool:
+    return estimator_of(fit.method).noise_spectrum
 
 
 def warnings(fit: Fit) -> list[str]:
