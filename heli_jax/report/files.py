@@ -232,10 +232,10 @@ def whiteness_note(fit: Fit) -> str:
     estimator = estimator_of(fit.method)
     if estimator.noise_spectrum:
         return (
-            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: the "
-            "noise's spectrum is estimated and the intervals allow for it."
+            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
+            "the noise's spectrum is estimated and the intervals allow for it."
         )
-    what, better = estimator.errors, fit.disturbable and not estimator.noise_spectrum
+    what, better = estimator.errors, fit.disturbable
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
