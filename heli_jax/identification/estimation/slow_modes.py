@@ -49,6 +49,8 @@ def smoothed_beside_modes(
     shaped = [S * peak[:, None, None] for S, peak in zip(flat, peaks, strict=True)]
     # An output that hardly shows the mode beside its measurement noise has no such peak.
     better = [a < b for a, b in zip(_misfit(shaped, errors), _misfit(plain, errors), strict=True)]
+    if all(better) or not any(better):
+        return shaped if all(better) else plain
     scales = [np.where(better, np.sqrt(peak)[:, None], 1.0) for peak in peaks]
     flat = smoothed([e / scale for e, scale in zip(errors, scales, strict=True)])
     pairs = zip(flat, scales, strict=True)
