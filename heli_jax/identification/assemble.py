@@ -161,7 +161,7 @@ def assemble(
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
     by_instrument = data.flights[0].by_instrument is not None
-    weak = weak_by_instrument(solution) if bool(best.converged) else ()
+    weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     in_time = (problem, params, signals, white, against, layout.determined)
     adequacy = (
