@@ -31,10 +31,15 @@ if TYPE_CHECKING:
 def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Did the optimiser arrive; what do the data determine; is the model adequate.
-    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {report_tables.adequate(fit)}")
+    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
+    if fit.status == "not-converged":
+        # What "the data determine" is a property of an optimum.
+        text = "the optimiser stopped before an optimum, and these numbers are no result."
+    worse = [f"{n} ({m.vaf:.2g})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
+    print(f"{arrived}: {text} adequate: {report_tables.adequate(fit)}{held}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")

@@ -11,6 +11,7 @@ from heli_jax.analysis.spectral import CrossSpectra, composite, cross_spectra, r
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
 from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.flights.parts import spans
 
 _LONGEST = 30.0
@@ -116,7 +117,10 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     if not inputs:
         raise ValueError("no input moves, expected one that does")
     instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
+    own = own_instruments(flights, instruments)
+    instruments = tuple(n for n in instruments if n not in own)
     notes = _notes(flights, inputs, instruments)
+    notes += [f"{own_said(own)}; it is not used"] if own else []
     outputs: dict[str, Output] = {}
     windows: dict[str, Windows] = {}
     names = (inputs, instruments)

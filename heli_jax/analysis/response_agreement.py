@@ -12,6 +12,8 @@ USUAL_J = 100.0
 """at most, where a response is usually called acceptable (Tischler and Remple, 2012, chapter 11)"""
 _POINTS = 20
 """frequencies, equally spaced in the logarithm, that J is usually taken over"""
+_TOO_SMALL = 0.7
+"""times the lower limit, below which squared errors are smaller than the noise that they are of"""
 _MISFIT = 2.0
 """times what random errors let expect, from which on squared errors speak against the model"""
 
@@ -35,8 +37,8 @@ class PairAgreement(NamedTuple):
     chi_squared: float
     """squared errors over their variance, in the mean; 1 is expected"""
     simulated: bool
-    """whether the model was simulated and sent through the windows of the measurement; else its
-    response at each frequency was taken"""
+    """whether the model was simulated from its initial state and sent through the windows of the
+    measurement; else its bounded solution was, and what the ends of the record add taken off"""
 
 
 APART = (
@@ -92,7 +94,14 @@ class ResponseAgreement(NamedTuple):
 
     @property
     def misfit(self) -> str:
-        """What chi-squared says where it lies above its interval; empty elsewhere."""
+        """What chi-squared says where it lies above its interval, or far below it; else empty."""
+        if self.chi_squared < _TOO_SMALL * self.lower95:
+            return (
+                f"Squared errors of the responses are {self.chi_squared:.3g} times what their "
+                f"random errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the "
+                "noise in the windows is taken for larger than it is in the responses, and the "
+                "intervals are too wide."
+            )
         if not self.chi_squared > self.upper95:
             return ""
         why = (

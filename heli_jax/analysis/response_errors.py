@@ -177,15 +177,18 @@ def noise_density(
 
 
 def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, p, p) smooth spectral matrix of what the inputs leave of errors in the windows seen
-    (W, p); of outputs with other windows than one another only the diagonal is sound."""
+    """(k, p, p) smooth spectral matrix of what inputs (their instruments) leave of errors in the
+    windows seen (W, p); of outputs with different windows only the diagonal is sound."""
     P = []
     for mask in seen.T:
-        z, u = (np.real(np.einsum("kaa->ka", _cross(mask, v, v))) for v in (w.Z, w.U))
-        P.append(np.nan_to_num(inverse(_cross(mask, w.Z, w.U), z, u)))
+        # By what follows the instruments in the errors themselves, not by a response by instrument:
+        # that one is anything where the excitation has no power, and what it left would be as well.
+        S_zz = _cross(mask, w.Z, w.Z)
+        power = np.real(np.einsum("kaa->ka", S_zz))
+        P.append(np.nan_to_num(inverse(S_zz, power, power)))
     S_ze = np.einsum("wp,wkz,wkp->kpz", seen, np.conj(w.Z), E, optimize=True)
-    dH = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
-    D = (E - np.einsum("wkm,kpm->wkp", w.U, dH, optimize=True)) * seen[:, None, :]
+    part = np.einsum("pkmz,kpz->kpm", np.stack(P), S_ze / np.sum(seen, axis=0)[None, :, None])
+    D = (E - np.einsum("wkm,kpm->wkp", w.Z, part, optimize=True)) * seen[:, None, :]
     # Each input takes one of the independent averages for its own response.
     freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
     S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)

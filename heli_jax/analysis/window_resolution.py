@@ -48,7 +48,7 @@ def window_error(
         input: the place of its input among the inputs.
         hold: what that does between samples.
     """
-    poles = fitted.poles
+    poles = np.asarray(fitted.poles, complex)
     if not (np.isfinite(poles).all() and np.all(poles.real * windows.seconds < -1.0)):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})

@@ -132,14 +132,18 @@ def hann(length: int) -> Float[np.ndarray, " n"]:
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
 
 
-def windowed(flights: Sequence[Flight], options: ResponseOptions = ResponseOptions()) -> Windowed:
+def windowed(
+    flights: Sequence[Flight],
+    options: ResponseOptions = ResponseOptions(),
+    by: Sequence[str] | None = None,
+) -> Windowed:
     """Flights in windows.
-
-    Inputs with an instrument in every flight (`Flight.instruments`) are taken by it.
 
     Args:
         flights: of one rate, with the same inputs; samples of outputs may be missing.
         options: band, window and points.
+        by: inputs that are taken by their instrument (`Flight.instruments`); all that have one in
+            every flight unless given.
 
     Raises:
         ValueError: rates differ, nothing moves, the band does not fit the window or the rate, or
@@ -153,15 +157,17 @@ def windowed(flights: Sequence[Flight], options: ResponseOptions = ResponseOptio
     inputs = tuple(n for n in flights[0].inputs if any(np.ptp(f.inputs[n]) > 0 for f in flights))
     if not inputs:
         raise ValueError("no input moves, expected one that does")
-    instruments = tuple(n for n in inputs if all(n in f.instruments for f in flights))
+    instruments = tuple(
+        n for n in inputs if all(n in f.instruments for f in flights) and (by is None or n in by)
+    )
     starts = tuple(_starts(f, length) for f in flights)
     outputs, seen, notes = _complete(flights, starts, length, (length * dt, len(inputs)))
     cut = _Cut(starts, length, lines, dt)
     U, of_inputs = cut.transforms([np.stack([f.inputs[n] for n in inputs]) for f in flights])
     Z = U
     if instruments:
-        by = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
-        signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in by]
+        kinds = [[f.instruments if n in instruments else f.inputs for n in inputs] for f in flights]
+        signals = [[s[n] for n, s in zip(inputs, each, strict=True)] for each in kinds]
         Z = cut.transforms([np.stack(s) for s in signals])[0]
     Y, of_outputs = cut.transforms([_filled(f, outputs) for f in flights])
     own = of_inputs[:, None, :] & of_outputs[:, :, None]

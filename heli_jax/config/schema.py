@@ -300,7 +300,7 @@ class FitConfig(_Strict):
     instrument: Annotated[
         Any, BeforeValidator(_instrument_choice, json_schema_input_type=str | list[str] | None)
     ] = None
-    """frequency-error: inputs that are taken by their instrument, or none; unless given, all of
+    """in frequency: inputs that are taken by their instrument, or none; unless given, all of
     which every flight holds one (docs/frequency.md)"""
     nuisance: NuisanceConfig = NuisanceConfig()
     """what is estimated beside"""

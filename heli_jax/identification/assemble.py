@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from heli_jax import naming
+from heli_jax.analysis.response_agreement import ResponseAgreement
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.agreement import (
     correlated_residuals,
@@ -44,6 +45,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     held_upright,
     moved_by_feedback,
 )
+from heli_jax.identification.validation.excitation_test import by_excitation
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -53,6 +55,7 @@ from heli_jax.identification.validation.feedback import (
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
+from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
 
@@ -119,7 +122,9 @@ def _numbers(
     verdict, wider, quantiles, _ = errors
     of_interest = estimates_of(problem, layout, e, verdict, quantiles, wider)
     nuisance = {k: v for k, v in of_interest.items() if k not in layout.free}
-    nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
+    # A method that does not see initial states and biases has no interval of them.
+    if layout.estimator.nuisances_in_rows:
+        nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
     nuisance |= {n: _absent(nuisance[n], gone=n in layout.sigmas) for n in absent}
     sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
     ill = layout.estimator.ill_conditioned(problem, e, sds)
@@ -159,10 +164,16 @@ def assemble(
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
     stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
-    instruments = instruments_of(problem) if by_instrument else ()
+    weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
+    instruments = _instruments(problem, by_instrument, responses)
     in_time = (problem, params, signals, white, against, layout.determined)
-    adequacy = by_responses(responses, pooled_metrics(signals)) or _adequacy(*in_time)
+    pooled = pooled_metrics(signals)
+    adequacy = (
+        by_responses(responses, pooled)
+        or by_excitation(problem, solution, pooled)
+        or _adequacy(*in_time)
+    )
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     missing = () if all_white else _missing(problem, signals, adequacy)
@@ -196,6 +207,7 @@ def assemble(
             *notes,
             *closed_loop,
             *feedback_trust_notes(moved, Loop(found, instruments, stays)),
+            *weak_note(weak),
             *adequacy.sentences,
             *missing,
             *held.notes,
@@ -204,10 +216,20 @@ def assemble(
         feedback=found,
         moved_by_feedback=moved,
         held_upright=stays,
+        weak_instrument=weak,
         instruments=instruments,
         seed=run.seed,
         timing=run.timing,
     )
+
+
+def _instruments(
+    problem: Problem, by_instrument: bool, responses: ResponseAgreement | None
+) -> tuple[str, ...]:
+    """The inputs that were taken by their instrument."""
+    if responses is not None:
+        return responses.instruments
+    return instruments_of(problem) if by_instrument else ()
 
 
 def _against_expected(

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
+from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.agreement import signals_of
 from heli_jax.identification.assemble import OptimizationRun, assemble, noise_by_name
 from heli_jax.identification.estimation import multistart as starting
@@ -276,4 +278,9 @@ def cautions(problem: Problem) -> tuple[str, ...]:
     for label, flight in zip(labels(flights), flights, strict=True):
         for caution in flight.source.cautions if flight.source else ():
             said.setdefault(caution, label)
-    return tuple(f"{label}: {caution}" for caution, label in said.items())
+    own = own_instruments(problem.training, naming.names(problem.model.Inputs))
+    own = own if problem.instrument is None else ()
+    return (
+        *(f"{label}: {caution}" for caution, label in said.items()),
+        *((f"{own_said(own)}; it is not used.",) if own else ()),
+    )

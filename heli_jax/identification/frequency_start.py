@@ -30,11 +30,20 @@ class FrequencyErrorStart(NamedTuple):
     """no stepwise selection of terms"""
 
     @property
+    def _why(self) -> str:
+        return " and ".join(dict.fromkeys(v.reason for v in self.values.values() if v.reason))
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """What was taken from where."""
         taken = [n for n, v in self.values.items() if v.origin == "frequency error"]
+        if not taken:
+            return (
+                f"The start by frequency error failed ({self.status}, {self.seconds:.2g} s): all "
+                f"parameters begin as stated, since {self._why}.",
+            )
         said = [
-            f"Start by frequency error of {', '.join(taken) or 'nothing'} ({self.status}, "
+            f"Start by frequency error of {', '.join(taken)} ({self.status}, "
             f"{self.seconds:.2g} s): the fit begins there, they are not its result."
         ]
         grouped: dict[str, list[str]] = {}

@@ -152,7 +152,9 @@ def choose(
         ValueError: a candidate is estimated by instrument.
     """
     for name, problem in problems.items():
-        if estimator_of(problem.method).by_instrument and instruments_of(problem):
+        method = estimator_of(problem.method)
+        # Responses by instrument have the likelihood of their errors.
+        if method.by_instrument and not method.fits_responses and instruments_of(problem):
             raise ValueError(
                 f"{name}: an estimate by instrument has no likelihood to be compared by, expected "
                 "instrument=() or method='filter-error'"

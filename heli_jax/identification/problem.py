@@ -92,7 +92,7 @@ class Problem:
     """with windows: standard deviation of the jump of each state from one window to the next, as a
     part of what the state does; None leaves them apart"""
     instrument: tuple[str, ...] | None = None
-    """frequency-error: inputs that are taken by their instrument (`Flight.instruments`); None: all
+    """in frequency: inputs that are taken by their instrument (`Flight.instruments`); None: all
     that every flight holds one of; (): none"""
     # Any: an EquationErrorStart, whose class stands above this module in the order of imports.
     first_guess: Any = None
@@ -218,7 +218,7 @@ def _check_method(problem: Problem) -> None:
     if problem.instrument and not estimator_of(problem.method).by_instrument:
         raise ValueError(
             f"instrument: method {problem.method} takes no input by an instrument, expected "
-            "frequency-error, or none"
+            "frequency-error, frequency-response, or none"
         )
     if not estimator_of(problem.method).process_noise:
         return

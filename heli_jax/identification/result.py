@@ -150,6 +150,8 @@ class Fit:
     held_upright: bool = False
     """frequency error: whether the model is unstable and the record does not grow, so that somebody
     closes a loop even where no input was found to follow the response"""
+    weak_instrument: tuple[str, ...] = ()
+    """the parameters of which an instrument tells too little"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0
@@ -164,10 +166,19 @@ class Fit:
 
     @property
     def untrusted(self) -> tuple[str, ...]:
-        """The parameters that feedback may have biased."""
-        return untrusted(
-            self.moved_by_feedback, Loop(self.feedback, self.instruments, self.held_upright)
-        )
+        """The parameters that feedback may have biased, or of which the instruments say too
+        little."""
+        loop = Loop(self.feedback, self.instruments, self.held_upright)
+        doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
+        return tuple(n for n in self.estimates if n in doubted)
+
+    @property
+    def distrust(self) -> str:
+        """A sentence that belongs beside what the data determine; empty where all is trusted."""
+        if not self.untrusted or self.status == "not-converged":
+            return ""
+        why = "weak instrument" if self.weak_instrument else "closed loop without an instrument"
+        return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
@@ -220,6 +231,8 @@ class Fit:
     @property
     def interval(self) -> str:
         """What to call the intervals."""
+        if self.status == "not-converged":
+            return "95 % where it stopped"
         if self.coloured:
             return "95 % (autocorrelated residuals)"
         return "95 % (too narrow)" if self.overconfident else "95 % interval"

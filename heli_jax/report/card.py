@@ -61,7 +61,8 @@ def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
     estimator = estimator_of(fit.method)
     # With process noise estimated, a simulation departs from the record even with the true
     # parameters: the gates apply to the prediction one step ahead, and the simulation informs.
-    filtered = estimator.process_noise
+    # Where the noise's spectrum is estimated the fit simulates nothing either.
+    filtered = estimator.process_noise or estimator.noise_spectrum
     sources = (
         (fit.metrics, "simulated", not filtered),
         (fit.one_step, "one step ahead", True),
@@ -182,7 +183,7 @@ def _of_agreement(name: str, m: Metrics, source: str, *, judged: bool) -> list[G
     ]
     if judged:
         return lines
-    remark = "a simulation does not know the disturbance: see its error over what is expected"
+    remark = "not asked: a simulation does not know the disturbance"
     return [line._replace(gate="", passed=None, remark=remark) for line in lines]
 
 
@@ -222,7 +223,10 @@ def _of_whiteness(fit: Fit, what: str) -> list[Gate]:
     for name, w in fit.whiteness.items():
         remark = f"{w.lags} lags, {percent(w.outside, 1)} of them outside the 99 % band"
         lines.append(Gate(what, name, w.p_value, "", "at least 0.01", w.white, remark))
-    return lines
+    if not estimator_of(fit.method).noise_spectrum:
+        return lines
+    remark = "not asked: the noise's spectrum is estimated, and need not be white"
+    return [line._replace(gate="", passed=None, remark=remark) for line in lines]
 
 
 def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:

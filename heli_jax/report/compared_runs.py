@@ -93,7 +93,8 @@ class ComparedRuns(NamedTuple):
                 run.model,
                 run.method,
                 run.status,
-                run.verdict,
+                # What the data determine is a property of an optimum.
+                "no optimum was reached" if run.status == "not-converged" else run.verdict,
                 {True: "yes", False: "no", None: "not judged"}[run.adequate],
             )
             for label, run in zip(self.labels, self.runs, strict=True)

@@ -31,15 +31,18 @@ def whiteness_note(fit: Fit) -> str:
     # By the correlation at one sample, which is the number that the sentence gives.
     worst = max((fit.whiteness[n] for n in not_white), key=lambda w: abs(w.lag1))
     estimator = estimator_of(fit.method)
-    what, better = estimator.errors, fit.disturbable and not estimator.noise_spectrum
+    if estimator.noise_spectrum:
+        return (
+            f"The residuals in time of {', '.join(not_white)} are not white, as gusts make them: "
+            "the noise's spectrum is estimated and the intervals allow for it."
+        )
+    what, better = estimator.errors, fit.disturbable
     if fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
             "residuals' autocorrelation"
             + (", which filter-error would use for a better estimate." if better else ".")
         )
-    elif estimator_of(fit.method).noise_spectrum:
-        consequence = "The intervals allow for it: the noise's spectrum is estimated."
     else:
         # Autocorrelated samples repeat one another, so that there are fewer pieces of news than
         # samples.

@@ -215,8 +215,8 @@ class FrequencyError(Estimator):
     def notes(
         self, layout: Layout, data: Data, noise: Noise, e: Evaluation, ill: bool
     ) -> list[str]:
-        """How much of flights with missing samples is used, where models were linearised, and which
-        instruments are weak.
+        """How much of flights with missing samples is used, where models were linearised, and what
+        there is not by instrument.
 
         Args:
             layout: what the unknowns are.
@@ -228,7 +228,7 @@ class FrequencyError(Estimator):
         return [
             *cut_notes(layout, data),
             *linearisation_notes(layout, data, noise, e),
-            *instrument_notes(layout, data, noise, e.z),
+            *instrument_notes(data),
         ]
 
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:

@@ -16,16 +16,17 @@ from jaxtyping import Float
 from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.identification.estimation.evaluation import deviations, evaluate
 from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
+from heli_jax.identification.unknowns.layout import Data, Solution
 
 PART = 0.05
 """sd of the Gaussian that smooths the inputs' spectra, as a part of the frequency"""
 _ALONE = 1e-9
 """of the instruments' power, below which two of them move as one"""
-_STRONG = 16.4
+STRONG = 16.4
 """F of the inputs' regression on the instruments from which on an interval of 95 % holds in 90 % of
 all cases at least"""
 
@@ -39,7 +40,8 @@ def instruments_of(problem: Problem) -> tuple[str, ...]:
     if problem.instrument is not None:
         return tuple(problem.instrument)
     known = naming.names(problem.model.Inputs)
-    return tuple(n for n in known if _lacks(problem.training, n) is None)
+    own = own_instruments(problem.training, known)
+    return tuple(n for n in known if n not in own and _lacks(problem.training, n) is None)
 
 
 def _lacks(flights: Sequence[Flight], name: str) -> str | None:
@@ -53,7 +55,7 @@ def _lacks(flights: Sequence[Flight], name: str) -> str | None:
 
 
 def absent_instrument(problem: Problem) -> str | None:
-    """Which instrument that was asked for is not there; None where all are.
+    """Which instrument that was asked for is not there, or is none; None where all are.
 
     Args:
         problem: its flights hold the instruments.
@@ -68,7 +70,8 @@ def absent_instrument(problem: Problem) -> str | None:
         why = _lacks(problem.training, name)
         if why is not None:
             return f"instrument of {name}: {why}; expected one in every flight, or instrument: none"
-    return None
+    own = own_instruments(problem.training, problem.instrument or ())
+    return own_said(own) if own else None
 
 
 def instrumented_inputs(
@@ -172,30 +175,16 @@ def inputs_by_instrument(data: Data) -> tuple[str, ...]:
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
 
 
-def instrument_notes(layout: Layout, data: Data, noise: Noise, z: np.ndarray) -> list[str]:
-    """Of which unknowns the instruments tell too little, and what a likelihood is then.
+def instrument_notes(data: Data) -> list[str]:
+    """What there is not of an estimate by instrument.
 
     Args:
-        layout: what the unknowns are.
         data: the numbers of the problem.
-        noise: at the optimum.
-        z: the unknowns there.
     """
     if data.flights[0].by_instrument is None:
         return []
-    notes = [
+    return [
         f"By instrument ({', '.join(inputs_by_instrument(data))}): the estimates solve equations "
         "and have no likelihood, so that there is no AIC or BIC; a profile is that of the "
         "equations' sum of squares, which has the same limits."
     ]
-    weak = {n: s for n, s in strengths(Solution(layout, data, noise, z)).items() if s.F < _STRONG}
-    if weak:
-        words = ", ".join(f"{n} ({100.0 * s.share:.2g} %)" for n, s in weak.items())
-        notes.insert(
-            0,
-            "Weak instrument: of what the inputs tell of these parameters only a small part "
-            f"follows the excitation ({words}; F below {_STRONG:g}): their estimates lean towards "
-            "the direct one and intervals may be too narrow. Remedy: a stronger excitation at the "
-            "frequencies that they act at, or longer records.",
-        )
-    return notes

@@ -6,10 +6,11 @@ the measured outputs less the simulated ones, what the model misses of the respo
 $$\Delta H = \overline{E Z^*}\; \overline{U Z^*}^{-1}.$$
 
 The model goes through the same windows as the record: what windows do to a response they do to
-both, and nothing is biased. Where it is unstable, or remembers longer than a window, its response
-at each frequency is taken instead, with the inputs as they act between samples. Errors are complex
-and linear, whitened between outputs and inputs by the noise's spectral matrix: what no response
-explains of the errors. Lines of a window count for as much as they are independent.
+both, and nothing is biased. Where it is unstable, or remembers longer than a window, its bounded
+solution is taken in place of a simulation, and what the ends of the record add to it is projected
+out. Errors are complex and linear, whitened between outputs and inputs by the noise's spectral
+matrix: what no response explains of the errors. Lines of a window count for as much as they are
+independent.
 
 Sources: Pintelon and Schoukens (2012), chapters 2 and 9; Bendat and Piersol (2010), chapter 9;
 Tischler and Remple (2012), chapters 7 to 12, for the approach, whose logarithmic errors and weights
@@ -19,7 +20,6 @@ by coherence are not used: they lose a factor of 2 to 10 in precision.
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,11 +33,10 @@ from heli_jax.analysis.response_agreement import (
     pair_agreements,
 )
 from heli_jax.analysis.response_errors import noise_density, response_of
-from heli_jax.analysis.windowed import window_transforms
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.frequency_instrument import absent_instrument
 from heli_jax.identification.estimation.in_time import in_time
-from heli_jax.identification.estimation.linear_machine import Machine, machine_of
 from heli_jax.identification.estimation.measured_signals import least_noise, signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.estimation.response_weights import (
@@ -49,6 +48,10 @@ from heli_jax.identification.estimation.response_weights import (
     weighed,
 )
 from heli_jax.identification.estimation.simulated_flights import driven, simulated_at, with_biases
+from heli_jax.identification.estimation.window_errors import (
+    errors_in_windows,
+    rows_of_responses,
+)
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -68,6 +71,7 @@ class FrequencyResponse(Estimator):
     nuisances_in_rows = False
     noise_spectrum = True
     fits_responses = True
+    by_instrument = True
     errors = "residuals"
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
@@ -82,7 +86,7 @@ class FrequencyResponse(Estimator):
         # A flight held out that is shorter than a window has no responses.
         if noise.whitening == ():
             return Residuals(jnp.zeros(0), None)
-        return Residuals(_rows(layout, data, noise.whitening, u), None)
+        return Residuals(rows_of_responses(layout, data, noise.whitening, u), None)
 
     def refusal(self, problem: Problem) -> str | None:
         """Other than linear models, and flights with too little in windows.
@@ -94,6 +98,9 @@ class FrequencyResponse(Estimator):
             return (
                 f"model {problem.model.name} is not linear; expected output-error or filter-error"
             )
+        refused = absent_instrument(problem)
+        if refused is not None:
+            return refused
         try:
             first_weights(problem, problem.training)
         except ValueError as e:
@@ -136,7 +143,7 @@ class FrequencyResponse(Estimator):
         u, weights = unpack(layout, data, z), back(noise.whitening)
         weights = weights._replace(simulated=_forgetful(layout, data, u, weights))
         weights = weights._replace(begun=(u.states, u.offsets))
-        errors = np.asarray(_errors(layout, data, on_device(weights), z))
+        errors = np.asarray(errors_in_windows(layout, data, on_device(weights), z))
         density = noise_density(weights.windows, weights.averages, errors)
         weights = weighed(weights, weights.simulated, density)
         level = -2.0 * weights.log_determinant / max(weights.numbers, 1.0)
@@ -193,6 +200,19 @@ class FrequencyResponse(Estimator):
         """
         return OUTPUT_ERROR.records(reached, u, runs, seed)
 
+    def errors_in_windows(
+        self, layout: Layout, data: Data, noise: Noise, z: Array
+    ) -> Complex[Array, "W k p"]:
+        """Transforms of measured less modelled outputs; zero where an output is not seen.
+
+        Args:
+            layout: what the unknowns are.
+            data: the numbers of the problem.
+            noise: with the weights.
+            z: the unknowns.
+        """
+        return errors_in_windows(layout, data, noise.whitening, z)
+
     def response_agreement(
         self, layout: Layout, data: Data, noise: Noise, z: Array
     ) -> ResponseAgreement | None:
@@ -206,10 +226,14 @@ class FrequencyResponse(Estimator):
         """
         weights = back(noise.whitening)
         w, used = weights.windows, weights.used
-        E = response_of(w, weights.averages, np.asarray(_errors(layout, data, noise.whitening, z)))
+        E = response_of(
+            w, weights.averages, np.asarray(errors_in_windows(layout, data, noise.whitening, z))
+        )
         H = response_of(w, weights.averages, w.Y)
         white = np.einsum("kab,kb->ka", weights.whitening, E.reshape(len(E), -1))
-        freedom = max(2.0 * weights.numbers - len(layout.of_interest), 1.0)
+        # What the ends of the records add takes its part.
+        ends = 0 if all(weights.simulated) else len(data.flights) * len(layout.states)
+        freedom = max(2.0 * weights.numbers - len(layout.of_interest) - ends, 1.0)
         low, high = expected_interval(freedom, weights.numbers_of_noise)
         pairs = pair_agreements(
             w, used, H, E, weights.variance(), weights.coherence, weights.simulated
@@ -225,87 +249,6 @@ class FrequencyResponse(Estimator):
             w.instruments,
             w.notes if w.together else (*w.notes, APART),
         )
-
-
-def _rows(layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns) -> Float[Array, " r"]:
-    w = weights.windows
-    first, sums = 0, []
-    for i, starts in enumerate(w.starts):
-        part = slice(first, first + len(starts))
-        first += len(starts)
-        if not starts:
-            continue
-        E, Z = _flight_errors(layout, data, weights, u, i), jnp.conj(w.Z[part])
-        sums.append(jnp.einsum("wp,wkz,wkp->kpz", w.seen[part].astype(Z.dtype), Z, E))
-    S = sum(sums[1:], sums[0]) / jnp.sum(w.seen, axis=0).astype(sums[0].dtype)[None, :, None]
-    dH = jnp.einsum("pkmz,kpz->kpm", weights.averages.P, S)
-    rows = jnp.einsum("kab,kb->ka", weights.whitening, dH.reshape(dH.shape[0], -1))
-    # Of a complex normal error each part has half of the variance.
-    return 2.0**0.5 * jnp.concatenate([jnp.real(rows).reshape(-1), jnp.imag(rows).reshape(-1)])
-
-
-@eqx.filter_jit
-def _errors(
-    layout: Layout, data: Data, weights: ResponseWeights, z: Array
-) -> Complex[Array, "W k p"]:
-    """Transforms of measured less modelled outputs; zero where an output is not seen."""
-    u, w = unpack(layout, data, z), weights.windows
-    parts = [
-        _flight_errors(layout, data, weights, u, i) for i, starts in enumerate(w.starts) if starts
-    ]
-    return jnp.concatenate(parts) * w.seen[:, None, :].astype(parts[0].dtype)
-
-
-def _flight_errors(
-    layout: Layout, data: Data, weights: ResponseWeights, u: Unknowns, i: int
-) -> Complex[Array, "W k p"]:
-    """One flight's, output by output in the order of the windows."""
-    w = weights.windows
-    states, offsets = weights.begun
-    # Numbers, not unknowns: they are found in time, since responses hardly tell them.
-    u = u._replace(states=states, offsets=offsets)
-    machine, flight = machine_of(layout, data, u, i), data.flights[i]
-    names = layout.outputs[i]
-    measured = {n: jnp.nan_to_num(flight.outputs[n]) for n in names}
-    through = [n for n, sent in zip(w.outputs, weights.simulated, strict=True) if sent]
-    if any(n in names for n in through):
-        run = machine.simulated(layout.block)
-        for n in through:
-            if n in names:
-                measured[n] = measured[n] - run[names.index(n)]
-    absent = jnp.zeros_like(flight.outputs[names[0]])
-    y = jnp.stack([measured.get(n, absent) for n in w.outputs])
-    E = window_transforms(y, w.starts[i], w.length, w.numbers, w.dt)
-    E = jnp.moveaxis(E, 0, -1)
-    rest = [n for n in names if n in w.outputs and n not in through]
-    return E - _analytic(machine, weights, i, (names, rest)) if rest else E
-
-
-def _analytic(
-    machine: Machine,
-    weights: ResponseWeights,
-    i: int,
-    outputs: tuple[tuple[str, ...], list[str]],
-) -> Complex[Array, "W k p"]:
-    """Response at each frequency times the transforms of what drives the machine.
-
-    Args:
-        machine: of the i-th flight.
-        weights: with the windows.
-        i: the flight's number.
-        outputs: those that the flight measures, and those that are asked for.
-    """
-    w, (names, asked) = weights.windows, outputs
-    z = np.exp(2j * np.pi * w.lines / w.length)
-    G, D = machine.responses(z)
-    cut = (w.starts[i], w.length, w.numbers, w.dt)
-    # The transforms of late inputs themselves: a delay is then what it is in the record.
-    U = window_transforms(machine.U.T, *cut)
-    acting = window_transforms(machine.acting.T, *cut)
-    Y = jnp.einsum("kpr,rwk->wkp", G, U) + jnp.einsum("pm,mwk->wkp", D, acting)
-    zero = jnp.zeros_like(Y[:, :, 0])
-    columns = [Y[:, :, names.index(n)] if n in asked else zero for n in w.outputs]
-    return jnp.stack(columns, axis=-1)
 
 
 def _forgetful(

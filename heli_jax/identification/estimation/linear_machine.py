@@ -1,4 +1,4 @@
-"""A flight's linear machine in discrete time: matrices, simulation, and response.
+"""A flight's linear machine in discrete time: matrices, and simulation.
 
 The one place from which the fit of responses takes them: a model that is linearised at a flight's
 trim need only be put in here.
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import StateSpace, jacobians
@@ -47,19 +47,6 @@ class Machine(NamedTuple):
         args = ZeroOrderHoldArgs(None, tuple(self.U.T), dt, None, Discrete(self.Ad, self.B, None))
         states = jnp.stack(blockwise(args, block, tuple(self.x0)))
         return self.C @ states + self.D @ self.acting.T
-
-    def responses(
-        self, z: Complex[np.ndarray, " k"]
-    ) -> tuple[Complex[Array, "k p r"], Complex[Array, "p m"]]:
-        """From the columns of U, and from the inputs that act.
-
-        Args:
-            z: exp(i omega dt).
-        """
-        Ad, B, C, D = (v.astype(z.dtype) for v in (self.Ad, self.B, self.C, self.D))
-        identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
-        resolvent = jnp.linalg.inv(z[:, None, None] * identity[None] - Ad[None])
-        return jnp.einsum("pn,knj,jr->kpr", C, resolvent, B), D
 
 
 def machine_of(layout: Layout, data: Data, u: Unknowns, i: int) -> Machine:

@@ -25,6 +25,7 @@ from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import zeros
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.linear_machine import forgets
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.input_offsets import offset_inputs
@@ -99,7 +100,7 @@ def first_weights(
     """
     options = problem.frequency
     _require_names(problem, options)
-    w = windowed(flights, options)
+    w = windowed(flights, options, instruments_of(problem))
     at = averages(w)
     sound = np.isfinite(response_of(w, at, w.Y))
     if len(w.inputs) > 1 and not sound.any():

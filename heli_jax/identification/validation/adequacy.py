@@ -71,6 +71,8 @@ class Adequacy(NamedTuple):
     residuals are white and others carry the fit"""
     doubts: tuple[str, ...] = ()
     """what forbids to call it adequate, however well it fits"""
+    limited: str = ""
+    """what keeps an adequate model from a plain yes, where no residual in time is judged"""
 
     def doubted(self, doubts: Sequence[str]) -> "Adequacy":
         """The same, not adequate where there is such a doubt, each in a few words."""
@@ -91,7 +93,8 @@ class Adequacy(NamedTuple):
         """`yes`, `in size only (the residuals of p are not white)`, or
         `no (VAF of p is -586, less than its mean)`."""
         if self.adequate:
-            words = f"in size only ({'; '.join(self._left_over)})" if self.coloured else "yes"
+            left = "; ".join(self._left_over) if self.coloured else self.limited
+            words = f"in size only ({left})" if left else "yes"
             if self.unexplained:
                 words += f", but nothing of {' and '.join(self.unexplained)} is explained"
             return words

@@ -24,7 +24,7 @@ Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's
 Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,6 +74,8 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         at: where the fit ended.
     """
     layout = at.layout
+    if layout.estimator.fits_responses:
+        return _of_responses(at)
     if not layout.estimator.by_instrument:
         return {}
     lines = _lines(at)
@@ -81,21 +83,63 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         return {}
     shares, chances, n = _coherent_with_residual(lines)
     n = n if all(lines.direct) else 0.0
-    told = _information(at, [np.ones(len(v)) for v in shares])
-    sd = np.sqrt(np.diagonal(told))
+    mean = mean_share(information(at, [np.ones(len(v)) for v in shares]))
+    by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
+    may_be = mean(information(at, _room_for_feedback(lines)))
+    return {
+        n: Moved(float(b), float(m)) for n, b, m in zip(layout.of_interest, by, may_be, strict=True)
+    }
+
+
+def mean_share(
+    told: Float[np.ndarray, "q q"],
+) -> Callable[[Float[np.ndarray, "q q"]], Float[np.ndarray, " q"]]:
+    """What makes of a part of the information the share that each unknown has of it, 0 to 1.
+
+    Args:
+        told: the whole information.
+    """
+    sd = np.sqrt(np.maximum(np.diagonal(told), 1e-300))
     # A parameter that is not determined has no standard deviation to be moved by.
     covariance = np.linalg.pinv(told / np.outer(sd, sd), rcond=1e-12, hermitian=True)
 
-    def mean(of: np.ndarray) -> np.ndarray:
+    def mean(of: Float[np.ndarray, "q q"]) -> Float[np.ndarray, " q"]:
         part = covariance @ (of / np.outer(sd, sd)) @ covariance
         with np.errstate(all="ignore"):
             return np.clip(np.nan_to_num(np.diagonal(part) / np.diagonal(covariance)), 0.0, 1.0)
 
-    by = np.sqrt(n * mean(_information(at, shares) - _information(at, chances)))
-    may_be = mean(_information(at, _room_for_feedback(lines)))
-    return {
-        n: Moved(float(b), float(m)) for n, b, m in zip(layout.of_interest, by, may_be, strict=True)
-    }
+    return mean
+
+
+def _of_responses(at: Solution) -> dict[str, Moved]:
+    """The same of fitted responses: how much of the inputs feedback may have brought in."""
+    layout, data, noise, z = at
+    w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
+    if w.instruments:
+        return {}
+    # A method of the estimator: its module stands above this one in the order of imports.
+    E = np.asarray(layout.estimator.errors_in_windows(layout, data, noise, z))
+    joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
+    S = np.einsum("wka,wkb->kab", joint, np.conj(joint)) / len(joint)
+    See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
+    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See)
+    by_line = information_by_line(at)
+    may_be = mean_share(by_line.sum(axis=0))(np.einsum("k,kab->ab", room, by_line))
+    return {n: Moved(0.0, float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
+
+
+def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
+    """Of the unknowns of interest, at each line of the windows of fitted responses.
+
+    Args:
+        at: where the fit ended.
+    """
+    layout, data, noise, z = at
+    k, r = np.asarray(noise.whitening.whitening).shape[:2]
+    q = len(layout.of_interest)
+    # Real parts, then imaginary ones.
+    J = np.asarray(evaluate(layout, data, noise, z).J)[: 2 * k * r, :q].reshape(2, k, r, q)
+    return np.einsum("ckra,ckrb->kab", J, J)
 
 
 def held_upright(at: Solution) -> bool:
@@ -213,30 +257,33 @@ def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.nd
 
 def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency the part of the input that a constant gain may have brought in."""
-    m = lines.inputs[0].shape[1]
     joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
-    rooms = []
-    for W, S, See in zip(
-        lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART), strict=True
-    ):
-        e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
-        ratio = e[:, None, :] / u[:, :, None]
-        white = np.real(np.einsum("kij,kjl,kil->k", W, S[:, m:, m:], np.conj(W))) / W.shape[1]
-        seen = white > _SEEN if np.any(white > _SEEN) else np.ones(len(white), bool)
-        # The largest gain that leaves the input no less than it has, at any frequency.
-        room = np.minimum(ratio / np.max(ratio[seen], axis=0)[None], 1.0).mean(axis=2)
-        # Each input by what it does: one that hardly acts moves no estimate.
-        direct = np.array(lines.direct)
-        H = np.swapaxes(
-            np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2
-        )
-        effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
-        room, effect = room[:, direct], effect[:, direct]
-        rooms.append(np.sum(room * effect, axis=1) / np.sum(effect, axis=1))
-    return rooms
+    spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
+    return [_room(*of_record, lines.direct) for of_record in zip(*spectra, strict=True)]
 
 
-def _information(
+def _room(
+    W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: Sequence[bool] | None = None
+) -> Float[np.ndarray, " k"]:
+    """By frequency the same, of the whitening, the spectra of inputs and outputs together, and
+    those of the residual; of the inputs `direct`, all unless given."""
+    m = S.shape[1] - See.shape[1]
+    e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
+    u = np.where(u > 0, u, 1e-300)
+    ratio = e[:, None, :] / u[:, :, None]
+    white = np.real(np.einsum("kij,kjl,kil->k", W, S[:, m:, m:], np.conj(W))) / W.shape[1]
+    seen = white > _SEEN if np.any(white > _SEEN) else np.ones(len(white), bool)
+    # The largest gain that leaves the input no less than it has, at any frequency.
+    room = np.minimum(ratio / np.max(ratio[seen], axis=0)[None], 1.0).mean(axis=2)
+    # Each input by what it does: one that hardly acts moves no estimate.
+    H = np.swapaxes(np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2)
+    effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
+    of = np.ones(m, bool) if direct is None else np.asarray(direct)
+    room, effect = room[:, of], effect[:, of]
+    return np.sum(room * effect, axis=1) / np.maximum(np.sum(effect, axis=1), 1e-300)
+
+
+def information(
     at: Solution, weights: Sequence[Float[np.ndarray, " K"]]
 ) -> Float[np.ndarray, "q q"]:
     """Of the unknowns of interest, each frequency by its weight."""

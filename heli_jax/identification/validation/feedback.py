@@ -21,9 +21,10 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.dynamics.model import axes_of
 from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
@@ -258,12 +259,32 @@ def feedback_notes(
     if filtered:
         doubt = "" if white is None else ", and they are not: disturbances or dynamics are missing"
         return [f"{begun}Filter error asks for white innovations{doubt}."]
-    axes = disturbable(problem.model)
-    how = f" with disturbance: {{axis: {axes[0]}, poles: 1}}" if axes else " and process noise"
+    if _by_instrument(problem, present):
+        return []
     return [
         f"{begun}That of {problem.method} knows no gusts, which feedback brings into the inputs: "
-        f"in gusts its estimates are biased, and method: filter-error{how} is advised."
+        f"in gusts its estimates are biased, and {_advised(problem, present)} is advised."
     ]
+
+
+def _by_instrument(problem: Problem, present: Sequence[Feedback]) -> bool:
+    """Whether all inputs that follow the response are taken by their instrument."""
+    if not estimator_of(problem.method).by_instrument:
+        return False
+    return {one.input for one in present} <= set(instruments_of(problem))
+
+
+def _advised(problem: Problem, present: Sequence[Feedback]) -> str:
+    """Filter error with a disturbance where the response that is followed is disturbed."""
+    axes, outputs = axes_of(problem.model), {one.output for one in present}
+    own = [axis.name for axis in axes if outputs & {axis.rate, axis.angle}]
+    if not axes:
+        return "method: filter-error and process noise"
+    if len(axes) == 1 or len(own) == 1:
+        name = own[0] if own else axes[0].name
+        return f"method: filter-error with disturbance: {{axis: {name}, poles: 1}}"
+    named = ", ".join(own or [axis.name for axis in axes])
+    return f"method: filter-error with a disturbance of each axis that gusts move ({named})"
 
 
 def _what_follows(problem: Problem, present: Sequence[Feedback]) -> str:

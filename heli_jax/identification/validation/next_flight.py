@@ -236,6 +236,13 @@ def _doublets(m: int, dt: float, step: float) -> Float[np.ndarray, " m"]:
     return np.where(phase == 0, 1.0, np.where(phase == 1, -1.0, 0.0))
 
 
+def _of_length(
+    flight: Flight, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]
+) -> Flight:
+    """The flight with other signals; what else was logged is not as long as these."""
+    return replace(flight, inputs=inputs, outputs=outputs, instruments={}, hold={}, hold_reason={})
+
+
 def _sensitivity(
     problem: Problem, at: Solution, i: int, candidates: list[Candidate], m: int
 ) -> tuple[Sensitivity, Layout, Data]:
@@ -252,7 +259,7 @@ def _sensitivity(
             rest = np.full(m, 0.0 if linear else float(u[0]))
             inputs[n] = rest + candidate.values if n == candidate.input else rest
         outputs = {n: np.zeros(m) for n in flight.outputs}
-        flights.append(replace(flight, inputs=inputs, outputs=outputs, hold={}, hold_reason={}))
+        flights.append(_of_length(flight, inputs, outputs))
         record: Any = problem.model.Inputs
         parts.append(
             numbers._replace(

@@ -80,7 +80,7 @@ def responses(fit: Fit) -> Table | None:
             number(p.coherence, 2),
             number(p.chi_squared, 2),
             number(p.J, 3),
-            "in windows" if p.simulated else "by line",
+            "in windows" if p.simulated else "in windows, ends free",
         )
         for p in agreement.pairs
         if p.lines

@@ -6,6 +6,7 @@ import numpy as np
 
 from heli_jax.identification.identifiability.analysis import ILL_CONDITIONED
 from heli_jax.identification.identifiability.sentences import listed
+from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.report.fit_content import adequate_unjudged, whiteness_note
@@ -81,13 +82,22 @@ def _doubts(fit: Fit) -> list[str]:
     doubts = [
         (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
         ("the intervals are too narrow", fit.overconfident),
-        ("the residuals are not white", fit.coloured and not fit.white),
+        # Where the noise's spectrum is estimated nothing asks them to be white.
+        ("the residuals are not white", fit.coloured and not fit.white and not _by_spectrum(fit)),
         # Widened though each residual is white by itself: then several outputs err together.
         ("residuals of outputs are correlated", fit.coloured and fit.white),
+        (
+            f"{listed(fit.untrusted) if fit.untrusted else ''} not to be trusted",
+            bool(fit.untrusted),
+        ),
         ("they are hardly separated", v.condition > ILL_CONDITIONED or bool(v.pairs)),
         ("an estimate is at its bound", any(e.at_bound for e in fit.estimates.values())),
     ]
     return [words for words, is_so in doubts if is_so]
+
+
+def _by_spectrum(fit: Fit) -> bool:
+    return estimator_of(fit.method).noise_spectrum
 
 
 def warnings(fit: Fit) -> list[str]:

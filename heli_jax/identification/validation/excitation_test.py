@@ -1,0 +1,163 @@
+r"""Whether a model in frequency is adequate: does the excitation still explain its residual?
+
+The residual of the right model knows nothing of what excites the machine: of the logged excitation
+where inputs are taken by it, else of the inputs. In bands of a record's own lines the power that
+follows the excitation is compared with what chance makes of it (Wilks, for complex normal errors).
+Nothing is simulated, so that the verdict holds for unstable machines, and gusts raise the noise and
+not the test. By instrument it is the test of overidentification (Sargan, 1958): more frequencies
+than parameters have to agree.
+
+Sources: Sargan (1958); Goodman (1963) for complex normal errors; Ljung, System Identification
+(1999), 16.6, for residuals against inputs.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+from jaxtyping import Complex
+
+from heli_jax.identification.estimation.frequency_instrument import instruments_of
+from heli_jax.identification.estimation.frequency_lines import errors_of_lines
+from heli_jax.identification.estimation.frequency_records import records_of
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.validation.adequacy import EXPLAINED, Adequacy
+from heli_jax.identification.validation.metrics import Metrics
+
+LEVEL = 0.01
+"""of the test of all outputs together"""
+_FIRST, _GROWTH = 12, 1.15
+"""lines of the lowest band, and how much wider the next one is"""
+_DIVERGED = -10.0
+"""VAF of a simulation below which it has left the record"""
+
+
+class Followed(NamedTuple):
+    """What of an output's residual follows the excitation."""
+
+    p_value: float
+    explained: float
+    """part of the output's power that follows the excitation which the model explains"""
+
+
+def by_excitation(
+    problem: Problem, at: Solution, agreement: Mapping[str, Metrics]
+) -> Adequacy | None:
+    """Whether a model fitted in frequency is adequate; None of a method that is judged in time.
+
+    Args:
+        problem: with the flights, their inputs and instruments.
+        at: where the fit ended.
+        agreement: of the simulation in time, by output.
+    """
+    estimator = at.layout.estimator
+    if not estimator.noise_spectrum or estimator.fits_responses:
+        return None
+    followed = residual_against_excitation(problem, at)
+    if not followed:
+        return None
+    failed = {n: f for n, f in followed.items() if f.p_value < LEVEL / len(followed)}
+    bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
+    what = "the excitation" if at.data.flights[0].by_instrument is not None else "the inputs"
+    numbers = ", ".join(
+        f"{n} (p {f.p_value:.2g}, {100 * f.explained:.0f} % explained)" for n, f in failed.items()
+    )
+    said = (
+        f"The residual still follows {what} in {numbers}: the model, or its estimates, are wrong "
+        "there, and no interval allows for that."
+    )
+    remarks = _diverged(agreement)
+    if bad:
+        doubt = f"the residual of {' and '.join(bad)} follows {what}"
+        worse = any(not followed[n].explained >= 0.0 for n in bad)
+        return Adequacy(False, worse, (), (said,), remarks=remarks, doubts=(doubt,))
+    limited = f"some of the residual of {', '.join(failed)} follows {what}" if failed else ""
+    notes = (said, *remarks) if failed else remarks
+    return Adequacy(True, False, (), remarks=notes, limited=limited)
+
+
+def _diverged(agreement: Mapping[str, Metrics]) -> tuple[str, ...]:
+    names = [n for n, m in agreement.items() if not m.vaf >= _DIVERGED]
+    if not names:
+        return ()
+    return (
+        f"Simulated in time from its initial state the model leaves the record in "
+        f"{', '.join(names)}: it is unstable, or nearly, and an error of its start grows. The fit "
+        "simulates nothing, and is judged at its frequencies.",
+    )
+
+
+def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Followed]:
+    """By output what of its residual follows the excitation; outputs of too few lines are left out.
+
+    Args:
+        problem: with the flights, their inputs and instruments.
+        at: where a fit by frequency error ended.
+    """
+    layout, data, noise, z = at
+    errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
+    sums: dict[str, np.ndarray] = {}
+    for record, e, W in zip(records_of(layout), errors, noise.whitening, strict=True):
+        flight, part = problem.training[record.flight], slice(record.first, record.last)
+        names = layout.outputs[record.flight]
+        by = instruments_of(problem) if data.flights[0].by_instrument is not None else ()
+        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
+        drives = [v[part] for v in drives if np.ptp(v[part]) > 0]
+        if not drives:
+            continue
+        X = _lines(drives, record.lines)
+        y = _lines([flight.outputs[n][part] for n in names], record.lines)
+        W = np.asarray(W)
+        # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
+        S = np.linalg.inv(np.conj(np.swapaxes(W, 1, 2)) @ W)
+        size = np.sqrt(np.real(np.einsum("kii->ki", S)))
+        for j, name in enumerate(names):
+            found = _in_bands(e[:, j], y[:, j], size[:, j], X)
+            sums[name] = sums.get(name, np.zeros(4)) + found
+    return {
+        name: Followed(
+            float(scipy.special.chdtrc(freedom, statistic)),
+            float(1.0 - left / response) if response > 0 else 1.0,
+        )
+        for name, (statistic, freedom, left, response) in sums.items()
+        if freedom > 0
+    }
+
+
+def _lines(signals: list[np.ndarray], count: int) -> Complex[np.ndarray, "K c"]:
+    v = np.stack(signals, axis=1)
+    return np.fft.rfft(v - v.mean(axis=0), axis=0)[1 : 1 + count] / np.sqrt(len(v))
+
+
+def _in_bands(
+    e: Complex[np.ndarray, " K"],
+    y: Complex[np.ndarray, " K"],
+    size: np.ndarray,
+    X: Complex[np.ndarray, "K m"],
+) -> np.ndarray:
+    """The test's statistic and degrees of freedom, and the powers that follow the excitation of the
+    residual, less what chance makes, and of the model's response."""
+    first, lines, total = 0, float(max(_FIRST, 4 * X.shape[1])), np.zeros(4)
+    while first + int(lines) <= len(e):
+        band = slice(first, first + int(lines))
+        n, first, lines = int(lines), band.stop, lines * _GROWTH
+        white = e[band] / size[band]
+        Q, R = np.linalg.qr(X[band] / size[band][:, None])
+        along = np.abs(np.diag(R))
+        Q = Q[:, along > 1e-9 * np.max(along, initial=0.0)]
+        m = Q.shape[1]
+        if m == 0:
+            continue
+        power = float(np.sum(np.abs(white) ** 2))
+        followed = float(np.sum(np.abs(Q.conj().T @ white) ** 2))
+        if not power > followed:
+            continue
+        statistic = -(2.0 * n - m - 1.0) * np.log1p(-followed / power)
+        response = (y - e)[band] / size[band]
+        scale = float(np.mean(size[band] ** 2))
+        chance = m * (power - followed) / (n - m)
+        answered = float(np.sum(np.abs(Q.conj().T @ response) ** 2))
+        total += [statistic, 2.0 * m, scale * (followed - chance), scale * answered]
+    return total

@@ -1,0 +1,42 @@
+"""Machines that remember longer than a window or than a record's lines tell, against NumPy."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Flight
+from heli_jax.flights.instruments import own_instruments
+from heli_jax.identification.estimation.bounded_solution import bounded_outputs, ends_outputs, span
+from heli_jax.identification.estimation.linear_machine import Machine
+
+
+@pytest.mark.parametrize("samples", [90, 91])
+def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add(samples):
+    rng = np.random.default_rng(samples)
+    # An unstable mode, an integrator and a lag.
+    A = np.array([[1.08, 0.0, 0.1], [0.3, 1.0, 0.0], [0.0, 0.0, 0.7]])
+    B, C, D = (rng.standard_normal(s) for s in ((3, 2), (2, 3), (2, 2)))
+    U, x = rng.standard_normal((samples, 2)), rng.standard_normal(3)
+    machine = Machine(*(jnp.asarray(v) for v in (A, B, U, U, C, D, x)))
+    y = np.zeros((2, samples))
+    for k in range(samples):
+        y[:, k] = C @ x + D @ U[k]
+        x = A @ x + B @ U[k]
+    left = (y - np.asarray(bounded_outputs(machine, None))).ravel()
+    basis = np.asarray(ends_outputs(machine)).reshape(3, -1).T
+    ends = np.linalg.lstsq(basis, left, rcond=None)[0]
+    whole = np.asarray(bounded_outputs(machine, jnp.asarray(ends)))
+    np.testing.assert_allclose(whole, y, atol=1e-8 * np.max(np.abs(y)))
+    Q, solution = (np.asarray(v) for v in span(jnp.asarray(basis)))
+    np.testing.assert_allclose(solution @ (Q.T @ left), ends, rtol=1e-6)
+
+
+def test_a_stick_is_no_instrument_of_itself():
+    u, r = np.random.default_rng(1).standard_normal((2, 50))
+
+    def flight(by):
+        return Flight(dt=0.1, inputs={"lat": u}, outputs={"p": u}, instruments={"lat": by})
+
+    assert own_instruments([flight(3.0 * u - 1.0)], ["lat"]) == ("lat",)
+    # A flight in open loop beside others is none.
+    assert own_instruments([flight(u), flight(r)], ["lat"]) == ()
