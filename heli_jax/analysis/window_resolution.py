@@ -48,8 +48,8 @@ def window_error(
         input: the place of its input among the inputs.
         hold: what that does between samples.
     """
-    poles = np.asarray(fitted.poles, complex)
-    if not (np.isfinite(poles).all() and np.all(poles.real * windows.seconds < -1.0)):
+    poles = fitted.poles
+    if not (np.isfinite(poles).all() and np.all(np.real(poles) * windows.seconds < -1.0)):
         return None
     kept = sorted({*windows.inputs, *(windows.instruments or ())})
     place = {i: j for j, i in enumerate(kept)}
