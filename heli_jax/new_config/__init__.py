@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import models, naming
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.open_log import chosen_flights, open_flights
@@ -165,12 +165,27 @@ def _model(name: str | None, log: _Log, path: str) -> tuple[Any, str | dict[str,
     if (
         not linear
         and not linear_models.is_shipped(stated)
-        and not stated.endswith((".yaml", "yml"))
+        and not stated.endswith((".yaml", ".yml"))
     ):
-        return models.by_name(stated, "--model"), stated, False
+        return _by_name(stated), stated, False
     if not linear and stated in ("roll", "pitch"):
         return models.by_name(stated, "--model"), stated, False
     return linear_models.linear_model(stated).model, {"linear": stated}, True
+
+
+def _by_name(stated: str) -> Any:
+    try:
+        return models.by_name(stated, "--model")
+    except InputError as e:
+        if ":" in stated:
+            raise
+        # The library's own list leaves out what is linear, and files.
+        known = (*models.names(), *linear_models.shipped())
+        near = nearest(stated, known) if "did you mean" in nearest(stated, known) else ""
+        raise InputError(
+            f"--model: there is no model {stated!r}{near}; expected one of {', '.join(known)}, a "
+            "linear model's file (NAME.yaml) or package.module:name"
+        ) from e
 
 
 def _by_what_moves(log: _Log, path: str) -> str:
