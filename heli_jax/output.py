@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heli_jax import run_directory
+from heli_jax.config.frequency import missing_handling
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
 from heli_jax.identification.fit import Check, Estimate
@@ -34,7 +35,10 @@ def print_fit(run: FitRun) -> None:
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Did the optimiser arrive; what do the data determine; is the model adequate.
-    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {report_tables.adequate(fit)}")
+    # Reasons have a line each below: they are said once.
+    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts and not judged
+    adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
+    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {adequate}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
         print(f"! {line}")
@@ -77,11 +81,14 @@ def print_fit(run: FitRun) -> None:
     if supplementary.responses is not None:
         for line in handling_lines(supplementary.responses.handling):
             print(line)
+        logged = {n for f in problem.training for n in f.outputs}
+        for sentence in missing_handling(run.config, logged):
+            print(f"! {sentence}")
     if (responses := report_tables.responses(fit)) is not None:
         print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    print(f"acceptance card: {summary(card(problem, fit))}")
+    print(f"acceptance card: {summary(card(problem, fit), _GATES)}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
         print_table(compared.head, compared.rows)
@@ -152,6 +159,8 @@ def _range(estimate: Estimate | Combination) -> str:
     return f"{shown[0]} to {shown[1]}"
 
 
+_GATES = 5
+"""failed gates that the terminal names; the report has all"""
 _NEAR = 10.0
 """standard deviations from the value, or share of it, up to which an end shares its digits"""
 

@@ -51,7 +51,7 @@ def draw_response(
     seen = seen_of(omega, pair)
     branch = branch_of(omega, pair.H, seen)
     _draw_measured(axes, hz, pair, known, branch)
-    _limit(axes, pair.H, branch, seen)
+    _limit(axes, pair.H, branch, seen if seen.any() else known)
     if np.isfinite(pair.picture).any():
         # Bin by bin beside the dots: unwrapped by itself it may leave them by turns.
         own = _nearest(np.degrees(np.angle(pair.picture)), branch)
@@ -61,7 +61,8 @@ def draw_response(
         # As a whole: a transfer function is smooth, and its own phase tells its turns.
         apart = np.median((branch - turned)[seen]) if seen.any() else 0.0
         turned = turned + 360.0 * np.round(apart / 360.0)
-        _curve(axes, hz, H, turned, known, color=color, lw=1.4, label=label)
+        everywhere = np.ones(hz.size, bool)
+        _curve(axes, hz, H, turned, everywhere, color=color, lw=1.4, label=label)
     axes[2].plot(hz, pair.coherence, color=style.BLACK, lw=0.9)
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
@@ -88,8 +89,7 @@ def seen_of(omega: np.ndarray, pair: Any) -> np.ndarray:
         pair: with H, sd and coherence, (k,) each.
     """
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
-    seen = known & (octave_mean(omega, pair.coherence) >= _SEEN)
-    return seen if seen.any() else known
+    return known & (octave_mean(omega, pair.coherence) >= _SEEN)
 
 
 def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
     Args:
         omega: (k,) [rad/s]
         H: (k,) complex; NaN stays NaN.
-        seen: (k,) bool
+        seen: (k,) bool; with none of them the phase is within half a turn of zero.
     """
     along = np.zeros(omega.size)
     if seen.any():
@@ -146,6 +146,9 @@ def _curve(
     known: np.ndarray,
     **line_style: Any,
 ) -> None:
+    # NaN breaks a line: joined, it would cross frequencies of which nothing is known.
     good = known & np.isfinite(H) & (np.abs(H) > 0)
-    axes[0].plot(hz[good], 20.0 * np.log10(np.abs(H[good])), **line_style)
-    axes[1].plot(hz[good], degrees[good], **line_style)
+    with np.errstate(divide="ignore"):
+        gain = 20.0 * np.log10(np.abs(H))
+    axes[0].plot(hz, np.where(good, gain, np.nan), **line_style)
+    axes[1].plot(hz, np.where(good, degrees, np.nan), **line_style)

@@ -80,6 +80,10 @@ def _doubts(fit: Fit) -> list[str]:
     v = fit.verdict
     doubts = [
         (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
+        (
+            f"zero is in the interval of {listed(v.through_zero) if v.through_zero else ''}",
+            bool(v.through_zero),
+        ),
         ("the intervals are too narrow", fit.overconfident),
         ("the residuals are not white", fit.coloured and not fit.white),
         # Widened though each residual is white by itself: then several outputs err together.
