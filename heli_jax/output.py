@@ -11,7 +11,7 @@ from heli_jax import run_directory
 from heli_jax.config.frequency import missing_handling
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
-from heli_jax.identification.fit import Check, Estimate
+from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
@@ -32,16 +32,7 @@ if TYPE_CHECKING:
 def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    judged = "judged where it stopped: " if fit.status == "not-converged" else ""
-    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
-    # Did the optimiser arrive; what do the data determine; is the model adequate.
-    # Reasons have a line each below: they are said once.
-    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts and not judged
-    adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
-    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {adequate}")
-    note = files.whiteness_note(fit)
-    for line in ([note] if note else []) + list(fit.notes):
-        print(f"! {line}")
+    _print_outcome(fit)
     # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
     # stand in fit.json and the report.
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
@@ -78,12 +69,7 @@ def print_fit(run: FitRun) -> None:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
-    if supplementary.responses is not None:
-        for line in handling_lines(supplementary.responses.handling):
-            print(line)
-        logged = {n for f in problem.training for n in f.outputs}
-        for sentence in missing_handling(run.config, logged):
-            print(f"! {sentence}")
+    _print_handling(run)
     if (responses := report_tables.responses(fit)) is not None:
         print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
@@ -98,6 +84,30 @@ def print_fit(run: FitRun) -> None:
         _print_baseline(run.baseline)
     if run.directory is not None:
         print(f"report: {run.directory / 'report.html'}")
+
+
+def _print_outcome(fit: Fit) -> None:
+    """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
+    judged = "judged where it stopped: " if fit.status == "not-converged" else ""
+    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
+    # Reasons have a line each below: they are said once.
+    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts and not judged
+    adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
+    print(f"{arrived}: {judged}{fit.verdict.text} adequate: {adequate}")
+    note = files.whiteness_note(fit)
+    for line in ([note] if note else []) + list(fit.notes):
+        print(f"! {line}")
+
+
+def _print_handling(run: FitRun) -> None:
+    """Handling qualities of model and data, and of which axes there are none."""
+    if run.supplementary.responses is None:
+        return
+    for line in handling_lines(run.supplementary.responses.handling):
+        print(line)
+    logged = {n for f in run.problem.training for n in f.outputs}
+    for sentence in missing_handling(run.config, logged):
+        print(f"! {sentence}")
 
 
 def run_compatibility(
