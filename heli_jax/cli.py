@@ -13,9 +13,9 @@ from heli_jax import (
     cli_options,
     file_commands,
     interrupts,
-    reading_progress,
     run_commands,
     run_directory,
+    terminal,
 )
 from heli_jax.errors import InputError
 
@@ -54,10 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         options.interrupts = seen
         try:
-            with reading_progress.on_terminal():
+            options.say = terminal.silent if options.quiet else terminal.say
+            with terminal.progress_shown(options.quiet):
                 return options.run(options)
         except KeyboardInterrupt:
-            _say(seen.words())
+            terminal.say(seen.words())
             return INTERRUPTED
         except BrokenPipeError:
             # `heli-jax simulate ... | head` is no failure. Python would flush its standard output
@@ -67,12 +68,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except Exception as e:
             # Whatever it says: an interrupt of which a library has made an error of its own.
             if seen.seen:
-                _say("interrupted")
+                terminal.say("interrupted")
                 return INTERRUPTED
             # Everything else is a fault of ours, and its traceback is what a report of it needs.
             if not isinstance(e, InputError):
                 raise
-            _say(" ".join(str(e).split()))
+            terminal.say(" ".join(str(e).split()))
             return WRONG_INPUT
 
 
@@ -90,12 +91,14 @@ def _parser() -> argparse.ArgumentParser:
         name: str, run: Callable[[argparse.Namespace], int], words: str
     ) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=words, description=words)
+        added.add_argument("--quiet", action="store_true", help="results, doubts and errors alone")
         added.set_defaults(run=run)
         return added
 
     fit = command("fit", _fit, "estimate parameters; write a run directory with a report")
     _add_config(fit)
     fit.add_argument("--out", metavar="DIR", help="run directory (default: runs/NAME-DATE-TIME)")
+    fit.add_argument("--json", action="store_true", help="print fit.json, for other programs")
     agree = command("compatibility", _compatibility, "do a log's sensors agree? their errors")
     _add_config(agree)
     agree.add_argument("--out", metavar="DIR", help="run directory (default: as of fit)")
@@ -143,11 +146,6 @@ def _add_config(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _say(text: str) -> None:
-    # On standard error: standard output is for results, which may be piped on.
-    print(f"heli-jax: {text}", file=sys.stderr, flush=True)
-
-
 def _prepare_jax() -> None:
     """float64, and a compilation cache that takes everything. Only entry points do this."""
     # Imports of JAX and of what uses it stand within the commands: they take seconds, and a wrong
@@ -183,8 +181,11 @@ def _fit(options: argparse.Namespace) -> int:
     from heli_jax import output, workflow
 
     experiment = workflow.load_config(options.config, options.set)
-    run = workflow.run_fit(experiment, out, progress=_say, began=began)
-    output.print_fit(run)
+    run = workflow.run_fit(experiment, out, progress=options.say, began=began)
+    if options.json:
+        print((out / "fit.json").read_text(encoding="utf-8"), end="")
+    else:
+        output.print_fit(run)
     return _fit_code(run.fit)
 
 
@@ -207,7 +208,7 @@ def _check(options: argparse.Namespace) -> int:
 
     def said(note: str) -> None:
         notes.append(note)
-        _say(note)
+        options.say(note)
 
     check = workflow.run_check(workflow.load_config(options.config, options.set), progress=said)
     if options.json:
@@ -223,7 +224,7 @@ def _windows(options: argparse.Namespace) -> int:
     from heli_jax import log_windows, workflow
 
     experiment = workflow.load_config(options.config, options.set)
-    ranking = log_windows.rank_log(experiment, options.log, options.length, progress=_say)
+    ranking = log_windows.rank_log(experiment, options.log, options.length, progress=options.say)
     log_windows.print_ranking(ranking)
     if log_windows.cannot_be_fitted(ranking) or log_windows.not_determined(ranking):
         return NOT_DETERMINED
@@ -234,7 +235,7 @@ def _compatibility(options: argparse.Namespace) -> int:
     _prepare_jax()
     from heli_jax import output
 
-    compatible = output.run_compatibility(options.config, options.out, options.set, _say)
+    compatible = output.run_compatibility(options.config, options.out, options.set, options.say)
     return DONE if compatible else NOT_CONVERGED
 
 
@@ -244,7 +245,7 @@ def _frf(options: argparse.Namespace) -> int:
     from heli_jax import log_responses, workflow
 
     experiment = workflow.load_config(options.config, options.set)
-    log_responses.run_responses(experiment, out, options.log, _say)
+    log_responses.run_responses(experiment, out, options.log, options.say)
     return DONE
 
 
@@ -272,14 +273,14 @@ def _simulate(options: argparse.Namespace) -> int:
     else:
         simulated = generate.follow(experiment)
     for note in simulated.notes:
-        _say(f"{options.config}: {note}")
+        options.say(f"{options.config}: {note}")
     simulation_output.write_table(out, simulated.columns)
     if out is not None:
-        _say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
+        options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
         simulation_output.write_view(view, experiment, simulated)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
-        _say(f"wrote {view}{whole}")
+        options.say(f"wrote {view}{whole}")
     return DONE
 
 
@@ -310,7 +311,10 @@ def _sweep(options: argparse.Namespace) -> int:
     options.interrupts.words = interrupted
     # Processes of a cluster have to be told.
     options.interrupts.unwinds = bool(options.workers or options.scheduler)
-    with simulation_output.sweep_progress() as progress, _client(options, config) as client:
+    with (
+        simulation_output.sweep_progress(options.quiet) as progress,
+        _client(options, config) as client,
+    ):
         workflow.run_sweep(
             experiment,
             out,
@@ -321,7 +325,7 @@ def _sweep(options: argparse.Namespace) -> int:
             client=client,
             memory=_cache() / "lanes.json",
             progress=progress,
-            say=_say,
+            say=options.say,
         )
     simulation_output.print_sweep(out)
     return DONE
@@ -373,26 +377,28 @@ def _convert(options: argparse.Namespace) -> int:
     with run_directory.whole_file(out, f"{out}") as temporary:
         convert.write_converted(temporary, converted)
     for note in converted.notes:
-        _say(f"{options.log}: {note}")
+        options.say(f"{options.log}: {note}")
     columns = converted.columns
-    _say(f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}")
+    options.say(
+        f"wrote {columns[convert.TIME].size} samples of {len(columns) - 1} signals to {out}"
+    )
     return DONE
 
 
 def _compare(options: argparse.Namespace) -> int:
-    return run_commands.compare(options, _say)
+    return run_commands.compare(options, options.say)
 
 
 def _new(options: argparse.Namespace) -> int:
-    return file_commands.new(options, _say)
+    return file_commands.new(options, options.say)
 
 
 def _keys(options: argparse.Namespace) -> int:
-    return file_commands.keys(options, _say)
+    return file_commands.keys(options, options.say)
 
 
 def _new_model(options: argparse.Namespace) -> int:
-    return file_commands.new_model(options, _say)
+    return file_commands.new_model(options, options.say)
 
 
 if __name__ == "__main__":

@@ -54,9 +54,16 @@ def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simu
 
 
 @contextlib.contextmanager
-def sweep_progress() -> Iterator["Callable[[Progress], None]"]:
+def sweep_progress(quiet: bool = False) -> Iterator["Callable[[Progress], None]"]:
     """What shows how far a sweep is, on standard error: a bar on a terminal, else now and then a
-    line."""
+    line.
+
+    Args:
+        quiet: show nothing.
+    """
+    if quiet:
+        yield lambda _: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

@@ -29,6 +29,7 @@ from heli_jax.identification.validation.enough import judged_again
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.report import files
 from heli_jax.report.files import SupplementaryAnalyses
+from heli_jax.stages import recorded, stage
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
@@ -126,8 +127,25 @@ def run_fit(
     began = time.perf_counter() if began is None else began
     if out is not None:
         run_directory.require_free(Path(out))  # before the work, not after it
-    config = config if isinstance(config, Experiment) else load_config(config)
-    problem = configuration.problem(config)
+    with recorded() as seconds:
+        seconds["loading"] = time.perf_counter() - began
+        run = _fit_run(config, progress, began, with_findings=out is not None)
+        run.fit.timing.update(seconds)
+    if out is None:
+        return run
+    progress("writing the report")
+    with stage("writing the report"):
+        return write_report(run, out)
+
+
+def _fit_run(
+    config: Experiment | str | Path, progress: Say, began: float, *, with_findings: bool
+) -> FitRun:
+    """`run_fit` without its report."""
+    # A reader shows how far it is by itself.
+    with stage("reading the log", name="reading", shown=False):
+        config = config if isinstance(config, Experiment) else load_config(config)
+        problem = configuration.problem(config)
     # Before the fit, so that a unit or a hold taken wrongly is seen while the fit runs.
     for note in reading_notes(problem):
         progress(note)
@@ -136,30 +154,25 @@ def run_fit(
     try:
         _require_rates(problem)
         # Part of the report, which a script that asks for none need not wait for.
-        enough = findings(problem) if out is not None else ()
-        fitted = fit(
-            problem,
-            starts=options.starts,
-            seed=options.seed,
-            max_steps=options.max_steps,
-            progress=progress,
-        )
+        with stage("whether the log is enough", name="findings"):
+            enough = findings(problem) if with_findings else ()
+        with stage("fit"):
+            fitted = fit(
+                problem,
+                starts=options.starts,
+                seed=options.seed,
+                max_steps=options.max_steps,
+                progress=progress,
+            )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e
-    run = FitRun(
-        config,
-        problem,
-        fitted,
-        _baseline(config, problem, fitted, progress),
-        _supplementary(config, problem, fitted, progress)._replace(
-            findings=_at_estimates(problem, fitted, enough)
-        ),
-        began=began,
-    )
-    if out is None:
-        return run
-    progress("writing the report")
-    return write_report(run, out)
+    with stage("recursive least squares", name="rls"):
+        rls = _baseline(config, problem, fitted, progress)
+    with stage("what else was asked for", name="further analyses"):
+        further = _supplementary(config, problem, fitted, progress)
+    with stage("whether the log was enough", name="findings"):
+        further = further._replace(findings=_at_estimates(problem, fitted, enough))
+    return FitRun(config, problem, fitted, rls, further, began=began)
 
 
 def _require_rates(problem: Problem) -> None:
@@ -197,7 +210,8 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
     for note in reading_notes(problem):
         progress(note)
     try:
-        return check(problem)
+        with stage("what the log can determine"):
+            return check(problem)
     except ValueError as e:
         raise InputError(f"{config.path}: fit: {e}") from e
 
@@ -225,7 +239,6 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
     if options is None:
         return None
     progress("recursive least squares")
-    started = time.perf_counter()
     # A baseline that fails must not cost the fit: too short a record, or a model that has none.
     estimate = None
     try:
@@ -238,7 +251,6 @@ def _baseline(config: Experiment, problem: Problem, fitted: Fit, progress: Say) 
         )
     except ValueError as e:
         progress(f"no baseline: {e}")
-    fitted.timing["rls"] = time.perf_counter() - started
     return estimate
 
 
@@ -325,13 +337,13 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
 
     out = Path(out)
     run_directory.require_free(out)
+    started = time.perf_counter()
     # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run)
     with run_directory.whole(out) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
-        started = time.perf_counter()
         title = run.config.path.stem
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
         write_page(folder, analysis, title, vehicle.constants)

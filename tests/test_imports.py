@@ -18,7 +18,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 BASE = {
     "errors", "pickled", "import_path", "regular_file", "units", "naming", "numerics", "yaml_file",
-    "vehicle", "versions", "numbers", "summaries", "exports",
+    "vehicle", "versions", "numbers", "summaries", "exports", "stages",
 }  # fmt: skip
 # What each part may import of heli_jax, beside itself.
 ALLOWED = {
@@ -32,6 +32,7 @@ ALLOWED = {
     "versions": set(),
     "yaml_file": {"errors", "regular_file"},
     "numbers": set(),
+    "stages": set(),
     "summaries": {"naming", "numbers"},
     "exports": {"naming", "summaries"},
     "vehicle": {"naming", "units", "errors", "yaml_file", "summaries"},
@@ -53,7 +54,7 @@ ENTRY = {
     "config", "generate", "new_model", "stick_inputs", "output", "run_directory", "workflow", "cli",
     "log_output", "log_windows", "log_responses", "cli_options", "interrupts", "reading_progress",
     "compatibility", "reference", "new_config", "simulation_output", "terminal_table",
-    "file_commands", "run_commands",
+    "file_commands", "run_commands", "stage_display", "terminal",
     "__init__",
     "__main__",
 }  # fmt: skip

@@ -14,8 +14,10 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.estimation.noise_covariance import (
+    RelaxedOptimum,
     better_of_two_guesses,
     first_noise,
     relax_noise_covariance,
@@ -46,6 +48,7 @@ from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import rate_against_angle
+from heli_jax.stages import stage
 
 __all__ = [
     "Check",
@@ -217,12 +220,32 @@ def fit(
     began = time.perf_counter()
     _require_problem(problem)
     report = progress or (lambda _: None)
-    guess = _first_guess(problem)
-    layout, data, noise = guess.layout, guess.data, guess.noise
+    with stage("first guess"):
+        guess = _first_guess(problem)
     # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
-    before = verdict_of(problem, layout, guess.e)
-    report(f"fitting {', '.join(layout.of_interest)}")
+    before = verdict_of(problem, guess.layout, guess.e)
+    words = f"fitting {', '.join(guess.layout.of_interest)}"
+    report(words)
     points = _starts(guess, problem, starts, seed)
+    with stage(words):
+        search, optima, optimum = _search(problem, guess, points, max_steps, report)
+    said = (*cautions(problem), *(f.sentence for f in rate_against_angle(problem)))
+    optimum = optimum._replace(notes=(*said, *optimum.notes))
+    timing = {"fit": time.perf_counter() - began}
+    with stage("intervals and verdicts"):
+        run = OptimizationRun(before, points, optima, seed, timing)
+        return assemble(problem, search, optimum, run)
+
+
+def _search(
+    problem: Problem,
+    guess: _FirstGuess,
+    points: Float[Array, "s q"],
+    max_steps: int,
+    report: starting.Progress,
+) -> tuple[starting.Search, list[Optimum], RelaxedOptimum]:
+    """The search with its layout and data, an optimum for each start, and where it ended."""
+    layout, data, noise = guess.layout, guess.data, guess.noise
     disturbed = bool(layout.sigmas)
     # Without a disturbance in the record the filter's optimiser finds no end: it is cut short,
     # and goes on only where there is one.
@@ -244,10 +267,7 @@ def fit(
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
         optimum = which(search, optimum)
-    said = (*cautions(problem), *(f.sentence for f in rate_against_angle(problem)))
-    optimum = optimum._replace(notes=(*said, *optimum.notes))
-    timing = {"fit": time.perf_counter() - began}
-    return assemble(problem, search, optimum, OptimizationRun(before, points, optima, seed, timing))
+    return search, optima, optimum
 
 
 def cautions(problem: Problem) -> tuple[str, ...]:

@@ -67,9 +67,8 @@ def configuration(
         f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
         "# heli-jax keys TEXT explains keys; heli-jax check says whether the log is enough.",
         f"model: {_value(chosen.name)}",
+        *([] if vehicle is None else [f"vehicle: {_value(vehicle)}"]),
     ]
-    if vehicle is not None:
-        lines.append(f"vehicle: {_value(vehicle)}")
     lines += ["flights:", f"  - log: {_value(log)}"]
     if flight is not None:
         lines.append(f"    flight: {flight}")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax import stages
 from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.optimiser_step import (
     BATCHED,
@@ -65,6 +66,9 @@ def _descend(
     state, (r, J) = compiled.begin(constants), first
     for k in range(max_steps):
         state = compiled.advance(constants, state, compiled.compressed(constants, r, J))
+        if compiled is SINGLE and stages.watched():
+            now = _optimum(constants.scaling.residual_norm, state, state.xi, count)
+            stages.advance(detail=f"cost {float(now.cost):.4g}")
         # Asked before the residuals: those at a point that nobody steps to would cost the most.
         if k + 1 == max_steps or bool(np.all(state.done)):
             break
@@ -235,6 +239,8 @@ def _run(
     if layout.estimator.one_program(layout) and held is None:
         end = _optimise_in_one_program(layout, data, noise, z0, np.asarray(max_steps), trusted)
         optimum = _optimum(end.scaling.residual_norm, end.state, end.z, count)
+        if stages.watched():
+            stages.advance(int(optimum.steps), f"cost {float(optimum.cost):.4g}")
         return _Run(optimum, end.scaling.unit, end.last.r, end.last.J)
 
     def evaluate(z: Array) -> tuple[Array, Array]:
@@ -306,6 +312,7 @@ def optimise_many(
         count = measured_count(numbers) // batch
         ends = _descend(evaluate, constants, evaluate(z0), count, _MANY_STEPS, BATCHED).optimum
         optima.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
+        stages.advance(min(batch, k - i))
     return jax.tree.map(lambda *v: np.concatenate(v), *optima)
 
 

@@ -9,6 +9,7 @@ from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap, bootstrap
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior, nuts
 from heli_jax.identification.uncertainty.profile_likelihood import Profile, profile
+from heli_jax.stages import stage
 
 DIFFERENT = 0.15
 """intervals whose ends lie further apart than this part of their width differ"""
@@ -67,13 +68,16 @@ def intervals(
     # From the quickest to the slowest, so that a mistake shows early.
     if profiles:
         report(f"profile likelihood of {', '.join(profiles)}")
-        profiled = profile(fit, profiles)
+        with stage(f"profile likelihood of {', '.join(profiles)}", name="profile likelihood"):
+            profiled = profile(fit, profiles)
     if runs:
         report(f"bootstrap, {runs} records")
-        booted = bootstrap(fit, runs, seed=seed)
+        with stage("bootstrap", total=runs):
+            booted = bootstrap(fit, runs, seed=seed)
     if draws:
         report(f"NUTS, 4 chains of {draws} draws")
-        posterior = nuts(fit, draws, seed=seed)
+        with stage("NUTS"):
+            posterior = nuts(fit, draws, seed=seed)
     by_parameter = _by_parameter(fit, profiled, booted, posterior)
     sentences += _sentences(fit, by_parameter, booted, posterior)
     return Intervals(by_parameter, profiled, booted, posterior, tuple(sentences))

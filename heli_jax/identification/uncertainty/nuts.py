@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax import stages
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
@@ -19,6 +20,8 @@ RHAT = 1.01
 EFFECTIVE = 400
 """effective draws above which an interval may be read off: 100 a chain (Vehtari et al., 2021)"""
 _CHAINS = 4
+_BLOCKS = 20
+"""in which the chains go on, one after another"""
 _TARGET = 0.8
 """acceptance rate that the step is adapted to (Hoffman and Gelman, 2014)"""
 
@@ -117,7 +120,7 @@ def _sample(
     draws: int,
     warmup: int,
     seed: int,
-) -> tuple[Array, Array]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions (chains, draws, q) and whether each step diverged (chains, draws)."""
     q = at.layout.size
     keys = jax.random.split(jax.random.key(seed), 3)
@@ -132,20 +135,30 @@ def _sample(
     # Chains begin apart, so that R-hat can tell whether they meet; this much of them is left out.
     settling = warmup // 2
 
-    def chain(key: Array) -> tuple[Array, Array]:
-        start_key, key = jax.random.split(key)
-        begin = state.position + 0.5 * jax.random.normal(start_key, (q,), at.z.dtype)
+    # The states are blackjax's own records: `Any`.
+    def begin(key: Array) -> Any:
+        return sampler.init(state.position + 0.5 * jax.random.normal(key, (q,), at.z.dtype))
 
-        # The states are blackjax's own records: `Any`.
-        def step(state: Any, key: Array) -> tuple[Any, tuple[Array, Array]]:
-            state, info = sampler.step(key, state)
-            return state, (state.position, info.is_divergent)
+    def step(state: Any, key: Array) -> tuple[Any, tuple[Array, Array]]:
+        state, info = sampler.step(key, state)
+        return state, (state.position, info.is_divergent)
 
-        keys = jax.random.split(key, draws + settling)
-        _, (positions, divergent) = jax.lax.scan(step, sampler.init(begin), keys)
-        return positions[settling:], divergent[settling:]
-
-    return jax.jit(jax.vmap(chain))(jax.random.split(keys[2], _CHAINS))
+    pairs = jax.vmap(jax.random.split)(jax.random.split(keys[2], _CHAINS))
+    chains = jax.jit(jax.vmap(begin))(pairs[:, 0])
+    # Some steps at a time, so that it can be said how far the chains are; those of the last block
+    # that nobody asked for are left out.
+    count = draws + settling
+    block = -(-count // _BLOCKS)
+    split = jax.vmap(lambda key: jax.random.split(key, block * _BLOCKS))(pairs[:, 1])
+    some = jax.jit(jax.vmap(lambda state, keys: jax.lax.scan(step, state, keys)))
+    found = []
+    with stages.stage(f"NUTS, {_CHAINS} chains", total=count):
+        for i in range(0, count, block):
+            chains, drawn = some(chains, split[:, i : i + block])
+            found.append(jax.device_get(drawn))
+            stages.advance(min(block, count - i))
+    positions, divergent = (np.concatenate(v, axis=1) for v in zip(*found, strict=True))
+    return positions[:, settling:count], divergent[:, settling:count]
 
 
 def _posterior(at: Solution, z: Float[np.ndarray, "chains draws q"], divergent: int) -> Posterior:

@@ -1,0 +1,31 @@
+"""What a command says on standard error while it works."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+
+from heli_jax import reading_progress, stage_display
+
+
+def say(text: str) -> None:
+    """Print a line."""
+    # On standard error: standard output is for results, which may be piped on.
+    print(f"heli-jax: {text}", file=sys.stderr, flush=True)
+
+
+def silent(_: str) -> None:
+    """Print nothing."""
+
+
+@contextlib.contextmanager
+def progress_shown(quiet: bool) -> Iterator[None]:
+    """Show how far the reading of a log and long work are.
+
+    Args:
+        quiet: show nothing.
+    """
+    if quiet:
+        yield
+        return
+    with reading_progress.on_terminal(), stage_display.on_terminal(say):
+        yield

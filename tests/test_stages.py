@@ -1,0 +1,84 @@
+"""What long work says of itself while it lasts, and what is kept of how long it took."""
+
+import threading
+import time
+
+import pytest
+
+from heli_jax import stage_display, stages
+from heli_jax.stages import Stage
+
+
+class Heard:
+    def __init__(self):
+        self.said = []
+
+    def begin(self, stage):
+        self.said.append(f"+{stage.words}")
+
+    def end(self, stage):
+        self.said.append(f"-{stage.words} {stage.done}")
+
+
+def test_outermost_stages_make_up_the_time():
+    began = time.perf_counter()
+    with stages.recorded() as seconds:
+        for _ in range(2):
+            with stages.stage("a fit", name="fit"), stages.stage("within"):
+                time.sleep(0.02)
+        with pytest.raises(KeyError), stages.stage("report"):
+            raise KeyError
+    spent = time.perf_counter() - began
+    assert seconds.keys() == {stages.COMPILATION, "fit", "report"}
+    assert 0.04 <= sum(seconds.values()) <= spent
+
+
+def test_an_observer_hears_of_stages_of_its_own_thread_alone():
+    heard = Heard()
+    with stages.observed_by(heard):
+        assert stages.watched()
+        with stages.stage("outer", total=3), stages.recorded(), stages.stage("inner"):
+            stages.advance(2, "cost 1")
+        with stages.stage("reading", shown=False):
+            pass
+        other = threading.Thread(target=lambda: heard.said.append(stages.watched()))
+        other.start()
+        other.join()
+    assert heard.said == ["+outer", "+inner", "-inner 2", "-outer 0", False]
+    assert not stages.watched()
+    with stages.stage("nobody listens"):
+        stages.advance()
+
+
+@pytest.mark.parametrize(
+    ("stage", "compiling", "words"),
+    [
+        (Stage("fit", began=0.0), None, "fit: 14 s"),
+        (Stage("fit", began=0.0), 3.0, "fit: compiling, 11 s"),
+        (Stage("fit", began=0.0), 13.0, "fit: 14 s"),
+        # Ten steps in the ten seconds after the first, which was compiled before.
+        (
+            Stage("fit", None, 11, "cost 2", 0.0, (1, 4.0)),
+            None,
+            "fit: step 11, cost 2, 1 a second, 14 s",
+        ),
+        (
+            Stage("bootstrap", 1000, 28, "", 0.0, (8, 4.0)),
+            None,
+            "bootstrap: 28 of 1000, 2 a second, 14 s, 0:08:06 left",
+        ),
+    ],
+)
+def test_a_stage_in_words(stage, compiling, words):
+    assert stage_display.in_words(stage, compiling, 14.0) == words
+
+
+def test_what_lasts_is_said_now_and_then_where_there_is_no_terminal(monkeypatch):
+    monkeypatch.setattr(stage_display, "_AFTER", 0.0)
+    monkeypatch.setattr(stage_display, "_EVERY", 0.0)
+    said = []
+    with stage_display.on_terminal(said.append), stages.stage("a long fit"):
+        waited = time.perf_counter()
+        while not said and time.perf_counter() - waited < 10.0:
+            time.sleep(0.05)
+    assert said[0].startswith("a long fit: ")
