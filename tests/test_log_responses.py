@@ -13,7 +13,7 @@ from heli_jax.analysis.attitude_responses import handling_gaps
 from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
 from heli_jax.cli import main
 from heli_jax.flights import Flight
-from heli_jax.linear_models import linear_model
+from heli_jax.linear_models.read import linear_model
 from heli_jax.report.figures.responses import branch_of
 
 DT = 0.02
