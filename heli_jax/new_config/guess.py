@@ -39,7 +39,7 @@ _FILLERS = {
 }
 # Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
 _OTHER = {
-    *("batt", "battery", "bat", "volt", "voltage", "current", "curr", "power", "temp"),
+    *("batt", "battery", "bat", "volt", "voltage", "power", "temp"),
     *("temperature", "rssi", "motor", "esc", "servo", "pid", "gain", "quat", "var", "noise"),
 }
 # gyro_roll is no roll, accel_x no speed.
@@ -168,7 +168,8 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
         si: the unit that the model has.
     """
     unit = series.unit or without_unit(name)[1]
-    if unit and not _fits(unit, si):
+    # A model that states no unit takes any.
+    if unit and si != "1" and not _fits(unit, si):
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
     return not (_OTHER | _CHANGES) & words - own
