@@ -112,7 +112,10 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
 
 @pytest.mark.parametrize(
     ("column", "value", "sentence"),
-    [(3, "", "outputs.p: all its samples are missing"), (None, "0", "no input moves")],
+    [
+        (3, "", "outputs.p: all its samples are missing"),
+        (None, "0", "nothing can be learnt from it"),
+    ],
 )
 def test_a_log_that_says_nothing_is_refused(config, tmp_path, capsys, column, value, sentence):
     log = tmp_path / "log.csv"
