@@ -180,11 +180,12 @@ def _by_name(stated: str) -> Any:
         if ":" in stated:
             raise
         # The library's own list leaves out what is linear, and files.
-        known = (*models.names(), *linear_models.shipped())
-        near = nearest(stated, known) if "did you mean" in nearest(stated, known) else ""
+        known = tuple(dict.fromkeys((*models.names(), *linear_models.shipped())))
+        near = nearest(stated, known)
+        meant = near if "did you mean" in near else ""
         raise InputError(
-            f"--model: there is no model {stated!r}{near}; expected one of {', '.join(known)}, a "
-            "linear model's file (NAME.yaml) or package.module:name"
+            f"--model: expected one of {', '.join(known)}, a linear model's file (NAME.yaml) or "
+            f"package.module:name, got {stated!r}{meant}"
         ) from e
 
 

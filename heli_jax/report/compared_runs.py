@@ -108,6 +108,8 @@ class ComparedRuns(NamedTuple):
         for label, run in zip(self.labels, self.runs, strict=True):
             if run.status == "not-converged":
                 notes.append(f"{label} did not converge: its numbers are no result.")
+                if run is first:
+                    notes.append("Differences are from the first run: name one first that did.")
             elif run.adequate is False:
                 notes.append(f"{label} is not adequate: its intervals may be too narrow.")
         return tuple(notes)
