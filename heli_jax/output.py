@@ -62,11 +62,7 @@ def print_fit(run: FitRun) -> None:
     for name, m in fit.validation.items():
         _print_agreement(f"{name}, held out, simulated", m)
     for name, m in fit.validation_free_run.items():
-        # An unstable machine simulated in one piece leaves any record: numbers would say nothing.
-        if diverges(m):
-            print(f"{name}, held out, simulated in one piece: diverges")
-        else:
-            _print_agreement(f"{name}, held out, simulated in one piece", m)
+        _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     _print_handling(run)
@@ -176,6 +172,10 @@ _NEAR = 10.0
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
+    # An unstable machine simulated in one piece leaves any record: numbers would say nothing.
+    if diverges(m):
+        print(f"{what}: diverges")
+        return
     print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
 
 

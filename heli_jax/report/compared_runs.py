@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.validation.metrics import Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.summaries import Summary, as_html, as_text
@@ -75,9 +76,9 @@ class ComparedRuns(NamedTuple):
             of = [run.validation if held_out else run.metrics for run in self.runs]
             for output in _in_order(of):
                 for words, key in _METRICS:
-                    values = [getattr(m.get(output), key, None) for m in of]
                     where = "held out" if held_out else "fitted"
-                    rows.append((output, where, words, *map(_number, values)))
+                    cells = (_agreement(m.get(output), key) for m in of)
+                    rows.append((output, where, words, *cells))
         return Table(("output", "flights", "metric", *self.labels), tuple(rows))
 
     @property
@@ -235,6 +236,12 @@ def _difference(first: Estimate | None, other: Estimate | None) -> str:
         return _ABSENT
     text = f"{(other.value - first.value) / joint:+.1f}"
     return "0.0" if float(text) == 0.0 else text
+
+
+def _agreement(m: Metrics | None, key: str) -> str:
+    if m is not None and diverges(m):
+        return "diverges"
+    return _number(getattr(m, key, None))
 
 
 def _number(value: float | None) -> str:
