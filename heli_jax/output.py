@@ -16,7 +16,7 @@ from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
@@ -62,7 +62,10 @@ def print_fit(run: FitRun) -> None:
     for name, m in fit.validation.items():
         _print_agreement(f"{name}, held out, simulated", m)
     for name, m in fit.validation_free_run.items():
-        _print_agreement(f"{name}, held out, simulated in one piece", m)
+        if diverges(m):
+            print(f"{name}, held out, simulated in one piece: diverges")
+        else:
+            _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
     _print_handling(run)
@@ -172,8 +175,8 @@ _NEAR = 10.0
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
-    # An unstable machine simulated in one piece leaves any record: numbers would say nothing.
-    if diverges(m):
+    # An unstable machine leaves any record: numbers would say nothing.
+    if diverges(m, FAR):
         print(f"{what}: diverges")
         return
     print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.summaries import Summary, as_html, as_text
@@ -239,7 +239,7 @@ def _difference(first: Estimate | None, other: Estimate | None) -> str:
 
 
 def _agreement(m: Metrics | None, key: str) -> str:
-    if m is not None and diverges(m):
+    if m is not None and diverges(m, FAR):
         return "diverges"
     return _number(getattr(m, key, None))
 
