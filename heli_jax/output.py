@@ -90,7 +90,7 @@ def _print_outcome(fit: Fit) -> None:
     judged = "judged where it stopped: " if fit.status == "not-converged" else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
-    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts and not judged
+    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
     adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
     print(f"{arrived}: {judged}{fit.verdict.text} adequate: {adequate}")
     note = files.whiteness_note(fit)
