@@ -199,9 +199,7 @@ def _fit(options: argparse.Namespace) -> int:
 
 
 def _fit_code(fitted: "Fit") -> int:
-    """The exit code of a fit; what is wrong with the model itself is said on standard error."""
-    for reason in fitted.adequacy.reasons:
-        terminal.say(f"the model is not adequate: {reason}")
+    """The exit code of a fit."""
     code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(fitted.status, NOT_CONVERGED)
     # Converged onto a model worse than a constant: a script that looks at the code alone must not
     # take these numbers.

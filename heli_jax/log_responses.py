@@ -1,7 +1,9 @@
 """`heli-jax frf`: frequency responses of a configuration's logs, before any model is fitted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from heli_jax import run_directory
 from heli_jax.analysis.attitude_responses import (
@@ -9,13 +11,17 @@ from heli_jax.analysis.attitude_responses import (
     measured_handling,
 )
 from heli_jax.analysis.flight_responses import FlightResponses, Settings, Wanted, flight_responses
+from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.frequency import asked_handling, check_pairs, units_of
+from heli_jax.config.frequency import asked_handling, check_pairs, missing_handling, units_of
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
+from heli_jax.flights.flight import Flight
 from heli_jax.numbers import number
 
+COHERENT = 0.6
+"""as in `analysis.response_curves`, from which on a response is taken for the input's"""
 _TOO_LARGE = 2.0
 """chi-squared per degree of freedom from which on a transfer function is called too simple"""
 
@@ -54,10 +60,30 @@ def responses_of_log(
     for note in (n for f in flights for n in (f.source.notes if f.source else ())):
         if progress is not None:
             progress(note)
+    _require_samples(flights, experiment.path)
     try:
-        return flight_responses(flights, settings)
+        found = flight_responses(flights, settings)
     except ValueError as e:
         raise InputError(f"{experiment.path}: frequency: {e}") from e
+    pairs = [pair for output in found.outputs.values() for pair in output.pairs.values()]
+    if not any(np.isfinite(pair.coherence).any() for pair in pairs):
+        longest = max(f.duration for f in flights)
+        raise InputError(
+            f"{experiment.path}: no response: at no frequency of the band has a signal ten times "
+            "the power that the window's sidelobes bring, expected sticks that are excited there "
+            f"(a sweep, doublets) for longer than a few windows of {found.window:.3g} s, got "
+            f"{longest:.3g} s"
+        )
+    return found
+
+
+def _require_samples(flights: Sequence[Flight], path: str | Path) -> None:
+    for name in dict.fromkeys(n for f in flights for n in f.outputs):
+        if not any(np.isfinite(f.outputs[name]).any() for f in flights if name in f.outputs):
+            raise InputError(
+                f"{path}: flights[].signals.outputs.{name}: all its samples are missing, expected "
+                "numbers; leave it out, or name another signal"
+            )
 
 
 def run_responses(
@@ -83,17 +109,35 @@ def run_responses(
         for pair in asked
         if named or pair.input in found.holds
     ]
+    gaps = missing_handling(experiment, found.outputs)
+    found = found._replace(notes=(*found.notes, *not_usable(found)))
     with run_directory.whole(out) as temporary:
         title = Path(experiment.path).stem
-        write_responses(temporary, found, units_of(experiment), title, handling)
+        written = found._replace(notes=(*found.notes, *gaps))
+        write_responses(temporary, written, units_of(experiment), title, handling)
     for note in found.notes:
         say(note)
     print_responses(found)
     for line in handling_lines(handling):
         print(line)
-    for sentence in handling_sentences(handling):
+    for sentence in (*handling_sentences(handling), *gaps):
         print(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")
+
+
+def not_usable(found: FlightResponses) -> tuple[str, ...]:
+    """That no response is coherent with its input, where none is.
+
+    Args:
+        found: the responses.
+    """
+    pairs = [pair for output in found.outputs.values() for pair in output.pairs.values()]
+    if any(np.max(octave_mean(found.omega, p.coherence)) >= COHERENT for p in pairs):
+        return ()
+    return (
+        f"no response is usable: none has a coherence of {COHERENT:g} in the mean over an octave; "
+        "little was excited, or gusts and noise are larger than the response",
+    )
 
 
 def print_responses(found: FlightResponses) -> None:
@@ -105,14 +149,20 @@ def print_responses(found: FlightResponses) -> None:
     for name, output in found.outputs.items():
         for input, pair in output.pairs.items():
             band = useful_band(found.omega, pair)
-            rows.append((f"{input} to {name}", f"{output.averages:.1f}", *band))
-    print_table(("response", "averages", "coherence", "usable from [Hz]", "to [Hz]"), rows)
+            by = "by instrument" if input in found.instruments else "direct"
+            rows.append((f"{input} to {name}", by, f"{output.averages:.1f}", *band))
+    head = ("response", "taken", "averages", "coherence", "usable from [Hz]", "to [Hz]")
+    print_table(head, rows)
     for wanted, fit in found.fits:
         orders = f"{wanted.zeros} zeros, {wanted.poles} poles"
         print(f"{wanted.input} to {wanted.output}, {orders}:")
         for head, cell in zip(FIT_HEAD, fit_row(fit), strict=True):
             print(f"  {head}: {cell}")
-        if not fit.converged:
+        if not fit.determined:
+            print(
+                "  the response does not determine it: fewer poles, or more excitation, is needed"
+            )
+        elif not fit.converged:
             print("  the search did not converge: these numbers are no result")
         elif fit.chi_squared > _TOO_LARGE:
             print(

@@ -94,9 +94,14 @@ def by_name(
     return model
 
 
+def names() -> tuple[str, ...]:
+    """The names of the models that ship, those from files apart."""
+    return (*_SHIPPED, *_HELICOPTERS)
+
+
 def _imported(name: str, where: str, folder: str | Path | None) -> Model:
     if not is_path(name):
-        known = [*_SHIPPED, *_HELICOPTERS, "package.module:name"]
+        known = [*names(), "package.module:name"]
         raise InputError(f"{where}: unknown model {name!r}{nearest(name, known)}")
     model = by_path(name, where, folder)
     if not isinstance(model, Model):

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heli_jax import run_directory
+from heli_jax.config.frequency import missing_handling
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
-from heli_jax.identification.fit import Check, Estimate
+from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
-from heli_jax.identification.validation.metrics import Metrics, diverges
+from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import rounded
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
@@ -31,18 +32,7 @@ if TYPE_CHECKING:
 def print_fit(run: FitRun) -> None:
     """Verdict, estimates, agreement and baseline on standard output."""
     problem, fit, supplementary = run.problem, run.fit, run.supplementary
-    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
-    # Did the optimiser arrive; what do the data determine; is the model adequate.
-    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
-    if fit.status == "not-converged":
-        # What "the data determine" is a property of an optimum.
-        text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({m.vaf:.2g})" for n, m in fit.validation.items() if not m.vaf >= 0]
-    held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
-    print(f"{arrived}: {text} adequate: {report_tables.adequate(fit)}{held}")
-    note = files.whiteness_note(fit)
-    for line in ([note] if note else []) + list(fit.notes):
-        print(f"! {line}")
+    _print_outcome(fit)
     # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
     # stand in fit.json and the report.
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
@@ -72,21 +62,18 @@ def print_fit(run: FitRun) -> None:
     for name, m in fit.validation.items():
         _print_agreement(f"{name}, held out, simulated", m)
     for name, m in fit.validation_free_run.items():
-        # An unstable machine simulated in one piece leaves any record: numbers would say nothing.
         if diverges(m):
             print(f"{name}, held out, simulated in one piece: diverges")
         else:
             _print_agreement(f"{name}, held out, simulated in one piece", m)
     for name, m in fit.one_step_validation.items():
         _print_agreement(f"{name}, held out, one step ahead", m)
-    if supplementary.responses is not None:
-        for line in handling_lines(supplementary.responses.handling):
-            print(line)
+    _print_handling(run)
     if (responses := report_tables.responses(fit)) is not None:
         print_table(responses.head, responses.rows)
     if problem.first_guess is not None:
         _print_first_guess(problem.first_guess)
-    print(f"acceptance card: {summary(card(problem, fit))}")
+    print(f"acceptance card: {summary(card(problem, fit), _GATES)}")
     if supplementary.choice is not None:
         compared = report_tables.choice(supplementary.choice)
         print_table(compared.head, compared.rows)
@@ -96,6 +83,35 @@ def print_fit(run: FitRun) -> None:
         _print_baseline(run.baseline)
     if run.directory is not None:
         print(f"report: {run.directory / 'report.html'}")
+
+
+def _print_outcome(fit: Fit) -> None:
+    """Did the optimiser arrive; what do the data determine; is the model adequate; doubts."""
+    text = " ".join(filter(None, (fit.verdict.text, fit.distrust)))
+    if fit.status == "not-converged":
+        # What "the data determine" is a property of an optimum.
+        text = "the optimiser stopped before an optimum, and these numbers are no result."
+    worse = [f"{n} ({m.vaf:.2g})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
+    arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
+    # Reasons have a line each below: they are said once.
+    why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
+    adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
+    print(f"{arrived}: {text} adequate: {adequate}{held}")
+    note = files.whiteness_note(fit)
+    for line in ([note] if note else []) + list(fit.notes):
+        print(f"! {line}")
+
+
+def _print_handling(run: FitRun) -> None:
+    """Handling qualities of model and data, and of which axes there are none."""
+    if run.supplementary.responses is None:
+        return
+    for line in handling_lines(run.supplementary.responses.handling):
+        print(line)
+    logged = {n for f in run.problem.training for n in f.outputs}
+    for sentence in missing_handling(run.config, logged):
+        print(f"! {sentence}")
 
 
 def run_compatibility(
@@ -157,11 +173,17 @@ def _range(estimate: Estimate | Combination) -> str:
     return f"{shown[0]} to {shown[1]}"
 
 
+_GATES = 5
+"""failed gates that the terminal names; the report has all"""
 _NEAR = 10.0
 """standard deviations from the value, or share of it, up to which an end shares its digits"""
 
 
 def _print_agreement(what: str, m: Metrics) -> None:
+    # An unstable machine leaves any record: numbers would say nothing.
+    if diverges(m, FAR):
+        print(f"{what}: diverges")
+        return
     print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
 
 

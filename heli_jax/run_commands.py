@@ -18,8 +18,13 @@ _DEEPEST = 3
 def runs(options: argparse.Namespace) -> int:
     """`heli-jax runs`: what fits a folder holds, the latest last."""
     folder = Path(options.directory)
+    if not folder.exists():
+        raise InputError(
+            f"{folder}: there is no such folder, expected one that holds runs of heli-jax fit: "
+            "heli-jax runs DIR"
+        )
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of runs, got none")
+        raise InputError(f"{folder}: expected a folder of runs, got a file")
     listed = sorted(_found(folder), key=lambda run: run["date"])
     if options.json:
         print(json.dumps(listed, indent=1))

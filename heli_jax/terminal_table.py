@@ -1,12 +1,69 @@
-"""Tables on the terminal."""
+"""Tables on the terminal: none of their numbers is ever cut off."""
 
+import shutil
 import sys
+from collections.abc import Sequence
+
+type _Row = tuple[str, ...]
+_BETWEEN = 3
+"""columns from one column's end to the next one's beginning"""
 
 
-def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    """A table on standard output, its columns as wide as they need."""
+def print_table(head: _Row, rows: list[_Row]) -> None:
+    """A table on standard output, its columns as wide as they need.
+
+    What is wider than the terminal is printed as several tables, each with the first column, or
+    where not even two columns fit as a list. What is piped on has lines of any length.
+
+    Args:
+        head: names of the columns.
+        rows: as many cells each.
+    """
+    # In a pipe nobody knows how wide a line may be, and a program reads it whole.
+    most = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    columns = list(zip(head, *rows, strict=True))
+    groups = _groups(columns, most)
+    if groups is None:
+        _print_list(head, rows)
+        return
+    for group in groups:
+        kept_head, *kept_rows = zip(*(columns[i] for i in group), strict=True)
+        _print(kept_head, kept_rows)
+
+
+def _groups(columns: Sequence[_Row], most: int | None) -> list[list[int]] | None:
+    """Columns by table, the first in each; None where it does not fit beside another."""
+    from rich.cells import cell_len
+
+    widths = [max(map(cell_len, column)) for column in columns]
+    if most is None or sum(widths) + _BETWEEN * len(widths) <= most:
+        return [list(range(len(columns)))]
+    groups: list[list[int]] = []
+    left = 0
+    for i, width in enumerate(widths[1:], 1):
+        if width + _BETWEEN > left or not groups:
+            groups.append([0])
+            left = most - widths[0] - _BETWEEN
+        if width + _BETWEEN > left:
+            return None
+        groups[-1].append(i)
+        left -= width + _BETWEEN
+    return groups or None
+
+
+def _print_list(head: _Row, rows: Sequence[_Row]) -> None:
+    for row in rows:
+        print(f"\n{row[0]}")
+        for name, cell in zip(head[1:], row[1:], strict=True):
+            if cell:
+                print(f"  {name}: {cell}" if name else f"  {cell}")
+    print()
+
+
+def _print(head: _Row, rows: Sequence[_Row]) -> None:
     # Imported here, not above: rich takes a tenth of a second, which `heli-jax --help` has not.
     from rich.box import SIMPLE_HEAD
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
 
@@ -15,8 +72,8 @@ def print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
         table.add_column(_escaped(name), justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(_escaped(cell) for cell in row))
-    # In a pipe rich assumes 80 columns and cuts off what is wider.
-    width = None if sys.stdout.isatty() else 120
+    widest = sum(max(map(cell_len, column)) for column in zip(head, *rows, strict=True))
+    width = widest + _BETWEEN * (len(head) + 1)
     Console(file=sys.stdout, highlight=False, width=width).print(table)
 
 

@@ -14,7 +14,7 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.analysis.flight_responses import Settings
 from heli_jax.config import Experiment
-from heli_jax.config.frequency import asked_handling
+from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
@@ -372,4 +372,6 @@ def _with_responses(run: FitRun) -> SupplementaryAnalyses:
     logged = {n for f in run.problem.training for n in f.outputs}
     asked = asked_handling(run.config, logged)
     responses = fitted_responses(run.fit, run.problem, settings, asked)
+    gaps = missing_handling(run.config, logged)
+    responses = responses._replace(notes=(*responses.notes, *gaps))
     return run.supplementary._replace(responses=responses)

@@ -1,6 +1,7 @@
 """`heli-jax frf`: from a log to responses, by a known linear system that SciPy simulated."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -8,9 +9,12 @@ import pytest
 import scipy.signal
 import xarray as xr
 
+from heli_jax.analysis.attitude_responses import handling_gaps
 from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
 from heli_jax.cli import main
 from heli_jax.flights import Flight
+from heli_jax.linear_models.read import linear_model
+from heli_jax.report.figures.responses import branch_of
 
 DT = 0.02
 ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
@@ -73,6 +77,7 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert main(["frf", str(config), "--out", str(out)]) == 0
     printed = capsys.readouterr()
     assert "lat to p, 0 zeros, 1 poles" in printed.out
+    assert "by instrument" in printed.out
     # By its instrument: nothing is to be said of feedback.
     assert "do not follow" not in printed.err
     (fitted,) = json.loads((out / "transfer_functions.json").read_text())
@@ -105,6 +110,47 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert (out / "figures/p-lat.png").exists()
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "sentence"),
+    [
+        (3, "", "outputs.p: all its samples are missing"),
+        (None, "0", "nothing can be learnt from it"),
+    ],
+)
+def test_a_log_that_says_nothing_is_refused(config, tmp_path, capsys, column, value, sentence):
+    log = tmp_path / "log.csv"
+    head, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    kept = {head.index("gyro")} if column else {1, 2, 3}
+    blank = [[value if i in kept else c for i, c in enumerate(row)] for row in rows]
+    log.write_text("\n".join(",".join(row) for row in [head, *blank]))
+    assert main(["frf", str(config), "--out", str(tmp_path / "none")]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_phase_keeps_its_branch_through_noise_and_through_missing_bins():
+    omega = np.geomspace(1.0, 100.0, 120)
+    true = -90.0 - 3.0 * omega  # a delay of 52 ms: 300 degrees more at the end
+    rng = np.random.default_rng(0)
+    H = np.exp(1j * np.radians(true))
+    noisy, missing = (omega > 10.0) & (omega < 13.0), (omega > 3.0) & (omega < 3.4)
+    H[noisy] = np.exp(2j * np.pi * rng.random(int(noisy.sum())))
+    H[missing] = np.nan
+    found = branch_of(omega, H, ~noisy & ~missing)
+    assert np.max(np.abs((found - true)[~noisy & ~missing])) < 1e-6
+    assert np.max(np.abs((found - true)[noisy])) < 200.0
+    assert np.isnan(found[missing]).all()
+
+
+def test_an_axis_without_a_stick_is_said_and_a_speed_has_no_handling_qualities():
+    model = linear_model("roll-flybarless").model
+    assert not handling_gaps(model, ["p"])
+    nameless = dataclasses.replace(model, axes=())
+    (said,) = handling_gaps(nameless, ["p", "phi"])
+    assert "axes: {roll: {stick: INPUT}}" in said
+    assert "output: phi" in said
+
+
 def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, capsys):
     text = config.read_text().replace("      instruments: {lat: {signal: sweep}}\n", "")
     config.write_text(text)
@@ -118,7 +164,7 @@ def test_without_an_instrument_the_bias_by_feedback_is_said(config, tmp_path, ca
         ("frequency.band=[0.1, 5]", "at least two periods in a window of 10 s, from 0.2 Hz on"),
         ("frequency.band=[1, 30]", "below half the rate of 50 Hz, got 30 Hz"),
         ("frequency.band=[5, 1]", "expected two increasing frequencies in Hz, got [5, 1]"),
-        ("frequency.window=200", "a part of at least 10000 samples (a window)"),
+        ("frequency.window=200", "the longest flight is 120 s, too short for a window"),
         ("frequency.transfer_functions.0.output=q", "has no output 'q'"),
         ("frequency.handling=[{input: lat, output: q}]", "handling[0].output: model"),
         ("frequency.handling=[{input: lat, output: p, gain: 2}]", "expected response: open-loop"),

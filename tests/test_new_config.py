@@ -7,7 +7,7 @@ import pytest
 
 from heli_jax import cli, yaml_file
 from heli_jax.config.schema import Config
-from heli_jax.new_config.guess import Series, by_motion, by_name, scaled, words_of
+from heli_jax.new_config.guess import Series, by_motion, by_name, may_be, scaled, words_of
 
 T = np.arange(0.0, 20.0, 0.02)
 STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))
@@ -142,3 +142,43 @@ def test_of_channels_without_names_the_one_that_the_output_follows_is_taken() ->
     assert found[0] == "ch7"
     del channels["ch7"]
     assert by_motion(Series(T, RATE), channels) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "si", "called", "may"),
+    [
+        ("Batt_V", "m/s", ["v", "right speed"], False),
+        ("Batt_v", "m/s", ["v"], False),
+        ("body.v", "m/s", ["v"], True),
+        ("Vlat_kt", "m/s", ["v", "vlat"], True),
+        ("GyroRoll_dps", "rad", ["phi", "roll"], False),
+        ("GyroRoll", "rad", ["phi", "roll"], False),
+        ("GyroRoll", "rad/s", ["p", "gyro roll"], True),
+        ("Roll_rpm", "rad", ["phi", "roll"], False),
+    ],
+)
+def test_a_name_or_a_unit_of_another_quantity_is_no_match(
+    name: str, si: str, called: list[str], may: bool
+) -> None:
+    series = Series(T, RATE)
+    assert (may_be(name, series, called, si) and by_name(called, [name]) == [name]) == may
+
+
+def test_a_logged_sweep_is_offered_as_an_instrument_and_dead_channels_are_no_signals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {"SweepAil": 0.5 * STICK} | table("GyroRoll_dps")
+    columns |= {"Bank": np.full(T.size, np.nan), "Batt_V": columns.pop("battery")}
+    log, out = write(tmp_path / "run.csv", columns), tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    text = out.read_text()
+    assert "#   lat: {signal: SweepAil}" in text
+    made = Config.model_validate(
+        yaml_file.parse_mapping(
+            text.replace("      # ins", "      ins").replace("      #   lat", "        lat"), "x"
+        )
+    )
+    signals = made.flights[0].signals
+    assert signals.inputs["lat"].signal == "aileron_pwm"
+    assert {n: o.signal for n, o in signals.outputs.items()} == {"p": "GyroRoll_dps"}
+    assert signals.instruments["lat"].signal == "SweepAil"

@@ -19,10 +19,13 @@ from heli_jax.analysis.response_curves import (
     times,
     without_hold,
 )
-from heli_jax.dynamics.model import Model, axes_of
+from heli_jax.dynamics.model import Axis, Model, axes_of
 
 _ATTITUDES = {"roll": "p", "pitch": "q", "yaw": "r"}
 """axes by name, and what an output with the rate about each is usually called"""
+_ANGLES = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
+_STICKS = {"roll": "lat", "pitch": "lon", "yaw": "ped"}
+"""what the input of each axis is called where a model does not name its stick"""
 
 
 class HandlingPair(NamedTuple):
@@ -57,13 +60,12 @@ def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair
         model: any.
         outputs: those of the model's that were logged.
     """
-    inputs = naming.names(model.Inputs)
     pairs = []
     for axis in axes_of(model):
-        if axis.name not in _ATTITUDES or axis.stick not in inputs:
+        stick = _stick(model, axis)
+        if stick is None:
             continue
         # Outputs have the names of states, or their own: roll for phi.
-        stick = str(axis.stick)
         angles = [n for n in (axis.angle, axis.name) if n in outputs]
         rates = [n for n in (axis.rate, _ATTITUDES[axis.name]) if n in outputs]
         if angles:
@@ -71,6 +73,32 @@ def handling_pairs(model: Model, outputs: Collection[str]) -> tuple[HandlingPair
         elif rates:
             pairs.append(HandlingPair(stick, rates[0], integrated=True))
     return tuple(pairs)
+
+
+def _stick(model: Model, axis: Axis) -> str | None:
+    """The input that turns the machine about an axis of roll, pitch or yaw."""
+    inputs = naming.names(model.Inputs)
+    named = (axis.stick, _STICKS.get(axis.name))
+    return next((str(n) for n in named if n in inputs), None) if axis.name in _ATTITUDES else None
+
+
+def handling_gaps(model: Model, outputs: Collection[str]) -> tuple[str, ...]:
+    """Axes whose angle or rate was logged and that have no stick, a sentence each.
+
+    Args:
+        model: any.
+        outputs: those of the model's that were logged.
+    """
+    with_stick = {a.name for a in axes_of(model) if _stick(model, a) is not None}
+    found = {n: [o for o in (_ANGLES[n], n, r) if o in outputs] for n, r in _ATTITUDES.items()}
+    inputs = ", ".join(naming.names(model.Inputs))
+    return tuple(
+        f"no handling qualities of {name}: model {model.name} does not say which input is its "
+        f"stick; write axes: {{{name}: {{stick: INPUT}}}} in its file, or in the configuration "
+        f"frequency: {{handling: [{{input: INPUT, output: {logged[0]}}}]}}, with one of {inputs}"
+        for name, logged in found.items()
+        if logged and name not in with_stick
+    )
 
 
 def prepared(pair: HandlingPair, curve: Curve) -> Curve:

@@ -111,7 +111,9 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
             no output has a part that is long enough.
     """
     dt = _one_rate(flights)
-    window = settings.window or min(max(f.duration for f in flights) / 5.0, _LONGEST)
+    longest = max(f.duration for f in flights)
+    window = settings.window or min(longest / 5.0, _LONGEST)
+    require_window(window, longest + dt)
     omega = _frequencies(settings, window, dt)
     inputs = [n for n in flights[0].inputs if any(np.std(f.inputs[n]) > 0 for f in flights)]
     if not inputs:
@@ -135,6 +137,23 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
     fits = _fits(settings, outputs, windows, holds)
     return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
+
+
+def require_window(window: float, longest: float) -> None:
+    """Refuse windows that no record holds.
+
+    Args:
+        window: length [s]
+        longest: of the flights [s]
+
+    Raises:
+        ValueError: the window is longer.
+    """
+    if window > longest * (1.0 + 1e-9):
+        raise ValueError(
+            f"window: the longest flight is {longest:.4g} s, too short for a window of "
+            f"{window:g} s; expected at most a fifth of it, {longest / 5.0:.3g} s, for an average"
+        )
 
 
 def _one_rate(flights: Sequence[Flight]) -> float:

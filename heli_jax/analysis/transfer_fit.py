@@ -63,6 +63,14 @@ class TransferFit(NamedTuple):
     converged: bool
 
     @property
+    def determined(self) -> bool:
+        """Whether the response says something of every coefficient of the denominator, and of one
+        of the numerator."""
+        return all(c.determined for c in self.denominator) and any(
+            c.determined for c in self.numerator
+        )
+
+    @property
     def poles(self) -> np.ndarray:
         """(n,) complex [1/s]"""
         return np.roots([1.0, *(c.value for c in self.denominator)])

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from heli_jax.analysis.flight_responses import require_window
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.analysis.spectra import OWN, leakage
 from heli_jax.flights.flight import Flight
@@ -150,7 +151,9 @@ def windowed(
             no output has windows enough.
     """
     dt = _one_rate(flights)
-    seconds = options.window or min(max(f.duration for f in flights) / 5.0, _LONGEST)
+    longest = max(f.duration for f in flights) + dt
+    seconds = options.window or min(longest / 5.0, _LONGEST)
+    require_window(seconds, longest)
     # Even, so that half of it is a number of samples.
     length = 2 * round(0.5 * seconds / dt)
     lines = _lines(options, length, dt)

@@ -230,6 +230,8 @@ def _sentence(error: ErrorDetails) -> str:
     # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
+    if error["type"] == "list_type" and isinstance(value, str | int | float):
+        return f"{place}: expected a list, such as [{value!s:.40}], got {value!r:.60}"
     # A section says where it is; quoted, it would fill the line. Our own validators say what they
     # got in their message.
     if isinstance(value, dict | list) or error["type"] == "value_error":

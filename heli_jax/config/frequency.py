@@ -2,8 +2,8 @@
 
 from collections.abc import Collection, Sequence
 
-from heli_jax import naming
-from heli_jax.analysis.attitude_responses import HandlingPair, handling_pairs
+from heli_jax import naming, units
+from heli_jax.analysis.attitude_responses import HandlingPair, handling_gaps, handling_pairs
 from heli_jax.config.experiment import Experiment
 from heli_jax.config.frequency_section import FrequencyConfig, HandlingConfig, TransferConfig
 from heli_jax.errors import InputError, nearest
@@ -20,23 +20,50 @@ def asked_handling(
         logged: outputs of the flights.
 
     Raises:
-        InputError: the model has no such input or output.
+        InputError: the model has no such input or output, or the output is no angle and no rate.
     """
     config = experiment.config.frequency or FrequencyConfig()
     if config.handling is None:
         return handling_pairs(experiment.model, logged)
     check_pairs(experiment, "handling", config.handling)
-    units = units_of(experiment)
+    unit = units_of(experiment)
+    for i, h in enumerate(config.handling):
+        if h.response == "open-loop" or _is(unit[h.output], "rad") or _is(unit[h.output], "rad/s"):
+            continue
+        raise InputError(
+            f"{experiment.path}: frequency.handling[{i}].output: {h.output} is in {unit[h.output]},"
+            " expected an angle or a rate of turn, of which alone bandwidth and phase delay are "
+            "defined"
+        )
     return tuple(
         HandlingPair(
             h.input,
             h.output,
             h.response,
-            integrated=units[h.output] == "rad/s" and h.response != "open-loop",
+            integrated=_is(unit[h.output], "rad/s") and h.response != "open-loop",
             gain=h.gain,
         )
         for h in config.handling
     )
+
+
+def _is(unit: str, si: str) -> bool:
+    try:
+        units.factor(unit, si)
+    except ValueError:
+        return False
+    return True
+
+
+def missing_handling(experiment: Experiment, logged: Collection[str]) -> tuple[str, ...]:
+    """Why axes that were logged have no handling qualities, where none are asked for by name.
+
+    Args:
+        experiment: the configuration.
+        logged: outputs of the flights.
+    """
+    config = experiment.config.frequency or FrequencyConfig()
+    return handling_gaps(experiment.model, logged) if config.handling is None else ()
 
 
 def check_pairs(

@@ -200,7 +200,7 @@ def fit(
     max_steps: int = 200,
     progress: starting.Progress | None = None,
 ) -> Fit:
-    """Estimate the free parameters by the problem's method: output error or filter error.
+    """Estimate the free parameters by the problem's method: one of `methods.METHODS`.
 
     Args:
         problem: model, vehicle, flights and what is free.

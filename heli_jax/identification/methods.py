@@ -26,7 +26,9 @@ METHODS = {
     "output-error": Method(f"{_ESTIMATION}.output_error:ESTIMATOR", "output error"),
     "filter-error": Method(f"{_ESTIMATION}.filter_error:ESTIMATOR", "filter error"),
     "frequency-error": Method(f"{_ESTIMATION}.frequency_error:ESTIMATOR", "frequency error"),
-    "frequency-response": Method(f"{_ESTIMATION}.frequency_response:ESTIMATOR", "responses"),
+    "frequency-response": Method(
+        f"{_ESTIMATION}.frequency_response:ESTIMATOR", "frequency response"
+    ),
 }
 
 

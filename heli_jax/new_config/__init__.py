@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import models, naming
-from heli_jax.errors import InputError
+from heli_jax.errors import InputError, nearest
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
@@ -29,6 +29,10 @@ _AXES = {
     "collective": ("heave", ("down_speed",)),
 }
 """by stick the linear model of its axis, and what has to be logged for it"""
+_UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
+    ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
+)
+_GRAVITY = ("g", "gravity", "g0")
 _FEWEST = 8
 """samples of a signal"""
 
@@ -121,7 +125,7 @@ def _read(path: Path, number: int | None) -> _Log:
         for topic in first.topics
         if topic.clock and topic.times.size >= _FEWEST
         for name, values in topic.columns.items()
-        if np.asarray(values).dtype.kind in "biuf"
+        if np.asarray(values).dtype.kind in "biuf" and _is_known(as_floats(values))
     }
     flight = first.flight[0] if others or first.flight[1] > 1 else None
     return _Log(str(path), first.format, series, None, flight, flight is not None)
@@ -133,7 +137,7 @@ def _read_table(table: Table) -> _Log:
         why = info.time.problem if info.time is not None else "none of its columns is a time"
         raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
     clock = info.time.column
-    names = [c.name for c in info.columns if c.kind == "number" and c.count >= _FEWEST]
+    names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
     values = table.numbers([clock, *(n for n in names if n != clock)])
@@ -142,9 +146,13 @@ def _read_table(table: Table) -> _Log:
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))
         for n in names
-        if n != clock
+        if n != clock and _is_known(values[n])
     }
     return _Log(table.path, table.format, series, info.time, None, False)
+
+
+def _is_known(values: np.ndarray) -> bool:
+    return int(np.sum(np.isfinite(values))) >= _FEWEST
 
 
 def _model(name: str | None, log: _Log, path: str) -> tuple[Any, str | dict[str, str], bool]:
@@ -158,12 +166,28 @@ def _model(name: str | None, log: _Log, path: str) -> tuple[Any, str | dict[str,
     if (
         not linear
         and not linear_models.is_shipped(stated)
-        and not stated.endswith((".yaml", "yml"))
+        and not stated.endswith((".yaml", ".yml"))
     ):
-        return models.by_name(stated, "--model"), stated, False
+        return _by_name(stated), stated, False
     if not linear and stated in ("roll", "pitch"):
         return models.by_name(stated, "--model"), stated, False
     return linear_models.linear_model(stated).model, {"linear": stated}, True
+
+
+def _by_name(stated: str) -> Any:
+    try:
+        return models.by_name(stated, "--model")
+    except InputError as e:
+        if ":" in stated:
+            raise
+        # The library's own list leaves out what is linear, and files.
+        known = tuple(dict.fromkeys((*models.names(), *linear_models.shipped())))
+        near = nearest(stated, known)
+        meant = near if "did you mean" in near else ""
+        raise InputError(
+            f"--model: expected one of {', '.join(known)}, a linear model's file (NAME.yaml) or "
+            f"package.module:name, got {stated!r}{meant}"
+        ) from e
 
 
 def _by_what_moves(log: _Log, path: str) -> str:
@@ -171,8 +195,9 @@ def _by_what_moves(log: _Log, path: str) -> str:
     names, called = tuple(log.series), _names()
     moving = {}
     for stick, (model, measured) in _AXES.items():
-        sticks = _moving(log, guess.by_name(called["inputs"][stick], names))
-        outputs = [n for m in measured for n in guess.by_name(called["outputs"][m], names)]
+        by_name = guess.by_name(called["inputs"][stick], names)
+        sticks = _moving(log, [n for n in by_name if not guess.is_excitation(n)])
+        outputs = [n for m in measured for n in _outputs(log, called["outputs"][m], _UNITS[m])]
         if sticks and _moving(log, outputs):
             size = np.nanstd(log.series[sticks[0]].values)
             moving[model] = float(size / (np.nanmax(np.abs(log.series[sticks[0]].values)) or 1.0))
@@ -202,17 +227,23 @@ def _signals(model: Any, log: _Log) -> text.Signals:
     """Channels for inputs and outputs of the model, and which of the log's are left."""
     called, taken = _names(), []
     inputs: dict[str, Guess | None] = {}
+    excitations: dict[str, str] = {}
+    sticks = [n for n in log.series if not guess.is_excitation(n)]
     for name in naming.names(model.Inputs):
         own = model_inputs().get(name)
         known = called["rotor_speed"] if name == "Omega" else []
         if own is not None and name != "Omega":
             known = called["inputs"][own.command.removeprefix("cyclic_").replace("tail", "yaw")]
-        inputs[name] = _found(log, name, known, naming.unit(model.Inputs, name) or "1", taken)
+        unit, known = naming.unit(model.Inputs, name) or "1", [_own(name), *known]
+        inputs[name] = _found(log, guess.by_name(known, sticks), unit, taken)
+        for channel in _moving(log, guess.excitations(known, tuple(log.series)))[:1]:
+            excitations[name] = channel
+    taken += excitations.values()
     outputs: dict[str, Guess | None] = {}
     for name in naming.names(model.Outputs):
         signal = model_outputs().get(name, name)
-        known = called["outputs"].get(signal, [])
-        found = _found(log, name, known, naming.unit(model.Outputs, name) or "1", taken)
+        known, unit = called["outputs"].get(signal, []), naming.unit(model.Outputs, name) or "1"
+        found = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
         if found is not None:
             outputs[name] = found
     _by_correlation(model, log, inputs, outputs, taken)
@@ -222,12 +253,22 @@ def _signals(model: Any, log: _Log) -> text.Signals:
         known = {"Omega": (speed[0], guess.rotor_speed(speed[0], log.series[speed[0]]))}
         taken.append(speed[0])
     rest = tuple(n for n in log.series if n not in taken)
-    return text.Signals(inputs, outputs, known, rest)
+    return text.Signals(inputs, outputs, known, rest, excitations)
 
 
-def _found(log: _Log, name: str, known: Sequence[str], si: str, taken: list[str]) -> Guess | None:
-    own = " ".join(guess.words_of(name))
-    candidates = [n for n in guess.by_name([own, *known], tuple(log.series)) if n not in taken]
+def _own(name: str) -> str:
+    """What the model calls a signal, as words."""
+    return " ".join(guess.words_of(name))
+
+
+def _outputs(log: _Log, called: Sequence[str], si: str) -> list[str]:
+    """Channels that may be an output, the likeliest first."""
+    names = [n for n, s in log.series.items() if guess.may_be(n, s, called, si)]
+    return guess.by_name(called, names)
+
+
+def _found(log: _Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:
+    candidates = [n for n in names if n not in taken]
     # What never moves is a trim, or a channel that is not connected; better than none.
     candidates = _moving(log, candidates) or candidates
     if not candidates:
@@ -252,7 +293,11 @@ def _by_correlation(
     for name, found in inputs.items():
         if found is not None or not known:
             continue
-        left = {n: s for n, s in log.series.items() if n not in taken and np.nanstd(s.values) > 0}
+        left = {
+            n: s
+            for n, s in log.series.items()
+            if n not in taken and not guess.is_excitation(n) and np.nanstd(s.values) > 0
+        }
         best = guess.by_motion(log.series[known[-1]], left)
         if best is None:
             continue
@@ -293,4 +338,5 @@ def _free(chosen: text.Chosen, constants: Mapping[str, float]) -> dict[str, floa
     file = chosen.name["linear"]
     own = linear_models.linear_model(file).vehicle().constants
     values = {n: c.value for n, c in own.items()} | dict(constants)
-    return {n: values.get(n, guess.EDIT) for n in listed.get(file, known)}
+    # Gravity is known, whatever a model's file calls free.
+    return {n: values.get(n, guess.EDIT) for n in listed.get(file, known) if n not in _GRAVITY}

@@ -15,8 +15,12 @@ _UNIT_WORDS = {
     "deg/s": "deg/s", "deg per s": "deg/s", "degs": "deg/s", "dps": "deg/s", "rad/s": "rad/s",
     "rads": "rad/s", "radps": "rad/s", "deg": "deg", "degree": "deg", "degrees": "deg",
     "rad": "rad", "mrad": "mrad", "rpm": "rpm", "percent": "%", "pct": "%", "mps": "m/s",
-    "m/s": "m/s", "cm": "cm", "mm": "mm",
+    "m/s": "m/s", "cm": "cm", "mm": "mm", "kt": "kt", "kn": "kt", "kts": "kt", "knot": "kt",
+    "knots": "kt", "fps": "ft/s", "ft/s": "ft/s", "kmh": "km/h", "km/h": "km/h", "volt": "V",
+    "volts": "V", "amp": "A", "amps": "A", "degc": "degC", "hz": "Hz",
 }  # fmt: skip
+# As people write them: a small v or a is a speed or an acceleration.
+_LETTERS = ("V", "A", "%")
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
 _COMMANDS = {"cmd", "command", "des", "desired", "sp", "setpoint", "ref", "target", "err", "error"}
 # What may stand behind a name and change nothing; roll_rate is no roll.
@@ -32,6 +36,17 @@ _FILLERS = {
     "norm",
     "in",
     "input",
+}
+# Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
+_OTHER = {
+    *("batt", "battery", "bat", "volt", "voltage", "power", "temp"),
+    *("temperature", "rssi", "motor", "esc", "servo", "pid", "gain", "quat", "var", "noise"),
+}
+# gyro_roll is no roll, accel_x no speed.
+_CHANGES = {"gyro", "gyr", "rate", "rates", "vel", "acc", "accel", "acceleration"}
+_EXCITATIONS = {
+    *("sweep", "chirp", "sid", "sysid", "inject", "injected", "injection", "excitation"),
+    *("excite", "multisine", "prbs"),
 }
 _PULSES = (700.0, 2300.0)
 """us: what receivers and servos are sent"""
@@ -89,6 +104,9 @@ def without_unit(name: str) -> tuple[str, str]:
         return match[1], unit
     if match and units.is_unit(match[2].strip()):
         return match[1], match[2].strip()
+    for letter in _LETTERS:
+        if name.endswith((f"_{letter}", f" {letter}")):
+            return name[:-2], letter
     for word, unit in _UNIT_WORDS.items():
         for mark in ("_", " ", "."):
             if name.lower().endswith(mark + word):
@@ -117,6 +135,44 @@ def by_name(called: Sequence[str], names: Sequence[str]) -> list[str]:
         elif any(f == words[: len(f)] and set(words[len(f) :]) <= _FILLERS for f in forms):
             scored.append((2, 0, place, name))
     return [name for *_, name in sorted(scored)]
+
+
+def is_excitation(name: str) -> bool:
+    """Whether a channel's name says that it is an excitation that an autopilot added to a stick."""
+    return bool(_EXCITATIONS & set(words_of(name)))
+
+
+def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The logged excitations of an input, by their names.
+
+    Args:
+        called: what people call the input, words by blanks.
+        names: of the log's channels.
+    """
+    forms = {tuple(c.split()) for c in called}
+    return [
+        name
+        for name in names
+        if is_excitation(name)
+        and tuple(w for w in words_of(name) if w not in _EXCITATIONS | _FILLERS) in forms
+    ]
+
+
+def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
+    """Whether a channel's name and unit leave room for an output of the model.
+
+    Args:
+        name: of the channel.
+        series: its samples.
+        called: what people call the output, words by blanks.
+        si: the unit that the model has.
+    """
+    unit = series.unit or without_unit(name)[1]
+    # A model that states no unit takes any.
+    if unit and si != "1" and not _fits(unit, si):
+        return False
+    words, own = set(words_of(name)), {w for c in called for w in c.split()}
+    return not (_OTHER | _CHANGES) & words - own
 
 
 def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:

@@ -33,6 +33,8 @@ class Signals(NamedTuple):
     known: Mapping[str, tuple[str, float]]
     """constants of the flight, with the channel that they are the mean of"""
     rest: Sequence[str]
+    excitations: Mapping[str, str] = {}
+    """by input the channel of what an autopilot added to it"""
 
 
 def configuration(
@@ -65,9 +67,8 @@ def configuration(
         f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
         "# heli-jax keys TEXT explains keys; heli-jax check says whether the log is enough.",
         f"model: {_value(chosen.name)}",
+        *([] if vehicle is None else [f"vehicle: {_value(vehicle)}"]),
     ]
-    if vehicle is not None:
-        lines.append(f"vehicle: {_value(vehicle)}")
     lines += ["flights:", f"  - log: {_value(log)}"]
     if flight is not None:
         lines.append(f"    flight: {flight}")
@@ -171,11 +172,41 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
     lines.append("      outputs:")
     for name, found in signals.outputs.items():
         lines += _signal(name, found, naming.meaning(chosen.model.Outputs, name))
+    lines += _missing(chosen, signals)
+    lines += _instruments(signals.excitations)
     if signals.rest:
         listed = ", ".join(signals.rest[:_MOST_LISTED])
         more = "" if len(signals.rest) <= _MOST_LISTED else ", ..."
         lines.append(f"      # not used: {_comment(listed)}{more}")
     return lines
+
+
+def _missing(chosen: Chosen, signals: Signals) -> list[str]:
+    """Outputs that no channel's name tells of."""
+    units = {
+        n: naming.unit(chosen.model.Outputs, n) or "1"
+        for n in naming.names(chosen.model.Outputs)
+        if n not in signals.outputs
+    }
+    if not units:
+        return []
+    first, unit = next(iter(units.items()))
+    listed = ", ".join(f"{n} [{u}]" for n, u in units.items())
+    return [
+        f"        # Not found by name: {listed}. Add what was logged,",
+        f"        # as {first}: {{signal: NAME, unit: {_value(unit)}}}",
+    ]
+
+
+def _instruments(excitations: Mapping[str, str]) -> list[str]:
+    if not excitations:
+        return []
+    return [
+        "      # What an autopilot added to the stick, by the channel's name. With it,",
+        "      # method: frequency-error is right in closed loop too (docs/frequency.md).",
+        "      # instruments:",
+        *(f"      #   {n}: {{signal: {_value(c)}}}   # GUESS" for n, c in excitations.items()),
+    ]
 
 
 def _signal(name: str, found: Guess | None, meaning: str) -> list[str]:

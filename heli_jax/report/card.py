@@ -84,15 +84,23 @@ def failed(lines: tuple[Gate, ...]) -> tuple[Gate, ...]:
     return tuple(gate for gate in lines if gate.passed is False)  # None passed nothing, nor failed
 
 
-def summary(lines: tuple[Gate, ...]) -> str:
-    """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`."""
+def summary(lines: tuple[Gate, ...], most: int | None = None) -> str:
+    """`13 of 15 gates passed; failed: Cramér-Rao of If (34 %)`.
+
+    Args:
+        lines: of the card.
+        most: how many failed gates are named; the others are counted.
+    """
     if not lines:
         return "none, since the optimiser stopped before an optimum"
     asked, missed = [gate for gate in lines if gate.passed is not None], failed(lines)
     text = f"{len(asked) - len(missed)} of {len(asked)} gates passed"
     if missed:
-        words = (f"{gate.what} of {gate.of} ({shown(gate)})" for gate in missed)
+        named = missed if most is None else missed[:most]
+        words = (f"{gate.what} of {gate.of} ({shown(gate)})" for gate in named)
         text += "; failed: " + ", ".join(words)
+        if len(missed) > len(named):
+            text += f" and {len(missed) - len(named)} more (report)"
     return text
 
 
@@ -247,8 +255,9 @@ def _of_excitation(problem: Problem, fit: Fit) -> list[Gate]:
 def _of_coherence(of: str, coherence: Coherence | str) -> Gate:
     if isinstance(coherence, str):
         return Gate("coherence", of, math.nan, "", "", None, coherence)
+    hz = coherence.lowest / (2.0 * math.pi) if coherence.lowest else 0.0
     # Of what lies below nothing is said: segments of this record are too short for it.
-    band = f"; from {coherence.lowest:.2g} rad/s on" if coherence.lowest else ""
+    band = f"; from {hz:.2g} Hz ({coherence.lowest:.2g} rad/s) on" if coherence.lowest else ""
     remark = f"weighted by the expected response, {coherence.segments} segments"
     what = "partial coherence" if coherence.others else "coherence"
     if not coherence.asked:

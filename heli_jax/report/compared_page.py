@@ -1,5 +1,6 @@
 """The page of several runs side by side: tables, and simulated outputs over the measured."""
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Iterator, Sequence
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from heli_jax import units
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
 from heli_jax.report.compared_runs import ComparedRuns
@@ -18,6 +20,9 @@ from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, picture
 
 _MOST_FIGURES = 24
+_SHOWN, _FAR = 2.0, 20.0
+"""of an output's measured range: how far from its middle the axes reach at most, and curves"""
+_SI = ("1", "m", "m/s", "m/s^2", "rad", "rad/s", "rad/s^2")
 
 
 def write_page(path: Path, compared: ComparedRuns) -> None:
@@ -47,7 +52,8 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
 
 def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[Picture]:
     for name, output, found in itertools.islice(_overlaps(compared), _MOST_FIGURES):
-        made = picture("overlay", functools.partial(_overlay, found, name, output), numbers)
+        unit = _unit(compared, output)
+        made = picture("overlay", functools.partial(_overlay, found, name, output, unit), numbers)
         if made is not None:
             yield made
 
@@ -66,9 +72,25 @@ def _overlaps(
             yield name, output, found
 
 
-def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str) -> Figure:
+def _unit(compared: ComparedRuns, output: str) -> str:
+    """The SI unit of an output, by the unit that it was logged in; empty where none is stated."""
+    flights = [f for run in compared.runs for f in run.content.get("data", ())]
+    logged = [((f.get("signals") or {}).get("outputs") or {}).get(output) for f in flights]
+    for stated in (signal.get("unit") for signal in logged if isinstance(signal, dict)):
+        for si in _SI:
+            with contextlib.suppress(ValueError):
+                units.factor(str(stated), si)
+                return si
+    return ""
+
+
+def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit: str) -> Figure:
     (ax,) = panels(None, 2.9, [1.0])
     first = found[0][1]
+    # By what was measured: one run that diverges would leave of all others a straight line.
+    measured = first.measured[output][np.isfinite(first.measured[output])]
+    middle = float(np.mean(measured)) if measured.size else 0.0
+    size = float(np.ptp(measured)) if measured.size and np.ptp(measured) > 0 else 1.0
     style.samples(
         ax, first.times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
     )
@@ -76,10 +98,15 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str) -> Fi
         color = style.CYCLE[i % len(style.CYCLE)]
         dashes = ("-", "--", ":")[i // len(style.CYCLE) % 3]
         simulated = signals.simulated[output]
+        far = np.abs(simulated - middle) > _FAR * size
+        if far.any():
+            label, simulated = f"{label} (diverges)", np.where(far, np.nan, simulated)
         style.line(ax, signals.times, simulated, color=color, ls=dashes, lw=0.9, label=label)
     ax.set_title(f"{output}, {name}: simulated", loc="left")
     ax.set_xlabel("time [s]")
-    ax.set_ylabel(f"{output} (SI)")
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size))
+    ax.set_ylabel(f"{output} [{unit}]" if unit not in ("", "1") else output)
     ends = [np.nanmin([s.times[0] for _, s in found]), np.nanmax([s.times[-1] for _, s in found])]
     ax.set_xlim(float(ends[0]), float(ends[1]) if ends[1] > ends[0] else float(ends[0]) + 1.0)
     style.legend_above(ax)

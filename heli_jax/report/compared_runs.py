@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
+from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
 from heli_jax.numbers import number, percent, rounded
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.summaries import Summary, as_html, as_text
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NOT_DETERMINED = "not determined"
+NOT_CONVERGED = "not converged"
 _ABSENT = "–"
 _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
     ("VAF", "vaf", percent),
@@ -28,8 +30,8 @@ _LATEX = str.maketrans(
     | {"$": r"\$", "{": r"\{", "}": r"\}", "~": r"\~{}", "\\": r"\textbackslash{}"}
 )
 _JOINT = (
-    "Differences are from the first run, in the standard deviation that the two have together if "
-    "nothing is common to them."
+    "± is one standard deviation (sd), a 95 % interval about twice as far. Differences are from "
+    "the first run, in the sd that the two have together if nothing is common to them."
 )
 _SAME = (
     "{first} and {second} share a log: their estimates hang together, and differ by less than that "
@@ -59,12 +61,12 @@ class ComparedRuns(NamedTuple):
         for name in _in_order(run.estimates for run in self.runs):
             found = [run.estimates.get(name) for run in self.runs]
             units = {e.unit for e in found if e is not None}
-            cells = [_measured(e, with_unit=len(units) > 1) for e in found]
-            # Where an optimiser stopped on its way there is nothing to compare.
-            there = [
-                None if run.status == "not-converged" else run.estimates.get(name)
-                for run in self.runs
+            cells = [
+                _measured(e, with_unit=len(units) > 1, arrived=_arrived(run))
+                for e, run in zip(found, self.runs, strict=True)
             ]
+            # Where an optimiser stopped on its way there is nothing to compare.
+            there = [e if _arrived(run) else None for e, run in zip(found, self.runs, strict=True)]
             apart = [_difference(there[0], other) for other in there[1:]]
             rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
@@ -78,9 +80,9 @@ class ComparedRuns(NamedTuple):
             of = [run.validation if held_out else run.metrics for run in self.runs]
             for output in _in_order(of):
                 for words, key, text in _METRICS:
-                    values = [getattr(m.get(output), key, None) for m in of]
                     where = "held out" if held_out else "fitted"
-                    rows.append((output, where, words, *map(text, values)))
+                    cells = (_agreement(m.get(output), key, text) for m in of)
+                    rows.append((output, where, words, *cells))
         return Table(("output", "flights", "metric", *self.labels), tuple(rows))
 
     @property
@@ -91,7 +93,7 @@ class ComparedRuns(NamedTuple):
             (
                 label,
                 run.model,
-                run.method,
+                method_of(run),
                 run.status,
                 # What the data determine is a property of an optimum.
                 "no optimum was reached" if run.status == "not-converged" else run.verdict,
@@ -112,33 +114,38 @@ class ComparedRuns(NamedTuple):
         for label, run in zip(self.labels, self.runs, strict=True):
             if run.status == "not-converged":
                 notes.append(f"{label} did not converge: its numbers are no result.")
+                if run is first:
+                    notes.append("Differences are from the first run: name one first that did.")
             elif run.adequate is False:
                 notes.append(f"{label} is not adequate: its intervals may be too narrow.")
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Long: a row for each run and parameter; NaN where the data do not determine it."""
+        """Long: a row for each run and parameter; NaN where the data do not determine it or
+        the fit did not converge."""
         from heli_jax.exports import runs_frame
 
-        estimates = [run.estimates for run in self.runs]
+        estimates = [_usable(run) for run in self.runs]
         return runs_frame(dict(zip(self.labels, estimates, strict=True)))
 
     def to_csv(self) -> str:
-        """As `to_dataframe`, as text; cells of what is not determined are empty."""
+        """As `to_dataframe`, as text; cells of what is not determined are empty, and those of fits
+        that did not converge."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["run", "parameter", "value", "sd", "lower95", "upper95", "unit"])
         for label, run in zip(self.labels, self.runs, strict=True):
-            for name, e in run.estimates.items():
+            for name, e in _usable(run).items():
                 known = e.sd is not None
                 numbers = (e.value, e.sd, e.lower95, e.upper95) if known else ("",) * 4
                 writer.writerow([label, name, *numbers, e.unit])
         return out.getvalue()
 
     def to_latex(self) -> str:
-        """The estimates as a table for a paper, with booktabs."""
+        """The estimates as a table for a paper, with booktabs; its first line says what ± is."""
         head, rows = self.estimates
         lines = [
+            "% estimate ± one standard deviation; [sd]: difference in joint standard deviations",
             r"\begin{tabular}{l" + "r" * (len(head) - 2) + "l}",
             r"\toprule",
             " & ".join(map(_latex, head)) + r" \\",
@@ -193,9 +200,33 @@ def _in_order(mappings: Any) -> list[str]:
     return list(dict.fromkeys(name for mapping in mappings for name in mapping))
 
 
-def _measured(e: Estimate | None, *, with_unit: bool) -> str:
+def method_of(run: SavedFit) -> str:
+    """The method, and by which inputs' instruments: such a fit is another estimator.
+
+    Args:
+        run: what `load_fit` read.
+    """
+    inputs = run.content.get("instruments") or ()
+    return f"{run.method} by instrument ({', '.join(inputs)})" if inputs else run.method
+
+
+def _arrived(run: SavedFit) -> bool:
+    return run.status != "not-converged"
+
+
+def _usable(run: SavedFit) -> dict[str, Estimate]:
+    """The estimates, without intervals where the optimiser stopped on its way."""
+    if _arrived(run):
+        return run.estimates
+    none = {"sd": None, "lower95": None, "upper95": None}
+    return {name: e._replace(**none) for name, e in run.estimates.items()}
+
+
+def _measured(e: Estimate | None, *, with_unit: bool, arrived: bool) -> str:
     if e is None:
         return _ABSENT
+    if not arrived:
+        return NOT_CONVERGED
     if e.sd is None:
         return NOT_DETERMINED
     value, sd = rounded(e.value, e.sd)
@@ -208,7 +239,14 @@ def _difference(first: Estimate | None, other: Estimate | None) -> str:
     joint = math.hypot(first.sd, other.sd)
     if first.unit != other.unit or not joint:
         return _ABSENT
-    return f"{(other.value - first.value) / joint:+.1f}"
+    text = f"{(other.value - first.value) / joint:+.1f}"
+    return "0.0" if float(text) == 0.0 else text
+
+
+def _agreement(m: Metrics | None, key: str, text: Callable[[float | None], str]) -> str:
+    if m is not None and diverges(m, FAR):
+        return "diverges"
+    return text(getattr(m, key, None))
 
 
 def _logs(run: SavedFit) -> set[str]:

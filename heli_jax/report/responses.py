@@ -16,7 +16,7 @@ from heli_jax.identification.validation.excited_band import longest_band
 from heli_jax.numbers import number
 from heli_jax.report.coherence import COHERENT
 from heli_jax.report.embedded import Numbers
-from heli_jax.report.figures.responses import draw_response
+from heli_jax.report.figures.responses import branch_of, draw_response, seen_of
 from heli_jax.report.handling_json import handling_json
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
@@ -93,7 +93,7 @@ def _draw(found: FlightResponses, units: Mapping[str, str], input: str, output: 
     curves = [
         (f"{w.zeros} zeros, {w.poles} poles", fit.sampled(found.omega, found.holds[input]))
         for w, fit in found.fits
-        if (w.input, w.output) == (input, output)
+        if (w.input, w.output) == (input, output) and fit.determined
     ]
     by = "by its instrument" if input in found.instruments else "direct"
     note = f"{by}, windows of {found.window:g} s, {measured.averages:.1f} independent averages"
@@ -122,7 +122,7 @@ def table(found: FlightResponses) -> dict[str, Any]:
                     "frequency_hz": found.omega / (2.0 * np.pi),
                     "gain": np.abs(pair.H),
                     "gain_db": 20.0 * np.log10(np.abs(pair.H)),
-                    "phase_deg": np.degrees(np.unwrap(np.angle(pair.H))),
+                    "phase_deg": branch_of(found.omega, pair.H, seen_of(found.omega, pair)),
                     "gain_sd_db": _DB * pair.sd / np.abs(pair.H),
                     "phase_sd_deg": np.degrees(pair.sd / np.abs(pair.H)),
                     "coherence": pair.coherence,
@@ -181,17 +181,21 @@ def _write_netcdf(path: Path, found: FlightResponses, units: Mapping[str, str]) 
 
 
 def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
+    poles_known = all(c.determined for c in fit.denominator)
+    zeros_known = all(c.determined for c in fit.numerator)
     return {
         "input": wanted.input,
         "output": wanted.output,
         "numerator": [_number(c) for c in fit.numerator],
         "denominator": [{"value": 1.0}, *(_number(c) for c in fit.denominator)],
         "delay_s": None if fit.delay is None else _number(fit.delay),
-        "poles": [[p.real, p.imag] for p in fit.poles],
-        "zeros": [[z.real, z.imag] for z in fit.zeros],
+        # Roots of coefficients that are not known are no numbers either.
+        "poles": [[p.real, p.imag] for p in fit.poles] if poles_known else None,
+        "zeros": [[z.real, z.imag] for z in fit.zeros] if zeros_known else None,
         "chi_squared_per_degree": fit.chi_squared,
         "J": fit.J,
         "converged": fit.converged,
+        "determined": fit.determined,
     }
 
 

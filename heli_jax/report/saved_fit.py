@@ -76,6 +76,11 @@ def load_fit(directory: str | Path) -> SavedFit:
         InputError: it holds no fit.json and signals.csv that a fit wrote.
     """
     directory = Path(directory)
+    if not directory.is_dir():
+        got = "a file" if directory.exists() else "nothing of that name"
+        raise InputError(
+            f"{directory}: expected the run directory of a fit (heli-jax fit --out DIR), got {got}"
+        )
     content = _content(directory / "fit.json")
     try:
         # Fixed ones are listed for who looks for them; they are no estimates.

@@ -159,3 +159,8 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     assert said in verdict.text
     verdict = analyse(np.diag([2.5, 100.0]), unknowns("L", "B"), reported=np.diag([0.64, 1e-4]))
     assert "only roughly L (95 % within a factor of 4.8)" in verdict.text
+    # Of either sign the interval is -0.57 to 2.57 times the value: no factor.
+    first, second = unknowns("L", "B")
+    verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
+    assert "only roughly B (its 95 % interval holds zero)." in verdict.text
+    assert verdict.through_zero == ("B",)

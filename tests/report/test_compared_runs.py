@@ -12,6 +12,7 @@ import pytest
 
 from heli_jax import cli, compare_runs
 from heli_jax.errors import InputError
+from heli_jax.report import compared_page
 
 METRICS = dict.fromkeys(
     ("vaf", "nrmse_fit_percent", "rmse", "tic", "bias", "variance", "covariance"), 0.5
@@ -131,3 +132,32 @@ def test_wrong_runs_end_in_a_sentence(
     assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(InputError, match="two runs"):
         compare_runs([tmp_path / "a"])
+
+
+def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {"K": (2.0, 0.1)}, instruments=["lat"])
+    b = write_run(tmp_path / "b", {"K": (2.0 - 1e-9, 0.1)})
+    c = write_run(tmp_path / "c", {"K": (5.0, 0.1)}, status="not-converged")
+    compared = compare_runs([a, b, c])
+    ((_, _, _, lost, apart, *_),) = compared.estimates.rows
+    assert lost == "not converged"
+    assert apart == "0.0"  # and not -0.0
+    assert [row[2] for row in compared.verdicts.rows][:2] == [
+        "output-error by instrument (lat)",
+        "output-error",
+    ]
+    assert "± is one standard deviation" in compared.notes[0]
+    assert "one standard deviation" in compared.to_latex()
+    assert np.isnan(compared.to_dataframe().set_index("run").loc["c", "sd"])
+
+
+def test_one_run_that_diverges_leaves_the_others_their_axes(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / n, {"K": (2.0, 0.1)}) for n in "ab"]
+    signals = (runs[1] / "signals.csv").read_text().splitlines()
+    signals = [signals[0], *(f"{line.rsplit(',', 1)[0]},1e14" for line in signals[1:])]
+    (runs[1] / "signals.csv").write_text("\n".join(signals))
+    ((name, output, found),) = compared_page._overlaps(compare_runs(runs))
+    (ax,) = compared_page._overlay(found, name, output, "rad/s").axes
+    assert max(map(abs, ax.get_ylim())) < 10.0
+    assert ax.get_ylabel() == "p [rad/s]"
+    assert any("diverges" in str(line.get_label()) for line in ax.get_lines())

@@ -179,7 +179,7 @@ def test_a_slow_mode_leaves_the_response_from_two_periods_of_a_segment_on():
     # Asked, not asked since the simulation has none either, and of an input that hardly acts.
     for expected, share in ((0.9, 0.5), (0.3, 0.5), (0.9, 0.01)):
         said = card._of_coherence("u to y", Coherence(0.9, expected, share, 8, 0, found.lowest))
-        assert f"from {found.lowest:.2g} rad/s on" in said.remark
+        assert f"Hz ({found.lowest:.2g} rad/s) on" in said.remark
 
 
 def test_empirical_response_says_why_it_is_missing():

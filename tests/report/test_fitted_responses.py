@@ -76,7 +76,7 @@ def test_flights_that_are_too_short_say_so(sound):
     fit, problem, _ = sound
     told = fitted_responses(fit, problem, Settings(window=100.0), ())
     assert told.pairs == ()
-    assert "expected a part of at least 2000 samples" in told.notes[0]
+    assert "the longest flight is 50 s, too short for a window" in told.notes[0]
 
 
 def test_the_envelopes_of_mismatch_are_narrowest_where_pilots_are():

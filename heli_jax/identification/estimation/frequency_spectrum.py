@@ -43,7 +43,8 @@ def smoothed(
         total, weight = 0.0, 0.0
         for other, power in powers.items():
             kernel = _kernel(K, other, part, least)
-            flat = np.ascontiguousarray(power.reshape(other, -1))
+            # Of a session in single precision too: the view below is of double numbers.
+            flat = np.ascontiguousarray(power.reshape(other, -1), dtype=complex)
             total = total + (kernel @ flat.view(float)).view(complex)
             weight = weight + counts[other] * kernel.sum(axis=1)
         at_knots = (total / np.asarray(weight)[:, None]).reshape(len(knots), *power.shape[1:])

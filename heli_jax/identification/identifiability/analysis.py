@@ -200,7 +200,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
     pairs = _pairs(correlation, names, a.undetermined)
     share = _shares(known.covariance, known.without_weak, a.unknowns)
     nuisances_hold = [n for group in a.groups if group.nuisances for n in group.names]
-    roughly = _roughly(a)
+    roughly, through_zero = _roughly(a), _through_zero(a)
     facts = Facts(
         a.unknowns,
         a.without_effect,
@@ -213,6 +213,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         share.prior,
         dict(remedies),
         roughly,
+        through_zero,
     )
     directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
@@ -235,6 +236,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         sentences=sentences(facts),
         resting=tuple(n for group in a.resting for n in group.names),
         roughly=tuple(roughly),
+        through_zero=through_zero,
         exchangeable=tuple(
             dict.fromkeys(
                 label for v in directions_not_determined for label in a.exchange.labels(v)
@@ -251,6 +253,19 @@ def _roughly(a: _Analysis) -> dict[str, float]:
         for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
         if u.logarithmic and sd > ROUGHLY and u.name not in (*a.undetermined, *a.without_effect)
     }
+
+
+def _through_zero(a: _Analysis) -> tuple[str, ...]:
+    """The parameters of either sign whose 95 % interval holds zero: no factor describes it."""
+    lacking = (*a.undetermined, *a.without_effect)
+    return tuple(
+        u.name
+        for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
+        if u.symmetric
+        and u.logarithmic
+        and Z95 * float(sd) * u.per_log >= 1.0
+        and u.name not in lacking
+    )
 
 
 def _without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:

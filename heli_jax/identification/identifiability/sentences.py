@@ -59,6 +59,8 @@ class Facts(NamedTuple):
     """by name, a further way out, as 'add a run with a known inertia'"""
     roughly: Mapping[str, float] = MappingProxyType({})
     """by name, the factor to the ends of a 95 % interval that is wide"""
+    through_zero: tuple[str, ...] = ()
+    """parameters of either sign whose 95 % interval holds zero"""
 
 
 def sentences(facts: Facts) -> tuple[str, ...]:
@@ -97,18 +99,28 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
     by_data = [
         u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
     ]
-    lines = [_by_data(by_data, facts.roughly)] if by_data else []
+    lines = [_by_data(by_data, facts)] if by_data else []
     return lines + _by_prior(by_prior)
 
 
-def _by_data(names: list[str], roughly: Mapping[str, float]) -> str:
-    well = [n for n in names if n not in roughly]
-    wide = [f"{n} (95 % within a factor of {roughly[n]:.2g})" for n in names if n in roughly]
+def _by_data(names: list[str], facts: Facts) -> str:
+    roughly, zero = facts.roughly, facts.through_zero
+    # An interval that holds zero is no factor, and says of the sign that it is open.
+    well = [n + _open_sign(n, zero) for n in names if n not in roughly]
+    wide = [
+        n + (_open_sign(n, zero) or f" (95 % within a factor of {roughly[n]:.2g})")
+        for n in names
+        if n in roughly
+    ]
     if not wide:
         return f"The data determine {listed(well)}."
     if not well:
         return f"The data determine only roughly {listed(wide)}."
     return f"The data determine {listed(well)}, and only roughly {listed(wide)}."
+
+
+def _open_sign(name: str, through_zero: tuple[str, ...]) -> str:
+    return " (its 95 % interval holds zero)" if name in through_zero else ""
 
 
 def _correlated_pairs(facts: Facts, covered: set[str]) -> list[str]:

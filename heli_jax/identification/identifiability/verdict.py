@@ -87,6 +87,8 @@ class Verdict:
     """parameters that are determined by priors, and not by the data alone"""
     roughly: tuple[str, ...] = ()
     """parameters that are determined, but with a wide interval"""
+    through_zero: tuple[str, ...] = ()
+    """parameters that are determined, with an interval that holds zero: their sign is open"""
     exchangeable: tuple[str, ...] = ()
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
 

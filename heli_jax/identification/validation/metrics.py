@@ -36,10 +36,19 @@ _MOSTLY_MISSING = 0.4
 NO_METRICS = Metrics(*[float("nan")] * 7)
 
 
-def diverges(m: Metrics) -> bool:
-    """Whether a simulation left what was measured: it is not finite, or its error has ten times the
-    variance of the signal."""
-    return not np.isfinite(m.rmse) or m.vaf < -9.0
+FAR = 1e4
+"""times the variance of a signal that gusts leave of no simulation that does not diverge"""
+
+
+def diverges(m: Metrics, times: float = 10.0) -> bool:
+    """Whether a simulation left what was measured: it is not finite, or its error has several
+    times the variance of the signal.
+
+    Args:
+        m: of the simulation.
+        times: how many.
+    """
+    return not np.isfinite(m.rmse) or m.vaf < 1.0 - times
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -100,7 +100,10 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
     )
     criterion = f"sd with it over that with the same record again; {_WORTH:g}"
     ratio = plan.after / plan.again if np.isfinite(plan.after) and plan.again > 0 else 1.0
-    begun = f"what to fly next for {plan.parameter} ({_sd(plan.before)}, the widest): "
+    begun = (
+        f"what to fly next for {plan.parameter} ({_sd(plan.before)} in white noise, the "
+        "widest then): "
+    )
     if not np.isfinite(plan.after):
         words = f"{begun}none of the manoeuvres that were compared determines it."
     elif ratio < _WORTH:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.transfer_fit import Z95
 from heli_jax.report import style
 from heli_jax.report.coherence import COHERENT
@@ -17,6 +18,11 @@ from heli_jax.report.style import legend_above, subtitle
 _COLOURS = (style.VERMILLION, style.GREEN, style.PURPLE)
 _WIDE = 1.0
 """relative random error past which a bin says nothing, and is not drawn"""
+_SEEN = 0.1
+"""mean coherence over an octave below which bins neither set the axes nor tell the phase's branch:
+there it is chance"""
+_MARGINS = (6.0, 45.0)
+"""dB and deg beyond what sets the axes"""
 
 
 def draw_response(
@@ -37,14 +43,26 @@ def draw_response(
         note: below the title.
         fits: transfer functions, each a label and its response (k,).
     """
-    axes = panels(None, 6.0 + style.ROW, [1.4, 1.2, 0.6], top=style.TOP + style.ROW)
     hz = omega / (2.0 * np.pi)
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
-    _draw_measured(axes, hz, pair, known)
+    if (left_out := int(np.sum(~known))) > 0:
+        note += f"; {left_out} of {omega.size} frequencies not drawn"
+    axes = panels(None, 6.0 + style.ROW, [1.4, 1.2, 0.6], top=style.TOP + style.ROW)
+    seen = seen_of(omega, pair)
+    branch = branch_of(omega, pair.H, seen)
+    _draw_measured(axes, hz, pair, known, branch)
+    _limit(axes, pair.H, branch, seen if seen.any() else known)
     if np.isfinite(pair.picture).any():
-        _curve(axes, hz, pair.picture, known, color=style.SKY, lw=1.0, label="several windows")
+        # Bin by bin beside the dots: unwrapped by itself it may leave them by turns.
+        own = _nearest(np.degrees(np.angle(pair.picture)), branch)
+        _curve(axes, hz, pair.picture, own, known, color=style.SKY, lw=1.0, label="several windows")
     for (label, H), color in zip(fits, itertools.cycle(_COLOURS), strict=False):
-        _curve(axes, hz, H, known, color=color, lw=1.4, label=label)
+        turned = phase(H)
+        # As a whole: a transfer function is smooth, and its own phase tells its turns.
+        apart = np.median((branch - turned)[seen]) if seen.any() else 0.0
+        turned = turned + 360.0 * np.round(apart / 360.0)
+        everywhere = np.ones(hz.size, bool)
+        _curve(axes, hz, H, turned, everywhere, color=color, lw=1.4, label=label)
     axes[2].plot(hz, pair.coherence, color=style.BLACK, lw=0.9)
     axes[2].axhline(COHERENT, color=style.VERMILLION, lw=0.8, ls=":")
     axes[2].set_ylim(0.0, 1.05)
@@ -63,7 +81,49 @@ def draw_response(
     return drawn
 
 
-def _draw_measured(axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray) -> None:
+def seen_of(omega: np.ndarray, pair: Any) -> np.ndarray:
+    """The frequencies (k,) that tell the branch of the phase.
+
+    Args:
+        omega: (k,) [rad/s]
+        pair: with H, sd and coherence, (k,) each.
+    """
+    known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
+    return known & (octave_mean(omega, pair.coherence) >= _SEEN)
+
+
+def branch_of(omega: np.ndarray, H: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The phase (k,) [deg] at every frequency, on the branch of the nearest that are seen.
+
+    Unwrapped through noise it would turn by chance, and through a missing bin be lost.
+
+    Args:
+        omega: (k,) [rad/s]
+        H: (k,) complex; NaN stays NaN.
+        seen: (k,) bool; with none of them the phase is within half a turn of zero.
+    """
+    along = np.zeros(omega.size)
+    if seen.any():
+        along = np.interp(np.log(omega), np.log(omega[seen]), phase(H[seen]))
+    return _nearest(np.degrees(np.angle(H)), along)
+
+
+def _nearest(degrees: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Phases on the branch within half a turn of others."""
+    return degrees - 360.0 * np.round((degrees - along) / 360.0)
+
+
+def _limit(axes: Panels, H: np.ndarray, branch: np.ndarray, seen: np.ndarray) -> None:
+    if not seen.any():
+        return
+    gain = 20.0 * np.log10(np.abs(H[seen]))
+    for ax, values, margin in zip(axes[:2], (gain, branch[seen]), _MARGINS, strict=True):
+        ax.set_ylim(float(np.min(values)) - margin, float(np.max(values)) + margin)
+
+
+def _draw_measured(
+    axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray, branch: np.ndarray
+) -> None:
     f, H = hz[known], pair.H[known]
     relative = Z95 * pair.sd[known] / np.abs(H)
     bars: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
@@ -74,17 +134,21 @@ def _draw_measured(axes: Panels, hz: np.ndarray, pair: Any, known: np.ndarray) -
     axes[0].errorbar(
         f, gain, yerr=[down, up], color=style.BLUE, label="one window, 95 % intervals", **bars
     )
-    axes[1].errorbar(
-        f, phase(H), yerr=np.degrees(np.minimum(relative, np.pi)), color=style.BLUE, **bars
-    )
-    if f.size:
-        low, high = np.min(gain), np.max(gain)
-        axes[0].set_ylim(low - 6.0, high + 6.0)
+    error = np.degrees(np.minimum(relative, np.pi))
+    axes[1].errorbar(f, branch[known], yerr=error, color=style.BLUE, **bars)
 
 
 def _curve(
-    axes: Panels, hz: np.ndarray, H: np.ndarray, known: np.ndarray, **line_style: Any
+    axes: Panels,
+    hz: np.ndarray,
+    H: np.ndarray,
+    degrees: np.ndarray,
+    known: np.ndarray,
+    **line_style: Any,
 ) -> None:
+    # NaN breaks a line: joined, it would cross frequencies of which nothing is known.
     good = known & np.isfinite(H) & (np.abs(H) > 0)
-    axes[0].plot(hz[good], 20.0 * np.log10(np.abs(H[good])), **line_style)
-    axes[1].plot(hz[good], phase(H[good]), **line_style)
+    with np.errstate(divide="ignore"):
+        gain = 20.0 * np.log10(np.abs(H))
+    axes[0].plot(hz, np.where(good, gain, np.nan), **line_style)
+    axes[1].plot(hz, np.where(good, degrees, np.nan), **line_style)

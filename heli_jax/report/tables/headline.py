@@ -81,6 +81,10 @@ def _doubts(fit: Fit) -> list[str]:
     v = fit.verdict
     doubts = [
         (f"{listed(v.roughly) if v.roughly else ''} only roughly", bool(v.roughly)),
+        (
+            f"zero is in the interval of {listed(v.through_zero) if v.through_zero else ''}",
+            bool(v.through_zero),
+        ),
         ("the intervals are too narrow", fit.overconfident),
         # Where the noise's spectrum is estimated nothing asks them to be white.
         ("the residuals are not white", fit.coloured and not fit.white and not _by_spectrum(fit)),

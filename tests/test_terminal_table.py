@@ -1,0 +1,34 @@
+"""Tables on the terminal: no digit is cut at any width."""
+
+import re
+import sys
+
+import pytest
+
+from heli_jax.terminal_table import print_table
+
+HEAD = ("parameter", "estimate", "95 % (autocorrelated residuals)", "unit", "of another method")
+ROWS = [
+    ("Yv", "-0.1283", "-0.209123 to -0.046", "1/s", "-0.03900 (-0.03778 to -0.04023)"),
+    ("sigma_w_p", "0.341", "0.310 to 0.375", "rad/s^2 [x]", "not determined"),
+]
+
+
+@pytest.mark.parametrize("width", [None, 120, 80, 50, 30])
+def test_every_cell_is_whole_and_lines_fit(
+    width: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if width is not None:
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    print_table(HEAD, ROWS)
+    lines = re.sub(r"\x1b\[\d*m", "", capsys.readouterr().out).splitlines()
+    for cell in (*HEAD, *ROWS[0], *ROWS[1]):
+        assert any(cell in line for line in lines if cell != HEAD[0] or width != 30) or (
+            cell == HEAD[0] and width == 30  # a list needs no name for its names
+        )
+    assert not any("…" in line for line in lines)
+    if width is None:
+        assert any("Yv" in line and "0.04023" in line for line in lines)
+    elif width >= 50:
+        assert max(map(len, lines)) <= width
