@@ -24,8 +24,8 @@ def steps(rng: np.random.Generator) -> np.ndarray:
     return 3e-6 * np.repeat(rng.uniform(-1.0, 1.0, SAMPLES), lengths)[:SAMPLES]
 
 
-def one_run(seed: int, sigma: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Relative errors, and errors in units of the sd that the fit states."""
+def problem(seed: int, sigma: float, method: str) -> Problem:
+    """A record in gusts of sigma [rad/s^2], to be fitted from 1.3 times the truth."""
     rng = np.random.default_rng(seed)
     u = steps(rng)
     roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
@@ -34,9 +34,14 @@ def one_run(seed: int, sigma: float, method: str) -> tuple[np.ndarray, np.ndarra
         inputs={"x_roll": u},
         outputs={"roll": roll + NOISE * rng.standard_normal(SAMPLES)},
     )
+    free = {n: Free(1.3 * float(getattr(VEHICLE, n))) for n in NAMES}
+    return Problem(models.roll_on_stand, VEHICLE, [flight], free, method=method)
+
+
+def one_run(seed: int, sigma: float, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors, and errors in units of the sd that the fit states."""
+    found = fit(problem(seed, sigma, method))
     truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
-    free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
-    found = fit(Problem(models.roll_on_stand, VEHICLE, [flight], free, method=method))
     value = np.array([found.estimates[n].value for n in NAMES])
     sd = np.array([found.estimates[n].sd or np.nan for n in NAMES])
     return (value - truth) / truth, (value - truth) / sd

@@ -117,5 +117,6 @@ def print_responses(found: FlightResponses) -> None:
         elif fit.chi_squared > _TOO_LARGE:
             print(
                 f"  squared errors are {number(fit.chi_squared, 2)} times what the random errors "
-                "let expect: the order is too low, or the machine is not linear"
+                "let expect: the order is too low, the machine is not linear, or a window of "
+                f"{found.window:.3g} s does not resolve it"
             )

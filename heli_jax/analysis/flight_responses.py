@@ -9,6 +9,7 @@ from heli_jax.analysis.response_curves import octave_mean
 from heli_jax.analysis.spectra import OWN, leakage, segment_transforms
 from heli_jax.analysis.spectral import CrossSpectra, composite, cross_spectra, responses
 from heli_jax.analysis.transfer_fit import Hold, Measured, TransferFit, fit_transfer
+from heli_jax.analysis.window_resolution import Windows, window_error
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
 from heli_jax.flights.parts import spans
@@ -19,6 +20,10 @@ _LENGTHS = (0.25, 0.5, 1.0, 1.5, 2.0)
 """of the windows of a composite, in that one's length"""
 _HIGHEST = 0.4
 """of the rate: above it an anti-aliasing filter has changed what was logged"""
+_ROUNDS = 2
+"""in which a transfer function is fitted again without what the windows add to it"""
+_AS_ONE = 1e-6
+"""less than 1, coherence of two inputs that move as one at all frequencies"""
 
 
 class Wanted(NamedTuple):
@@ -117,14 +122,18 @@ def flight_responses(flights: Sequence[Flight], settings: Settings = Settings())
     notes = _notes(flights, inputs, instruments)
     notes += [f"{own_said(own)}; it is not used"] if own else []
     outputs: dict[str, Output] = {}
+    windows: dict[str, Windows] = {}
     names = (inputs, instruments)
     for group, parts in _groups(flights, round(window / dt), notes):
         records = _records(flights, names, group, parts)
-        outputs |= _outputs(records, dt, omega, window, (names, group))
+        made = _windows(records, omega, window, names)
+        outputs |= _outputs(made, dt, (names, group))
+        windows |= dict.fromkeys(group, made)
     if not outputs:
         raise ValueError("; ".join(notes[-3:]))
+    notes += _moving_as_one(flights, inputs, outputs)
     holds = {n: Hold(flights[0].hold[n], dt) for n in inputs}
-    fits = _fits(settings, omega, outputs, window, holds)
+    fits = _fits(settings, outputs, windows, holds)
     return FlightResponses(omega, outputs, instruments, window, fits, holds, tuple(notes))
 
 
@@ -224,18 +233,36 @@ def _records(
     ]
 
 
-def _outputs(
-    records: list[np.ndarray],
-    dt: float,
-    omega: np.ndarray,
-    window: float,
-    names: tuple[_Names, list[str]],
-) -> dict[str, Output]:
+def _windows(records: list[np.ndarray], omega: np.ndarray, window: float, names: _Names) -> Windows:
+    inputs, instruments = names
+    m = len(inputs)
+    z = [m + instruments.index(n) if n in instruments else i for i, n in enumerate(inputs)]
+    return Windows(records, range(m), z if instruments else None, omega, window)
+
+
+def _moving_as_one(
+    flights: Sequence[Flight], inputs: list[str], outputs: dict[str, Output]
+) -> list[str]:
+    """Which inputs no response can be told apart of, in words."""
+    pairs = (pair for output in outputs.values() for pair in output.pairs.values())
+    if len(inputs) < 2 or any(np.isfinite(pair.H).any() for pair in pairs):
+        return []
+    U = [np.stack([f.inputs[n] - np.mean(f.inputs[n]) for n in inputs]) for f in flights]
+    alike = np.abs(np.corrcoef(np.concatenate(U, axis=1))) > 1.0 - _AS_ONE
+    # Where none is another's multiple one is a sum of others.
+    those = [n for n, one in zip(inputs, alike, strict=True) if np.sum(one) > 1] or inputs
+    return [
+        f"{' and '.join(those)} move as one: no response tells what each of them does; move them "
+        "apart, or leave one of them out"
+    ]
+
+
+def _outputs(windows: Windows, dt: float, names: tuple[_Names, list[str]]) -> dict[str, Output]:
     (inputs, instruments), outputs = names
+    records, omega, window = windows.records, windows.omega, windows.seconds
     m, first = len(inputs), len(inputs) + len(instruments)
     u, y = list(range(m)), list(range(first, first + len(outputs)))
-    z = [m + instruments.index(n) if n in instruments else u[i] for i, n in enumerate(inputs)]
-    by = z if instruments else None
+    by = None if windows.instruments is None else list(windows.instruments)
     spectra = cross_spectra(records, dt, omega, window)
     found = responses(spectra, u, y, by)
     own = _own(records, dt, omega, window)
@@ -256,7 +283,7 @@ def _outputs(
     return result
 
 
-def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float) -> np.ndarray:
+def _own(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, window: float) -> np.ndarray:
     """At which frequencies every signal has power of its own: (signals, k).
 
     Where one has none its spectrum is that of the window's sidelobes, which are coherent as well:
@@ -272,7 +299,7 @@ def _own(records: list[np.ndarray], dt: float, omega: np.ndarray, window: float)
 
 
 def _several(
-    records: list[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
+    records: Sequence[np.ndarray], dt: float, one: CrossSpectra, window: float, m: int
 ) -> list[CrossSpectra]:
     """Spectra of several windows beside those of one, as far as the records have three of each."""
     longest = max(r.shape[1] for r in records) * dt
@@ -305,9 +332,8 @@ def _picture(
 
 def _fits(
     settings: Settings,
-    omega: np.ndarray,
     outputs: dict[str, Output],
-    window: float,
+    windows: dict[str, Windows],
     holds: dict[str, Hold],
 ) -> tuple[tuple[Wanted, TransferFit], ...]:
     fits = []
@@ -319,17 +345,29 @@ def _fits(
                 f"{place}: no response from {wanted.input} to {wanted.output} is to be had of "
                 "these flights"
             )
-        pair = output.pairs[wanted.input]
-        hz = omega / (2.0 * np.pi)
-        low, high = wanted.band or (0.0, np.inf)
-        used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
-        H = np.where(used, pair.H, np.nan)
-        # With its hold, which is half a sample late, so that the delay is the machine's own.
-        hold = holds[wanted.input]
-        measured = Measured(omega, H, pair.sd, window, pair.coherence, hold)
         try:
-            fitted = fit_transfer(measured, wanted.zeros, wanted.poles, wanted.delay)
+            fitted = _fitted(wanted, output.pairs[wanted.input], windows[wanted.output], holds)
         except ValueError as e:
             raise ValueError(f"{place}: {e}") from e
         fits.append((wanted, fitted))
     return tuple(fits)
+
+
+def _fitted(wanted: Wanted, pair: Pair, windows: Windows, holds: dict[str, Hold]) -> TransferFit:
+    omega = windows.omega
+    hz = omega / (2.0 * np.pi)
+    low, high = wanted.band or (0.0, np.inf)
+    used = (octave_mean(omega, pair.coherence) >= wanted.coherence) & (hz >= low) & (hz <= high)
+    H = np.where(used, pair.H, np.nan)
+    # With its hold, which is half a sample late, so that the delay is the machine's own.
+    hold = holds[wanted.input]
+    measured = Measured(omega, H, pair.sd, windows.seconds, pair.coherence, hold)
+    orders = wanted.zeros, wanted.poles, wanted.delay
+    fitted = fit_transfer(measured, *orders)
+    for _ in range(_ROUNDS):
+        # What the windows do to the record they do to the transfer function.
+        added = window_error(fitted, windows, list(holds).index(wanted.input), hold)
+        if added is None:
+            break
+        fitted = fit_transfer(measured._replace(H=H - added), *orders)
+    return fitted

@@ -50,6 +50,9 @@ _POINTS = 500
 """of the grid on which crossings are looked for"""
 _LINE = 60
 """frequencies from w180 to 2 w180 through which the line of the phase delay is fitted"""
+_RISES = np.radians(10.0)
+"""of phase from the lowest frequency to the crossover, from which on a loop is called one of an
+unstable machine"""
 _VAGUE = 2.0
 """the factor by which a frequency's interval may reach to either side"""
 
@@ -94,13 +97,14 @@ def handling_qualities(curve: Curve, kind: Kind = "rate") -> HandlingQualities:
 
     Args:
         curve: the response of an attitude to a stick, or an open loop's that is closed by negative
-            unity feedback. Its sign does not matter: it is taken for that of a machine whose lag
-            grows from 0 or 90 deg on, as its gain falls.
+            unity feedback. The sign of an attitude's response does not matter: it is taken for
+            that of a machine whose lag grows from 0 or 90 deg on, as its gain falls. An open loop
+            is taken as it is.
         kind: rate, attitude-command or open-loop.
     """
     grid = np.geomspace(*curve.band, _POINTS)
     points = curve.at(grid)
-    sign, phase = _branch(grid, points)
+    sign, phase = (1, _loop_phase(points)) if kind == "open-loop" else _branch(grid, points)
     response = _Response(curve, grid, points, phase)
     numbers: dict[str, Number] = {}
     sentences: list[str] = []
@@ -122,6 +126,18 @@ def _branch(grid: np.ndarray, points: Point) -> tuple[int, np.ndarray]:
     values, counts = np.unique(turns, return_counts=True)
     turn = int(values[np.argmax(counts)])
     return (-1 if turn % 2 else 1), phase - np.pi * turn
+
+
+def _loop_phase(points: Point) -> np.ndarray:
+    """An open loop's phase (k,) [rad] unwrapped, between -360 and 0 deg at the crossover: its sign
+    is known, and that of an unstable machine may lag by 180 deg from the lowest frequency on."""
+    phase = np.unwrap(points.phase)
+    falls = np.flatnonzero((points.log_gain[:-1] > 0) & (points.log_gain[1:] <= 0))
+    if falls.size:
+        turns = np.ceil(phase[falls[-1]] / (2.0 * np.pi))
+    else:
+        turns = np.round(np.median(phase - 0.5 * np.pi * points.gain_slope) / (2.0 * np.pi))
+    return phase - 2.0 * np.pi * turns
 
 
 class _Response:
@@ -336,6 +352,7 @@ def _loop(response: _Response, numbers: dict[str, Number], sentences: list[str])
         by = at.phase_gradient[0] + at.phase_slope[0] * place.by
         margin = 180.0 + np.degrees(float(at.phase[0]))
         numbers["phase_margin"] = _linear(margin, np.degrees(by))
+        _low_gain(response, crossover, sentences)
     neutral = response.falls("phase", -np.pi, first=True)
     if neutral is None:
         sentences.append(_missing("gain margin", "the phase does not reach -180 deg in the band"))
@@ -344,3 +361,17 @@ def _loop(response: _Response, numbers: dict[str, Number], sentences: list[str])
     _put_frequency("w180", place, numbers, sentences)
     by = place.at.gain_gradient[0] + place.at.gain_slope[0] * place.by
     numbers["gain_margin"] = _linear(-_DB * float(place.at.log_gain[0]), _DB * by)
+
+
+def _low_gain(response: _Response, crossover: float, sentences: list[str]) -> None:
+    """How far the gain of a loop may fall that holds an unstable machine."""
+    below = response.grid < crossover
+    values = response.phase[below] + np.pi
+    upward = np.flatnonzero((values[:-1] <= 0) & (values[1:] > 0))
+    i = upward[-1] if upward.size else 0
+    if upward.size or (values.size and values[0] < values[-1] - _RISES):
+        sentences.append(
+            "caution: the phase rises up to the crossover, as where an unstable machine is in the "
+            f"loop; it may have a margin towards low gain too, {-_DB * response.gain[i]:.3g} dB at "
+            f"{_hz(response.grid[i])}, where the phase is {np.degrees(response.phase[i]):.0f} deg"
+        )

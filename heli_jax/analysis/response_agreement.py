@@ -104,10 +104,14 @@ class ResponseAgreement(NamedTuple):
             )
         if not self.chi_squared > self.upper95:
             return ""
+        why = (
+            "the model lacks something, the machine is not linear, or an input follows the outputs"
+            if self.doubt
+            else "a little more than by chance, too little to call the model not adequate"
+        )
         return (
-            f"Squared errors of the responses are {self.chi_squared:.3g} times what their random "
-            f"errors let expect (95 %: {self.lower95:.2g} to {self.upper95:.2g}): the model lacks "
-            "something, the machine is not linear, or an input follows the outputs."
+            f"Squared errors of the responses are {self.chi_squared:.4g} times what their random "
+            f"errors let expect (95 %: {self.lower95:.4g} to {self.upper95:.4g}): {why}."
         )
 
 

@@ -85,11 +85,12 @@ def integrated(curve: Curve) -> Curve:
 
 
 def times(curve: Curve, gain: float) -> Curve:
-    """The response with a positive gain that is known, such as a loop's."""
+    """The response with a gain that is known, such as a loop's; one below zero turns it over."""
+    turned = np.pi if gain < 0 else 0.0
 
     def at(omega: np.ndarray) -> Point:
         p = curve.at(omega)
-        return p._replace(log_gain=p.log_gain + np.log(gain))
+        return p._replace(log_gain=p.log_gain + np.log(abs(gain)), phase=p.phase + turned)
 
     return Curve(at, curve.band)
 

@@ -298,7 +298,9 @@ def composite(
     if any(s.omega.shape != omega.shape or np.any(s.omega != omega) for s in several):
         raise ValueError("several: expected the same frequencies in all")
     weights = np.stack([_weights(s, inputs, outputs) for s in several])
-    weights = weights / np.sum(weights, axis=0)
+    total = np.sum(weights, axis=0)
+    # Inputs that move as one have no response that could decide.
+    weights = np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1.0 / len(several))
     S = np.einsum("wk,wkab->kab", weights, np.stack([s.S for s in several]))
     n = np.stack([np.broadcast_to(s.averages, omega.shape) for s in several])
     return CrossSpectra(omega, S, np.sum(weights * n, axis=0), max(s.seconds for s in several))
@@ -308,7 +310,11 @@ def _weights(s: CrossSpectra, inputs: Sequence[int], outputs: Sequence[int]) -> 
     """(k,) one over the random error, to the fourth power."""
     found = responses(s, inputs, outputs)
     with np.errstate(all="ignore"):
-        information = np.nanmean(np.abs(found.H / found.sd) ** 2, axis=(1, 2))
+        each = np.abs(found.H / found.sd) ** 2
+    seen = np.isfinite(each)
+    information = np.sum(np.where(seen, each, 0.0), axis=(1, 2)) / np.maximum(
+        np.sum(seen, axis=(1, 2)), 1
+    )
     # Two periods within a segment are the least that a window resolves.
     resolved = s.omega >= 4.0 * np.pi / s.seconds * (1.0 - 1e-9)
-    return np.where(resolved, np.nan_to_num(information), 1e-12 / s.seconds) ** 2
+    return np.where(resolved, information, 1e-12 / s.seconds) ** 2

@@ -63,13 +63,15 @@ class HandlingConfig(BaseModel):
     output: str
     """an angle, or a rate [rad/s], whose response is integrated"""
     response: Literal["rate", "attitude-command", "open-loop"] = "rate"
-    gain: _Positive = 1.0
-    """of an open loop that the response is a part of"""
+    gain: Annotated[float, Field(allow_inf_nan=False)] = 1.0
+    """of an open loop that the response is a part of; below zero where it turns the sign over"""
 
     @model_validator(mode="after")
     def _of_a_loop(self) -> "HandlingConfig":
         if self.gain != 1.0 and self.response != "open-loop":
             raise ValueError(f"gain: expected response: open-loop with it, got {self.response}")
+        if self.gain == 0.0:
+            raise ValueError("gain: expected another number than 0, which opens the loop")
         return self
 
 

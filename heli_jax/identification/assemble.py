@@ -40,7 +40,9 @@ from heli_jax.identification.validation.adequacy import Adequacy, Evidence, asse
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
     feedback_trust_notes,
+    held_upright,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import by_excitation
@@ -160,12 +162,14 @@ def assemble(
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
     moved = moved_by_feedback(solution) if bool(best.converged) else {}
+    stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
     weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
+    instruments = _instruments(problem, by_instrument, responses)
     in_time = (problem, params, signals, white, against, layout.determined)
     adequacy = (
-        by_responses(responses)
+        by_responses(responses, pooled_metrics(signals))
         or by_excitation(problem, solution, pooled_metrics(signals))
         or _adequacy(*in_time)
     )
@@ -201,7 +205,7 @@ def assemble(
         notes=(
             *notes,
             *closed_loop,
-            *feedback_trust_notes(moved, found),
+            *feedback_trust_notes(moved, Loop(found, instruments, stays)),
             *weak_note(weak),
             *adequacy.sentences,
             *missing,
@@ -211,7 +215,8 @@ def assemble(
         feedback=found,
         moved_by_feedback=moved,
         weak_instrument=weak,
-        instruments=_instruments(problem, by_instrument, responses),
+        held_upright=stays,
+        instruments=instruments,
         seed=run.seed,
         timing=run.timing,
     )

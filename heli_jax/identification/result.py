@@ -14,7 +14,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
-from heli_jax.identification.validation.closed_loop_trust import Moved, untrusted
+from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, untrusted
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
@@ -149,6 +149,9 @@ class Fit:
     """frequency error without an instrument: by parameter what feedback may have done to it"""
     weak_instrument: tuple[str, ...] = ()
     """the parameters of which an instrument tells too little"""
+    held_upright: bool = False
+    """in frequency: whether the model is unstable and the record does not grow, so that somebody
+    closes a loop even where no input was found to follow the response"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0
@@ -165,7 +168,8 @@ class Fit:
     def untrusted(self) -> tuple[str, ...]:
         """The parameters that feedback may have biased, or of which the instruments say too
         little."""
-        doubted = (*untrusted(self.moved_by_feedback, self.feedback), *self.weak_instrument)
+        loop = Loop(self.feedback, self.instruments, self.held_upright)
+        doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
         return tuple(n for n in self.estimates if n in doubted)
 
     @property

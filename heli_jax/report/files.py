@@ -119,6 +119,7 @@ def _residuals(fit: Fit) -> dict[str, Any]:
         "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
         "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
+        "held_upright": fit.held_upright,
         "untrusted": list(fit.untrusted),
     }
 

@@ -92,6 +92,20 @@ def test_a_loop_has_the_margins_of_its_matrices():
     assert found.numbers["phase_margin"].value == pytest.approx(theirs.phase[0], rel=1e-3)
 
 
+def test_a_loop_with_an_unstable_machine_has_the_margins_of_its_sign():
+    s = 1j * OMEGA
+    H = 6.0 / ((s - 1.0) * (0.05 * s + 1.0)) * np.exp(-0.02 * s)
+    found = handling_qualities(times(measured(-H), -1.0), "open-loop")
+    # By hand: |L| = 1 at 5.684 rad/s; arg L = -180 deg at 28.69 rad/s.
+    w = np.sqrt((-401.0 + np.sqrt(401.0**2 + 4.0 * 400.0 * 35.0)) / 2.0)
+    lag = np.pi - np.arctan(w) + np.arctan(0.05 * w) + 0.02 * w
+    assert found.sign == 1
+    assert found.numbers["crossover"].value == pytest.approx(w, rel=1e-3)
+    assert found.numbers["phase_margin"].value == pytest.approx(180 - np.degrees(lag), abs=0.1)
+    assert found.numbers["gain_margin"].value == pytest.approx(18.45, abs=0.05)
+    assert any("towards low gain too, -1" in s for s in found.sentences)
+
+
 def test_of_a_model_the_derivatives_are_those_of_finite_differences():
     of_file = linear_model("roll-flybarless")
     model = of_file.model

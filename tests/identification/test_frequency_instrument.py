@@ -7,7 +7,8 @@ import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
 from heli_jax.identification.estimation.frequency_instrument import following
-from heli_jax.identification.estimation.frequency_rows import _Rows, _weighed
+from heli_jax.identification.estimation.frequency_rows import _weighed
+from heli_jax.identification.estimation.frequency_slopes import _Sums
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.model_selection import choose
 
@@ -65,8 +66,10 @@ def test_the_rows_solve_the_equations_and_have_their_covariance():
     e, Q = rng.standard_normal(50), np.linalg.qr(rng.standard_normal((50, 4)))[0]
 
     def weighed(Z):
-        parts = [jnp.asarray(v) for v in (e, e @ Q, Z, Z @ Q, J, J @ Q)]
-        return [np.asarray(v) for v in _weighed(_Rows(*parts[:4]), _Rows(*parts[4:], *parts[2:4]))]
+        # Parts of complex errors, of half their variance; derivatives of what is taken off.
+        r, z, j = (v / 2**0.5 for v in (e, -Z, -J))
+        sums = (r @ r, z @ r, z @ z.T, z @ j.T, r @ Q, (z @ Q).T, (j @ Q).T)
+        return [np.asarray(v) for v in _weighed(_Sums(*(jnp.asarray(v) for v in sums)).products())]
 
     r, M = weighed(Z)
     # The same with the ends projected out of everything by hand.

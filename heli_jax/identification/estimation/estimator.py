@@ -89,6 +89,8 @@ class Estimator(abc.ABC):
     them found by themselves"""
     rows_are_white: ClassVar[bool] = True
     """whether rows are independent where the measurement noise is white"""
+    relaxes_rows: ClassVar[bool] = True
+    """whether the noise is relaxed from the rows: else nobody evaluates them for that"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
     by_instrument: ClassVar[bool] = False
@@ -188,14 +190,14 @@ class Estimator(abc.ABC):
         return noise
 
     def relax(
-        self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The noise that the rows show, degrees of freedom taken off in proportion, and z.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
-            e: at z with `noise`.
+            e: the `Evaluation` at z with `noise`; None unless `relaxes_rows`.
             noise: so far.
             z: the unknowns.
         """

@@ -18,6 +18,7 @@ Sources: Pintelon and Schoukens (2012), chapters 6, 9 and 10; Klein and Morelli 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,7 @@ from jaxtyping import Array, Float
 
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
+from heli_jax.identification.estimation.frequency_gusts import machine_of, whitening_by
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
     instrument_notes,
@@ -49,7 +51,6 @@ from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
-from heli_jax.identification.estimation.slow_modes import smoothed_beside_modes
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -67,6 +68,7 @@ class FrequencyError(Estimator):
     nuisances_in_rows = False
     noise_spectrum = True
     rows_by_flight = False
+    relaxes_rows = False
     least_squares = False
     errors = "residuals"
     by_instrument = True
@@ -149,32 +151,33 @@ class FrequencyError(Estimator):
         return noise._replace(by_instrument=np.ones(()))
 
     def relax(
-        self, layout: Layout, data: Data, e: Evaluation, noise: Noise, z: Float[Array, " q"]
+        self, layout: Layout, data: Data, e: Any, noise: Noise, z: Float[Array, " q"]
     ) -> tuple[Float[Array, " q"], Noise]:
         """The spectrum that the errors show, smoothed over frequency and flights.
 
         Args:
             layout: what the unknowns are.
             data: the numbers of the problem.
-            e: at z with `noise`.
+            e: None: it is not asked for.
             noise: so far.
             z: the unknowns.
         """
         errors = [np.asarray(v) for v in errors_of_lines(layout, data, noise, z)]
         rows = sum(2 * v.size for v in errors)
         freedom = rows / max(rows - len(layout.free), 1)
-        spectra = [s * freedom for s in smoothed_beside_modes(layout, data, z, errors)]
+        errors = [v * freedom**0.5 for v in errors]
+        whitening = whitening_by(machine_of(layout, data, z), errors)
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = in_time(layout, data, noise, z)
-        logs = np.concatenate([np.linalg.slogdet(s)[1] for s in spectra])
+        logs = np.concatenate([-2.0 * np.linalg.slogdet(W)[1] for W in whitening])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
-            S = np.concatenate([s for s, f in zip(spectra, of_flight, strict=True) if f == i])
-            rms = np.sqrt(np.mean(np.real(np.einsum("kjj->kj", S)), axis=0))
+            own = np.concatenate([v for v, f in zip(errors, of_flight, strict=True) if f == i])
+            rms = np.sqrt(np.mean(np.abs(own) ** 2, axis=0))
             sd.append({n: np.asarray(v) for n, v in zip(names, rms, strict=True)})
         by = np.asarray(float(data.flights[0].by_instrument is not None))
-        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening_of(spectra), by)
+        return z, Noise(tuple(sd), np.asarray(np.mean(logs)), whitening, by)
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Of complex normal errors at the lines used, in SI units of the outputs; NaN for an

@@ -157,15 +157,19 @@ def strengths(at: Solution) -> dict[str, Strength]:
     with np.errstate(all="ignore"):
         shares = np.clip(np.nan_to_num((sds(0.0) / sds(1.0)) ** 2), 0.0, 1.0)
     # Each instrument takes its part of them.
-    n = AVERAGES * len(data.flights) / max(len(_by_instrument(data)), 1)
+    n = AVERAGES * len(data.flights) / max(len(inputs_by_instrument(data)), 1)
     return {
         name: Strength(float(share), float(n * share / max(1.0 - share, 1e-12)))
         for name, share in zip(layout.of_interest, shares, strict=True)
     }
 
 
-def _by_instrument(data: Data) -> tuple[str, ...]:
-    """The inputs that are taken by their instrument."""
+def inputs_by_instrument(data: Data) -> tuple[str, ...]:
+    """The inputs that are taken by their instrument.
+
+    Args:
+        data: of a fit by instrument.
+    """
     first = data.flights[0]
     inputs, by = naming.asdict(first.inputs), naming.asdict(first.by_instrument)
     return tuple(n for n in inputs if np.any(np.asarray(inputs[n]) != np.asarray(by[n])))
@@ -180,7 +184,7 @@ def instrument_notes(data: Data) -> list[str]:
     if data.flights[0].by_instrument is None:
         return []
     return [
-        f"By instrument ({', '.join(_by_instrument(data))}): the estimates solve equations and "
-        "have no likelihood, so that there is no AIC or BIC; a profile is that of the equations' "
-        "sum of squares, which has the same limits."
+        f"By instrument ({', '.join(inputs_by_instrument(data))}): the estimates solve equations "
+        "and have no likelihood, so that there is no AIC or BIC; a profile is that of the "
+        "equations' sum of squares, which has the same limits."
     ]

@@ -1,9 +1,13 @@
 r"""A model's error at a record's own frequencies, whitened, without what the ends may add.
 
+Complex numbers of a line stand as real ones, real parts first: their products are then products of
+real matrices, for which libraries are fastest.
+
 Sources: Pintelon and Schoukens (2012), chapters 6 and 10; Golub and Pereyra (1973) and Kaufman
 (1975) for the projection.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,49 +29,247 @@ _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
 
 
-class Lines(NamedTuple):
-    """A record at its own frequencies k = 1 ... K, below the Nyquist frequency."""
+class Matrices(NamedTuple):
+    """x[k+1] = Ad x[k] + B U[k], y[k] = C x[k] + D acting[k]; n states, p measured outputs."""
 
-    error: Complex[Array, "K p"]
-    """measured less simulated, the ends of the record taken off"""
-    rows: Float[Array, " s"]
-    """the same whitened, real parts and then imaginary ones; of white noise of variance 1"""
-    ends: Float[Array, " n"]
-    """the components of `rows` along what the ends of the record may add: zero but for their
-    derivatives"""
-    by: Float[Array, " s"]
-    """minus the response to the inputs by instrument, whitened likewise; () without"""
-    by_ends: Float[Array, " n"]
-    """its components along what the ends may add; () without"""
+    Ad: Float[Array, "... n n"]
+    B: Float[Array, "... n r"]
+    C: Float[Array, "... p n"]
+    D: Float[Array, "... p m"]
 
 
-def all_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> list[Lines]:
-    """Of every record.
+class Signals(NamedTuple):
+    """What drives a machine, in time or at the lines."""
+
+    U: Array
+    """what B multiplies, (N, r)"""
+    acting: Array
+    """the inputs that act at the samples, (N, m)"""
+
+
+class Machines(NamedTuple):
+    """Flights that are alike, side by side."""
+
+    matrices: Matrices
+    """of all of them, or with a leading axis where parameters are known of each flight"""
+    signals: Signals
+    """with a leading axis"""
+    by: Signals | None
+    """likewise with the inputs by instrument; None without"""
+
+
+class Resolved(NamedTuple):
+    """What a machine does at every line of a record, signals apart; without a derivative."""
+
+    z: Complex[np.ndarray, " K"]
+    T: Complex[Array, "n n"]
+    """Ad = V T V^H, triangular"""
+    V: Complex[Array, "n n"]
+    W: Float[Array, "K 2p 2p"]
+    """the whitening"""
+    H: Float[Array, "K 2p 2n"]
+    """W C (zI - Ad)^-1"""
+    Q: Float[Array, "s n"]
+    """an orthonormal basis of what the ends may add to whitened rows; zero where a state leaves no
+    trace"""
+    solution: Float[Array, "n n"]
+    """from the components along Q to the ends' states"""
+
+
+class Errors(NamedTuple):
+    """Of one record, with what they came of."""
+
+    rows: Float[Array, "K 2p"]
+    """measured less simulated, whitened, the ends of the record taken off"""
+    X: Complex[Array, "K n"]
+    """the states"""
+    signals: Signals
+    """at the lines"""
+
+
+def alike(layout: Layout, data: Data) -> list[list[int]]:
+    """The flights in groups that differ in numbers alone.
 
     Args:
         layout: what the unknowns are.
         data: the numbers of the problem.
-        noise: with the whitening of each record.
-        u: the unknowns, in the units of the model.
     """
-    by_flight: dict[int, list[Lines]] = {}
-    for members in _alike(layout, data):
-        # Flights that are alike side by side: one of them is compiled, not each.
-        first, flights = members[0], [data.flights[i] for i in members]
-        stacked = jax.tree.map(lambda *v: jnp.stack(v), *flights)
-        # Records of one length have one spectrum (`smoothed`), and with one sample time all that
-        # does not hang on the signals is computed once.
-        whitening = _of_flight(layout, noise.whitening, first)
+    groups: dict[Any, list[int]] = {}
+    for i, flight in enumerate(data.flights):
+        n = next(iter(flight.outputs.values())).shape[0]
+        key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
+        # An offset of its own moves the point about which a flight is linearised.
+        key = key if layout.model.linear else (i, *key)
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())
 
-        def of_one(flight: Any, i: int = first, whitening: Any = whitening) -> list[Lines]:
-            flight = flight._replace(dt=data.flights[i].dt)
-            own = (*data.flights[:i], flight, *data.flights[i + 1 :])
-            return _of_records(layout, data._replace(flights=own), u, i, whitening)
 
-        made = jax.vmap(of_one)(stacked)
-        for k, i in enumerate(members):
-            by_flight[i] = jax.tree.map(lambda v, k=k: v[k], made)
-    return [one for i in range(len(data.flights)) for one in by_flight[i]]
+def machines_of(layout: Layout, data: Data, u: Unknowns, members: list[int]) -> Machines:
+    """Those of one group.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        u: the unknowns, in the units of the model.
+        members: the flights' numbers.
+    """
+    first = members[0]
+    stacked = jax.tree.map(lambda *v: jnp.stack(v), *(data.flights[i] for i in members))
+
+    def of_one(flight: Any) -> Machines:
+        # With one sample time all that does not hang on the signals is computed once.
+        flight = flight._replace(dt=data.flights[first].dt)
+        matrices, signals = _machine(layout, data, u, (first, flight))
+        if flight.by_instrument is None:
+            return Machines(matrices, signals, None)
+        # A point to linearise about knows means alone, which inputs by instrument have as well.
+        by = flight._replace(inputs=flight.by_instrument)
+        return Machines(matrices, signals, _machine(layout, data, u, (first, by))[1])
+
+    axes = Machines(None if _one_machine(data, members) else 0, 0, 0)  # pyright: ignore
+    return jax.vmap(of_one, out_axes=axes)(stacked)
+
+
+def _one_machine(data: Data, members: list[int]) -> bool:
+    return len(members) > 1 and not data.flights[members[0]].known
+
+
+def _machine(
+    layout: Layout, data: Data, u: Unknowns, of: tuple[int, Any]
+) -> tuple[Matrices, Signals]:
+    i, flight = of
+    data = data._replace(flights=(*data.flights[:i], flight, *data.flights[i + 1 :]))
+    condition = layout.of_flights[i].condition
+    model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
+    linear = linear_inputs(model, drive.inputs, layout.hold(i))
+    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
+    _, _, C, D = jacobians(model, drive.params)
+    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
+    return Matrices(Ad, B, C[rows], D[rows]), Signals(U, acting)
+
+
+def by_flight(
+    data: Data,
+    members: list[int],
+    prepared: Callable[[Any], Any],
+    body: Callable[[Any, Any], Any],
+    common: Any,
+    each: Any,
+) -> Any:
+    """`body(prepared(common), one of each)` of every flight of a group, with a leading axis.
+
+    Args:
+        data: the numbers of the problem.
+        members: the flights' numbers.
+        prepared: what of it is the same for flights that have one machine.
+        body: of one flight.
+        common: of the machine; with a leading axis where each flight has its own.
+        each: of the flights, with a leading axis.
+    """
+    # One after another: what is on the way to a few sums of a flight is larger than any cache.
+    if _one_machine(data, members):
+        ready = prepared(common)
+        return jax.lax.map(lambda one: body(ready, one), each)
+    return jax.lax.map(lambda one: body(prepared(one[0]), one[1]), (common, each))
+
+
+def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
+    """A machine at the lines of a record.
+
+    Args:
+        m: its matrices.
+        record: which samples it is.
+        whitening: of the record's lines.
+    """
+    z = np.exp(2j * np.pi * np.arange(1, record.lines + 1) / record.samples)
+    z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
+    # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved.
+    T, V = jax.scipy.linalg.schur(m.Ad, output="complex")
+    H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
+    # What the ends of the record explain is found by linear least squares.
+    Q, solution = _span(stacked(z[:, None, None] * H).reshape(-1, H.shape[2]))
+    return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
+
+
+def _span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
+    Q, R = jnp.linalg.qr(basis)
+    # A state that no output shows has a column of rounding, and QR makes some direction of it,
+    # another at each step: what that takes off makes the sum of squares rough.
+    U, sizes, Vt = jnp.linalg.svd(R)
+    kept = sizes > _NO_END * sizes[0]
+    over = jnp.where(kept, 1.0 / jnp.where(kept, sizes, 1.0), 0.0)
+    return Q @ jnp.where(kept[None, :], U, 0.0), Vt.T * over[None, :]
+
+
+def stacked(v: Array) -> Array:
+    """Real parts and imaginary ones (K, 2, ...) of complex numbers (K, ...)."""
+    return jnp.stack([jnp.real(v), jnp.imag(v)], axis=1)
+
+
+def _real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
+    """The real matrix that does to stacked vectors what M does to complex ones."""
+    re, im = jnp.real(M), jnp.imag(M)
+    return jnp.concatenate(
+        [jnp.concatenate([re, -im], axis=2), jnp.concatenate([im, re], axis=2)], axis=1
+    )
+
+
+def at_lines(record: Record, v: Float[Array, "N c"]) -> Complex[Array, "K c"]:
+    """The Fourier transform of a record's part of signals, over the root of its length.
+
+    Args:
+        record: which samples it is.
+        v: over the whole flight; columns behind delays, so that what acted in a part was logged
+            before it.
+    """
+    # Without a mean: the zero line is not used, and rounding would carry it to the others.
+    part = v[record.first : record.last]
+    part = part - jnp.mean(part, axis=0, keepdims=True)
+    return jnp.fft.rfft(part, axis=0)[1 : 1 + record.lines] * float(record.samples) ** -0.5
+
+
+def errors(
+    at: Resolved, m: Matrices, record: Record, signals: Signals, y: Float[Array, "N p"]
+) -> Errors:
+    """Of one record.
+
+    Args:
+        at: the machine at its lines.
+        m: the machine.
+        record: which samples it is.
+        signals: over the whole flight.
+        y: what was measured.
+    """
+    lines = Signals(*(at_lines(record, v) for v in signals))
+    passing = lines.acting @ m.D.T.astype(at.z.dtype)
+    driving = lines.U @ m.B.T.astype(at.z.dtype)
+    rest = _times(at.W, at_lines(record, y) - passing)
+    white = rest - _times(at.H, driving)
+    d = at.solution @ (at.Q.T @ white.reshape(-1))
+    driving = driving + at.z[:, None] * d.astype(at.z.dtype)[None, :]
+    return Errors(rest - _times(at.H, driving), states(at, driving), lines)
+
+
+def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"]:
+    """(zI - Ad)^-1 of what drives them.
+
+    Args:
+        at: the machine at the lines.
+        driving: B U, and the ends.
+    """
+    seen = (driving @ jnp.conj(at.V))[:, :, None]
+    return _solved(at.z, at.T, seen, left=True)[:, :, 0] @ at.V.T
+
+
+def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> Array:
+    """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with a triangle T."""
+    M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype)[None] - T[None]
+    b = jnp.broadcast_to(b, (len(z), *b.shape[-2:]))
+    return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
+
+
+def _times(M: Float[Array, "K a 2b"], v: Complex[Array, "K b"]) -> Float[Array, "K a"]:
+    return jnp.einsum("kab,kb->ka", M, stacked(v).reshape(v.shape[0], -1))
 
 
 @eqx.filter_jit
@@ -82,170 +284,51 @@ def errors_of_lines(
         noise: with the whitening of each record.
         z: the unknowns.
     """
-    return [one.error for one in all_lines(layout, data, noise, unpack(layout, data, z))]
+    u, found = unpack(layout, data, z), {}
+    for members in alike(layout, data):
+        parts = parts_of_group(layout, noise, members)
+        machines, y = machines_of(layout, data, u, members), measured(layout, data, members)
+
+        def ready(m: Matrices, parts: Any = parts) -> Any:
+            return m, [resolved(m, record, W) for record, W in parts]
+
+        def of_one(common: Any, one: Any, parts: Any = parts) -> list[Array]:
+            m, ats = common
+            made = []
+            for at, (record, W) in zip(ats, parts, strict=True):
+                rows = errors(at, m, record, *one).rows.reshape(record.lines, 2, -1)
+                white = jax.lax.complex(rows[:, 0], rows[:, 1])
+                made.append(jnp.linalg.solve(W, white[:, :, None])[:, :, 0])
+            return made
+
+        each = (machines.signals, y)
+        made = by_flight(data, members, ready, of_one, machines.matrices, each)
+        for k, i in enumerate(members):
+            found[i] = [v[k] for v in made]
+    return [one for i in range(len(data.flights)) for one in found[i]]
 
 
-def _alike(layout: Layout, data: Data) -> list[list[int]]:
-    """The flights in groups that differ in numbers alone."""
-    groups: dict[Any, list[int]] = {}
-    for i, flight in enumerate(data.flights):
-        n = next(iter(flight.outputs.values())).shape[0]
-        key = (n, layout.outputs[i], layout.holds[i], layout.of_flights[i], tuple(flight.known))
-        # An offset of its own moves the point about which a flight is linearised.
-        key = key if layout.model.linear else (i, *key)
-        groups.setdefault(key, []).append(i)
-    return list(groups.values())
+def parts_of_group(layout: Layout, noise: Noise, members: list[int]) -> list[tuple[Record, Array]]:
+    """The records of each flight of a group, with their whitening.
+
+    Args:
+        layout: what the unknowns are.
+        noise: with the whitening of each record.
+        members: the flights' numbers.
+    """
+    # Records of one length have one spectrum (`smoothed`): that of the first flight's serve all.
+    pairs = zip(records_of(layout), noise.whitening, strict=True)
+    return [(record, W) for record, W in pairs if record.flight == members[0]]
 
 
-def _of_flight(layout: Layout, whitening: Any, i: int) -> list[Array]:
-    pairs = zip(records_of(layout), whitening, strict=True)
-    return [w for record, w in pairs if record.flight == i]
+def measured(layout: Layout, data: Data, members: list[int]) -> Float[Array, "f N p"]:
+    """What the flights of a group measured.
 
-
-def _of_records(
-    layout: Layout, data: Data, u: Unknowns, i: int, whitening: list[Array]
-) -> list[Lines]:
-    """The records of one flight, each with its whitening."""
-    # Once for all parts of a flight.
-    flight = data.flights[i]
-    machine, by = _machine(layout, data, u, i), None
-    if flight.by_instrument is not None:
-        alike = flight._replace(inputs=flight.by_instrument)
-        flights = (*data.flights[:i], alike, *data.flights[i + 1 :])
-        by = _machine(layout, data._replace(flights=flights), u, i)
-    y = jnp.stack([flight.outputs[n] for n in layout.outputs[i]], axis=1)
-    records = [r for r in records_of(layout) if r.flight == i]
-    return [_lines(machine, by, y, r, w) for r, w in zip(records, whitening, strict=True)]
-
-
-class _Machine(NamedTuple):
-    """What a flight's states and outputs follow, sample by sample."""
-
-    Ad: Float[Array, "n n"]
-    B: Float[Array, "n r"]
-    C: Float[Array, "p n"]
-    D: Float[Array, "p m"]
-    U: Float[Array, "N r"]
-    """what B multiplies"""
-    acting: Float[Array, "N m"]
-    """the inputs that act at the samples"""
-
-
-def _machine(layout: Layout, data: Data, u: Unknowns, i: int) -> _Machine:
-    condition = layout.of_flights[i].condition
-    model, drive, _ = linear_drive(layout, driven(layout, data, u, i), condition)
-    linear = linear_inputs(model, drive.inputs, layout.hold(i))
-    Ad, B, U, acting = held_columns(model, drive.params, drive.inputs, drive.dt, u.shift, linear)
-    _, _, C, D = jacobians(model, drive.params)
-    rows = np.asarray([naming.names(model.Outputs).index(n) for n in layout.outputs[i]])
-    return _Machine(Ad, B, C[rows], D[rows], U, acting)
-
-
-class _Fixed(NamedTuple):
-    """What does not move with the unknowns while they are differentiated by."""
-
-    P: Complex[Array, "K n n"]
-    """(zI - Ad)^-1"""
-    W: Complex[Array, "K p p"]
-    """the whitening"""
-    H: Complex[Array, "K p n"]
-    """W C P"""
-
-
-def _lines(
-    machine: _Machine, by: _Machine | None, y: Array, record: Record, whitening: Array
-) -> Lines:
-    Ad, _, C, *_ = machine
-    N, part = record.samples, slice(record.first, record.last)
-    k = np.arange(1, record.lines + 1)
-    z = jnp.asarray(np.exp(2j * np.pi * k / N))
-    still, C_still = (jax.lax.stop_gradient(v).astype(z.dtype) for v in (Ad, C))
-    identity = jnp.eye(Ad.shape[0], dtype=z.dtype)
-    P = jnp.linalg.inv(z[:, None, None] * identity[None] - still[None])
-    fixed = _Fixed(P, whitening, whitening @ (C_still[None] @ P))
-
-    def lines(v: Array) -> Array:
-        # Cut behind the inputs' delays: what acted in a part was logged before it. Without a mean:
-        # the zero line is not used, and rounding would carry it to the others.
-        v = v[part] - jnp.mean(v[part], axis=0, keepdims=True)
-        return jnp.fft.rfft(v, axis=0)[k] * float(N) ** -0.5
-
-    def answered(m: _Machine) -> tuple[Array, Array]:
-        """What drives the states, and what passes by them, whitened."""
-        passing = lines(m.acting) @ m.D.T.astype(z.dtype)
-        return lines(m.U) @ m.B.T.astype(z.dtype), jnp.einsum("kij,kj->ki", whitening, passing)
-
-    Y, (driving, passing) = jnp.einsum("kij,kj->ki", whitening, lines(y)), answered(machine)
-    # The ends of the record: what they explain is found by linear least squares.
-    basis = _span(_real(z[:, None, None] * fixed.H))
-    white = _stacked(Y - passing - _response(fixed, Ad, C, driving))
-    d = jax.lax.stop_gradient(basis.solution @ (basis.Q.T @ white))
-    driving = driving + z[:, None] * d.astype(z.dtype)[None, :]
-    white = Y - passing - _response(fixed, Ad, C, driving)
-    error, rows = jnp.linalg.solve(whitening, white[:, :, None])[:, :, 0], _stacked(white)
-    nothing = jnp.zeros(0, rows.dtype)
-    if by is None:
-        return Lines(error, rows, basis.Q.T @ rows, nothing, nothing)
-    driving, passing = answered(by)
-    response = -_stacked(passing + _response(fixed, by.Ad, by.C, driving))
-    return Lines(error, rows, basis.Q.T @ rows, response, basis.Q.T @ response)
-
-
-class _Span(NamedTuple):
-    """The space of what the ends of a record may add."""
-
-    Q: Float[Array, "s n"]
-    """orthonormal; zero where a state leaves no trace"""
-    solution: Float[Array, "n n"]
-    """from the components along Q to the ends' states"""
-
-
-def _span(basis: Float[Array, "s n"]) -> _Span:
-    basis = 2.0**0.5 * jax.lax.stop_gradient(basis)
-    Q, R = jnp.linalg.qr(basis)
-    # A state that no output shows has a column of rounding, and QR makes some direction of it,
-    # another at each step: what that takes off makes the sum of squares rough.
-    U, sizes, Vt = jnp.linalg.svd(R)
-    kept = sizes > _NO_END * sizes[0]
-    over = jnp.where(kept, 1.0 / jnp.where(kept, sizes, 1.0), 0.0)
-    return _Span(jnp.where(kept[None, :], Q @ U, 0.0), Vt.T * over[None, :])
-
-
-def _stacked(v: Complex[Array, "K p"]) -> Float[Array, " s"]:
-    # Of a complex normal error each part has half of the variance.
-    return 2.0**0.5 * _real(v.reshape(1, -1, 1))[:, 0]
-
-
-def _real(v: Complex[Array, "K p n"]) -> Float[Array, "s n"]:
-    v = v.reshape(-1, v.shape[2])
-    return jnp.concatenate([jnp.real(v), jnp.imag(v)])
-
-
-@jax.custom_jvp
-def _response(fixed: _Fixed, Ad: Array, C: Array, b: Array) -> Array:
-    """W C (zI - Ad)^-1 b at every line (K, p)."""
-    X = jnp.einsum("kij,kj->ki", fixed.P, b)
-    return jnp.einsum("kij,kj->ki", fixed.W, X @ C.T.astype(X.dtype))
-
-
-def _response_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    fixed, _Ad, C, b = primals
-    _, dA, dC, db = tangents
-    X = jnp.einsum("kij,kj->ki", fixed.P, b)
-    y = jnp.einsum("kij,kj->ki", fixed.W, X @ C.T.astype(X.dtype))
-    # One product for each line in place of a solution: H is the same for all unknowns.
-    moved = jnp.zeros_like(b) if _is_zero(db) else db
-    if not _is_zero(dA):
-        # Real matrices: half of a complex product.
-        moved = moved + jax.lax.complex(jnp.real(X) @ dA.T, jnp.imag(X) @ dA.T)
-    dy = jnp.einsum("kij,kj->ki", fixed.H, moved)
-    if not _is_zero(dC):
-        dy = dy + jnp.einsum("kij,kj->ki", fixed.W, X @ dC.T.astype(X.dtype))
-    return y, dy
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
-
-
-_response.defjvp(_response_jvp, symbolic_zeros=True)
+    Args:
+        layout: says in what order.
+        data: the numbers of the problem.
+        members: the flights' numbers.
+    """
+    names = layout.outputs[members[0]]
+    columns = [[data.flights[i].outputs[n] for n in names] for i in members]
+    return jnp.stack([jnp.stack([jnp.asarray(v) for v in of], axis=1) for of in columns])

@@ -11,13 +11,11 @@ Sources: Söderström and Stoica (1983) for estimates by instrument and their co
 Schoukens (2012), chapter 9.
 """
 
-from typing import Any, NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from heli_jax.identification.estimation.frequency_lines import all_lines
+from heli_jax.identification.estimation.frequency_slopes import Products, products_of_lines
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
 
 _NOTHING = 100.0
@@ -35,57 +33,25 @@ def rows_of_lines(layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Floa
     """
     v = _vector(layout, u)
     at, rest = jax.lax.stop_gradient((v, u))
-
-    def rows(v: Array) -> _Rows:
-        lines = all_lines(layout, data, noise, _with(layout, rest, v))
-        return _Rows(*(jnp.concatenate([one[i] for one in lines]) for i in range(1, 5)))
-
-    def along(direction: Array) -> Any:
-        return jax.jvp(rows, (at,), (direction,))
-
-    e, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(v.size, dtype=v.dtype))
-    Z, Z_ends = slopes.errors, slopes.ends
-    if slopes.by.shape[1]:
-        # One program for both: the direct estimate is where the search by instrument begins.
-        by = noise.by_instrument > 0.5
-        Z, Z_ends = jnp.where(by, slopes.by, Z), jnp.where(by, slopes.by_ends, Z_ends)
-    r, M = _weighed(_Rows(e.errors, e.ends, Z, Z_ends), slopes)
-    left = jnp.sum(e.errors**2) - jnp.sum(e.ends**2) - jnp.sum(r**2)
-    left = jnp.where(noise.by_instrument > 0.5, 0.0, jnp.sqrt(jnp.maximum(left, 0.0)))
+    made = products_of_lines(layout, data, noise, at, lambda v: _with(layout, rest, v))
+    r, M = _weighed(made)
+    left = jnp.sqrt(jnp.maximum(made.ee - jnp.sum(r**2), 0.0))
+    left = jnp.where(noise.by_instrument > 0.5, 0.0, left)
     r, M, left = jax.lax.stop_gradient((r, M, left))
     # The derivative is exactly M, whatever else moves with the unknowns.
     return jnp.append(r + M @ (v - at), left)
 
 
-class _Rows(NamedTuple):
-    """Whitened errors and instruments with their components along what the ends of the records may
-    add, or the derivatives of all of them, an unknown a row."""
-
-    errors: Float[Array, "... n"]
-    ends: Float[Array, "... m"]
-    by: Float[Array, "... n"]
-    by_ends: Float[Array, "... m"]
-
-
-def _weighed(e: _Rows, J: _Rows) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T, all without what the ends may add; zero along
-    what is no direction of Z.
-
-    Args:
-        e: the errors (n,), and Z (q, n).
-        J: their derivatives (q, n).
-    """
-    # Z P e and Z P J^T with the projection P: only the small products change (Kaufman).
-    information = e.by @ e.by.T - e.by_ends @ e.by_ends.T
-    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 0.0))
+def _weighed(of: Products) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """R^-T Z e and R^-T Z J^T, with R^T R = Z Z^T; zero along what is no direction of Z."""
+    sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(of.ZZ), 0.0))
     # Of one size: units do not decide what is rounding.
     over = jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(information * over[:, None] * over[None, :])
+    values, vectors = jnp.linalg.eigh(of.ZZ * over[:, None] * over[None, :])
     kept = values > _NOTHING * jnp.finfo(values.dtype).eps * values[-1]
     root = jnp.where(kept, 1.0 / jnp.sqrt(jnp.where(kept, values, 1.0)), 0.0)
     along = root[:, None] * vectors.T * over[None, :]
-    r = e.by @ e.errors - e.by_ends @ e.ends
-    return along @ r, along @ (e.by @ J.errors.T - e.by_ends @ J.ends.T)
+    return along @ of.Ze, along @ of.ZJ
 
 
 def _vector(layout: Layout, u: Unknowns) -> Float[Array, " q"]:

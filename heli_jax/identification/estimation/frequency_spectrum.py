@@ -4,7 +4,7 @@ Source: Brillinger, Time Series (1981), chapter 7; Pintelon and Schoukens (2012)
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -22,13 +22,14 @@ hundredth"""
 
 
 def smoothed(
-    lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART
+    lines: Sequence[Complex[np.ndarray, "K p"]], part: float = PART, *, least: float = LEAST
 ) -> list[Complex[np.ndarray, "K p p"]]:
     """By record the spectrum E e e^H (K, p, p) of all records, smoothed over frequency.
 
     Args:
         lines: by record at its own frequencies, those of N samples K = (N - 1) // 2.
-        part: sd of the Gaussian as a part of the frequency; six lines at least.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
     """
     # Records of one length have one spectrum and one kernel: their powers are added first.
     powers: dict[int, np.ndarray] = {}
@@ -38,10 +39,10 @@ def smoothed(
     counts = {K: sum(len(v) == K for v in lines) for K in powers}
     spectra = {}
     for K in powers:
-        knots, between = _knots(K, part)
+        knots, between = knots_of(K, part, least)
         total, weight = 0.0, 0.0
         for other, power in powers.items():
-            kernel = _kernel(K, other, part)
+            kernel = _kernel(K, other, part, least)
             flat = np.ascontiguousarray(power.reshape(other, -1))
             total = total + (kernel @ flat.view(float)).view(complex)
             weight = weight + counts[other] * kernel.sum(axis=1)
@@ -53,13 +54,21 @@ def smoothed(
     return [spectra[len(v)] for v in lines]
 
 
-@functools.lru_cache(maxsize=16)
-def _knots(K: int, part: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+@functools.lru_cache(maxsize=32)
+def knots_of(
+    K: int, part: float = PART, least: float = LEAST
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Lines (from 0) at which a spectrum of K lines is computed, and of each line the knot below
-    and how far it is on the way to the next."""
+    and how far it is on the way to the next.
+
+    Args:
+        K: lines.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
+    """
     knots = [0]
     while knots[-1] < K - 1:
-        width = max(LEAST, part * (knots[-1] + 1))
+        width = max(least, part * (knots[-1] + 1))
         knots.append(min(knots[-1] + max(1, int(width / _KNOTS)), K - 1))
     at = np.array(knots if K > 1 else [0, 0])
     low = np.clip(np.searchsorted(at, np.arange(K), side="right") - 1, 0, len(at) - 2)
@@ -67,14 +76,32 @@ def _knots(K: int, part: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarra
     return at, (low, share)
 
 
-@functools.lru_cache(maxsize=16)
-def _kernel(K: int, other: int, part: float) -> Float[np.ndarray, "knots other"]:
+@functools.lru_cache(maxsize=32)
+def _kernel(K: int, other: int, part: float, least: float) -> Float[np.ndarray, "knots other"]:
     """Weights that the lines of a record of `other` lines have at the knots of one of K."""
     # In parts of the rate, which all records have in common.
-    f, first = (_knots(K, part)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
+    f, first = (knots_of(K, part, least)[0] + 1) / (2 * K + 1), 1 / (2 * other + 1)
     g = first * np.arange(1, other + 1)
-    width = np.maximum(LEAST * first, part * f)
+    width = np.maximum(least * first, part * f)
     return np.exp(-0.5 * ((f[:, None] - g[None, :]) / width[:, None]) ** 2)
+
+
+def averages(
+    K: int, counts: Mapping[int, int], part: float = PART, least: float = LEAST
+) -> Float[np.ndarray, " K"]:
+    """Independent lines in a smoothed spectrum of K lines: (sum w)^2 / sum w^2.
+
+    Args:
+        K: lines of the record.
+        counts: how many records there are, by their lines.
+        part: sd of the Gaussian as a part of the frequency.
+        least: the same in lines, at least.
+    """
+    at, _ = knots_of(K, part, least)
+    kernels = [(n, _kernel(K, other, part, least)) for other, n in counts.items()]
+    total = sum(n * w.sum(axis=1) for n, w in kernels)
+    squares = sum(n * np.sum(w**2, axis=1) for n, w in kernels)
+    return np.interp(np.arange(K), at, total**2 / squares)
 
 
 def without_shared(S: Complex[np.ndarray, "K p p"]) -> Complex[np.ndarray, "K p p"]:
@@ -86,4 +113,8 @@ def whitening_of(
     spectra: Iterable[Complex[np.ndarray, "K p p"]],
 ) -> tuple[Complex[np.ndarray, "K p p"], ...]:
     """By record L^-1, where S = L L^H: L^-1 e is white."""
-    return tuple(np.linalg.inv(np.linalg.cholesky(S)) for S in spectra)
+    # Records of one length share their spectrum.
+    spectra = tuple(spectra)
+    made = {id(S): S for S in spectra}
+    made = {key: np.linalg.inv(np.linalg.cholesky(S)) for key, S in made.items()}
+    return tuple(made[id(S)] for S in spectra)

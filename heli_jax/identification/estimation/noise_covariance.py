@@ -116,7 +116,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     layout, estimator = search.layout, search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
     for _ in range(_ROUNDS):
-        e = evaluate(layout, search.data, noise, best.z)
+        e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
         fall = float(noise.log_variance_ratio - new.log_variance_ratio)
         change = abs(fall) + max(

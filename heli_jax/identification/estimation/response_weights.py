@@ -103,6 +103,11 @@ def first_weights(
     w = windowed(flights, options, instruments_of(problem))
     at = averages(w)
     sound = np.isfinite(response_of(w, at, w.Y))
+    if len(w.inputs) > 1 and not sound.any():
+        raise ValueError(
+            f"frequency: {' and '.join(w.inputs)} move as one, so that no response tells what each "
+            "of them does; expected inputs that move apart, or one of them"
+        )
     coherence = partial_coherence(w, at)
     at = at._replace(P=np.nan_to_num(at.P))
     asked = pairs_used(w, options, coherence, sound)

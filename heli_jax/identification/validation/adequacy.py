@@ -185,19 +185,23 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     )
 
 
-def by_responses(agreement: ResponseAgreement | None) -> Adequacy | None:
+def by_responses(
+    agreement: ResponseAgreement | None, simulated: Mapping[str, Metrics] | None = None
+) -> Adequacy | None:
     """Whether a model is adequate to measured frequency responses: by the squared errors over their
     variance, which gusts do not change, while a simulation in time knows nothing of gusts.
 
     Args:
         agreement: of the model's responses with the measured ones; None where none were fitted.
+        simulated: by output the model driven by the inputs alone.
     """
     if agreement is None:
         return None
     misfit = (agreement.misfit,) if agreement.misfit else ()
     if agreement.doubt:
         remarks, doubts = agreement.sentences, (agreement.doubt,)
-        return Adequacy(False, False, (), misfit, remarks=remarks, doubts=doubts)
+        less = any(m.vaf < 0 for m in (simulated or {}).values())
+        return Adequacy(False, less, (), misfit, remarks=remarks, doubts=doubts)
     return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
 
 

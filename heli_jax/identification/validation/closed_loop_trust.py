@@ -12,7 +12,13 @@ which is nowhere more than all of the input; with the largest such gain, as a me
 since nobody knows which is fed back. A loop holds the machine at low frequencies, where gusts are
 large in it and sweeps move sticks no more than elsewhere.
 
-Either is a mean over the frequencies that tell of a parameter, by what they tell.
+Either is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
+there is a loop: gusts leave residuals that a response is coherent with by chance, and so does a
+model that lacks something. Parameters are named where inputs were found to follow the response, or
+where somebody must have held the machine: the model is unstable, and the record does not grow.
+
+Inputs that are taken by instrument bring in nothing; of the others in the same fit only the second
+is told, since equations by instrument leave a residual that feedback makes coherent.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Bendat and
 Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance.
@@ -26,6 +32,8 @@ from jaxtyping import Float
 
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import evaluate
+from heli_jax.identification.estimation.frequency_gusts import machine_of
+from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
@@ -37,6 +45,11 @@ TRUSTED = 1.4
 interval then covers two thirds of the time"""
 MAY_BE = 0.25
 """part of the input that feedback may have brought in, where a parameter that is trusted shows"""
+BESIDE = 0.05
+"""the same where other inputs are taken by instrument: an input's effect is off by that part of it
+at least, in a fit that is taken for one that feedback does no harm to"""
+_GROWS = 3.0
+"""e-foldings over a record of the model's fastest growing mode, from which on somebody holds it"""
 _SEEN = 2.0
 """times the residual's power, above which an output shows the response: only there is it asked how
 large a gain the input leaves room for"""
@@ -54,19 +67,22 @@ class Moved(NamedTuple):
 
 
 def moved_by_feedback(at: Solution) -> dict[str, Moved]:
-    """By unknown of interest; empty where the method knows no frequencies, or inputs are taken by
-    instrument.
+    """By unknown of interest; empty where the method knows no frequencies, or every input that
+    moves is taken by instrument.
 
     Args:
         at: where the fit ended.
     """
-    layout, data, *_ = at
+    layout = at.layout
     if layout.estimator.fits_responses:
         return _of_responses(at)
-    if not layout.estimator.by_instrument or data.flights[0].by_instrument is not None:
+    if not layout.estimator.by_instrument:
         return {}
     lines = _lines(at)
+    if not any(lines.direct):
+        return {}
     shares, chances, n = _coherent_with_residual(lines)
+    n = n if all(lines.direct) else 0.0
     mean = mean_share(information(at, [np.ones(len(v)) for v in shares]))
     by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
     may_be = mean(information(at, _room_for_feedback(lines)))
@@ -99,14 +115,15 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
     """The same of fitted responses: how much of the inputs feedback may have brought in."""
     layout, data, noise, z = at
     w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
-    if w.instruments:
+    direct = np.array([n not in w.instruments for n in w.inputs])
+    if not direct.any():
         return {}
     # A method of the estimator: its module stands above this one in the order of imports.
     E = np.asarray(layout.estimator.errors_in_windows(layout, data, noise, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S = np.einsum("wka,wkb->kab", joint, np.conj(joint)) / len(joint)
     See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
-    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See)
+    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)
     by_line = information_by_line(at)
     may_be = mean_share(by_line.sum(axis=0))(np.einsum("k,kab->ab", room, by_line))
     return {n: Moved(0.0, float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
@@ -126,17 +143,64 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
     return np.einsum("ckra,ckrb->kab", J, J)
 
 
-def untrusted(moved: Mapping[str, Moved], found: Sequence[Feedback]) -> tuple[str, ...]:
-    """The parameters that a fit without an instrument cannot be trusted on: nothing where no loop
-    is seen, neither in the inputs nor in the residual.
+def held_upright(at: Solution) -> bool:
+    """Whether the model is unstable and a record does not grow as it would alone.
+
+    Args:
+        at: where the fit ended.
+    """
+    layout, data, *_, z = at
+    if not layout.estimator.by_instrument or layout.estimator.fits_responses:
+        return False
+    rate = float(np.log(np.max(np.abs(np.linalg.eigvals(machine_of(layout, data, z).Ad)))))
+    for names, flight in zip(layout.outputs, data.flights, strict=True):
+        y = [np.asarray(flight.outputs[n]) for n in names]
+        half = len(y[0]) // 2
+        grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
+        # Alone it would grow by half of the e-foldings from one half to the other.
+        if 2 * half * rate > _GROWS and np.log(grown) < 0.5 * half * rate:
+            return True
+    return False
+
+
+class Loop(NamedTuple):
+    """Who closes a loop, as far as it is known."""
+
+    found: Sequence[Feedback]
+    """whether inputs follow the response"""
+    instruments: Sequence[str] = ()
+    """the inputs that are taken by instrument"""
+    held: bool = False
+    """whether somebody must hold the machine"""
+
+    @property
+    def closed(self) -> bool:
+        """Whether an input that is taken for given follows the response, or may: where only one
+        with an instrument was found to, whoever closes its loop may move the others as well."""
+        if self.instruments:
+            return bool(self.inputs) and any(one.present for one in self.found)
+        return self.held or any(one.present for one in self.found)
+
+    @property
+    def inputs(self) -> list[str]:
+        """Those without an instrument that follow the response; all that move freely where it was
+        found of none."""
+        direct = [one for one in self.found if one.input not in self.instruments]
+        those = [one for one in direct if one.present] or direct
+        return list(dict.fromkeys(one.input for one in those))
+
+
+def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
+    """The parameters that a fit cannot be trusted on: nothing where no loop is closed.
 
     Args:
         moved: of `moved_by_feedback`.
-        found: whether inputs follow the response.
+        loop: who closes it.
     """
-    if not any(one.present for one in found) and not any(m.by > TRUSTED for m in moved.values()):
+    if not loop.closed:
         return ()
-    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > MAY_BE)
+    most = BESIDE if loop.instruments else MAY_BE
+    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > most)
 
 
 class _Lines(NamedTuple):
@@ -146,6 +210,9 @@ class _Lines(NamedTuple):
     errors: list[np.ndarray]
     measured: list[np.ndarray]
     inputs: list[np.ndarray]
+    """those that move"""
+    direct: tuple[bool, ...]
+    """by input, whether it is taken for given"""
 
 
 def _lines(at: Solution) -> _Lines:
@@ -164,7 +231,10 @@ def _lines(at: Solution) -> _Lines:
     moving = np.flatnonzero(sum(np.sum(np.abs(u) ** 2, axis=0) for u in inputs) > 0)
     errors = [np.asarray(e) for e in errors_of_lines(layout, data, noise, z)]
     W = [np.asarray(w) for w in noise.whitening]
-    return _Lines(W, errors, measured, [u[:, moving] for u in inputs])
+    by = inputs_by_instrument(data) if data.flights[0].by_instrument is not None else ()
+    names = list(naming.asdict(data.flights[0].inputs))
+    direct = tuple(names[i] not in by for i in moving)
+    return _Lines(W, errors, measured, [u[:, moving] for u in inputs], direct)
 
 
 def _coherent_with_residual(lines: _Lines) -> tuple[list[np.ndarray], list[np.ndarray], float]:
@@ -190,12 +260,15 @@ def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency the part of the input that a constant gain may have brought in."""
     joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
     spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
-    return [_room(*of_record) for of_record in zip(*spectra, strict=True)]
+    direct = np.array(lines.direct)
+    return [_room(*of_record, direct) for of_record in zip(*spectra, strict=True)]
 
 
-def _room(W: np.ndarray, S: np.ndarray, See: np.ndarray) -> Float[np.ndarray, " k"]:
+def _room(
+    W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
+) -> Float[np.ndarray, " k"]:
     """By frequency the same, of the whitening, the spectra of inputs and outputs together, and
-    those of the residual."""
+    those of the residual; of the inputs that are taken directly."""
     m = S.shape[1] - See.shape[1]
     e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
     u = np.where(u > 0, u, 1e-300)
@@ -207,6 +280,7 @@ def _room(W: np.ndarray, S: np.ndarray, See: np.ndarray) -> Float[np.ndarray, " 
     # Each input by what it does: one that hardly acts moves no estimate.
     H = np.swapaxes(np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2)
     effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
+    room, effect = room[:, direct], effect[:, direct]
     return np.sum(room * effect, axis=1) / np.maximum(np.sum(effect, axis=1), 1e-300)
 
 
@@ -227,28 +301,30 @@ def information(
     return J.T @ J
 
 
-def feedback_trust_notes(moved: Mapping[str, Moved], found: Sequence[Feedback]) -> list[str]:
-    """Which parameters a fit without an instrument cannot be trusted on, in words.
+def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
+    """Which parameters a fit cannot be trusted on, in words; nothing where no loop is closed.
 
     Args:
         moved: of `moved_by_feedback`.
-        found: whether inputs follow the response.
+        loop: who closes it.
     """
-    doubted, closed = untrusted(moved, found), any(one.present for one in found)
+    if not (loop.closed and moved):
+        return []
+    doubted = untrusted(moved, loop)
+    of = f" for {' and '.join(loop.inputs)}" if loop.instruments else ""
+    if not any(one.present for one in loop.found):
+        of += " (the model is unstable, and the record does not grow: somebody holds the machine)"
     if not doubted:
-        # A loop that was not found, and does nothing that shows, needs no words.
-        if not (closed and moved):
-            return []
         return [
-            "Closed loop without an instrument: feedback can hardly have moved these estimates: "
-            "they are known from frequencies at which it brings in little."
+            f"Closed loop without an instrument{of}: feedback can hardly have moved these "
+            "estimates: they are known from frequencies at which it brings in little."
         ]
     words = ", ".join(f"{n} ({100 * moved[n].may_be:.0f} %)" for n in doubted)
     rest = [n for n in moved if n not in doubted]
-    seen = "" if closed else " (the response is coherent with the residual)"
+    inputs = " and ".join(loop.inputs) if loop.instruments else "the inputs"
     return [
-        f"Closed loop without an instrument{seen}: this fit cannot be trusted on "
-        f"{', '.join(doubted)}. Where these show, so much of the inputs may be gusts that feedback "
+        f"Closed loop without an instrument{of}: this fit cannot be trusted on "
+        f"{', '.join(doubted)}. Where these show, so much of {inputs} may be gusts that feedback "
         f"brought in: {words}; no interval allows for that. "
         + (f"{', '.join(rest)} are hardly touched. " if rest else "")
         + "Remedy: log the excitation and name it (signals.instruments), or method: filter-error "

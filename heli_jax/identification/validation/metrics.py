@@ -29,6 +29,7 @@ BAND99 = 2.5758293035489004
 """half width of the 99 % band of a white residual's correlation, times sqrt(N): the 99.5 % point of
 the normal distribution"""
 
+_HUGE = 1e100
 _MOSTLY_MISSING = 0.4
 """part of the samples that are seen, below which a signal is one of fewer samples"""
 
@@ -41,6 +42,7 @@ def diverges(m: Metrics) -> bool:
     return not np.isfinite(m.rmse) or m.vaf < -9.0
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def metrics(measured: np.ndarray, simulated: np.ndarray) -> Metrics:
     """Agreement of two signals (N,) where something is measured (not NaN)."""
     # Only what was measured counts, for the means too: a gap must not shift one of them.
@@ -116,7 +118,10 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
 
 def _centred(signal: np.ndarray) -> np.ndarray:
     # A missing sample at the mean adds nothing to any sum of products.
-    return np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
+    centred = np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))
+    # Correlations have no size; of a simulation that diverges the squares would overflow.
+    size = np.max(np.abs(centred), initial=0.0)
+    return centred / size if _HUGE < size < np.inf else centred
 
 
 def sequence(signal: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Machines that remember longer than a window or than a record's lines tell, against NumPy."""
+"""Machines that remember longer than a window, against NumPy."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +7,7 @@ import pytest
 from heli_jax import Flight
 from heli_jax.flights.instruments import own_instruments
 from heli_jax.identification.estimation.bounded_solution import bounded_outputs, ends_outputs, span
-from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.estimation.linear_machine import Machine
-from heli_jax.identification.estimation.slow_modes import peaks_of
 
 
 @pytest.mark.parametrize("samples", [90, 91])
@@ -31,19 +29,6 @@ def test_every_run_of_a_machine_is_its_bounded_solution_and_what_the_ends_add(sa
     np.testing.assert_allclose(whole, y, atol=1e-8 * np.max(np.abs(y)))
     Q, solution = (np.asarray(v) for v in span(jnp.asarray(basis)))
     np.testing.assert_allclose(solution @ (Q.T @ left), ends, rtol=1e-6)
-
-
-def test_the_peak_of_a_slow_mode_and_none_of_a_damped_one():
-    record, dt = Record(0, 0, 6000), 0.02
-    assert np.all(peaks_of(np.array([-3.0 + 1j, -3.0 - 1j, -4.0]), record, dt) == 1.0)
-    slow = np.array([-0.02 + 0.55j, -0.02 - 0.55j])
-    peak = peaks_of(slow, record, dt)
-    omega = 2.0 * np.pi * np.arange(1, 3000) / 120.0
-    assert omega[np.argmax(peak)] == pytest.approx(0.55, abs=0.06)
-    assert np.max(peak) > 10.0
-    assert peak[-1] == pytest.approx(1.0, abs=0.01)
-    # Growing or decaying, the power at a frequency is the same.
-    np.testing.assert_allclose(peaks_of(-np.conj(slow), record, dt), peak, rtol=1e-12)
 
 
 def test_a_stick_is_no_instrument_of_itself():

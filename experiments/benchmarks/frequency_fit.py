@@ -1,0 +1,89 @@
+"""How long a fit in frequency takes once it is compiled: the bench, and the R-50 in closed loop.
+
+    .venv/bin/python experiments/benchmarks/frequency_fit.py [RUNS]
+
+The bench of experiments/frequency_error.py (one record of 6000 samples, three parameters) and the
+R-50 of experiments/closed_loop_frequency.py (four records of 4500 samples, six outputs, 22
+parameters) directly and by instrument. On one thread, the best of RUNS (5), records in turn: none
+is fitted twice in a row. Search: until estimates and noise spectrum stay. Whole: with everything
+that `fit` says of them. Processor time, beside it the time that passed, which other load adds to.
+The targets: 30 ms for the bench, 0.5 s for the R-50.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import closed_loop_frequency
+import frequency_error
+import jax
+
+from heli_jax import Problem, fit
+
+jax.config.update("jax_enable_x64", True)
+COMPILED = "/jax/core/compile/backend_compile_duration"
+compiled: list[float] = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: compiled.append(seconds) if event == COMPILED else None
+)
+
+
+class Took(NamedTuple):
+    """One fit."""
+
+    search: float
+    """[s] that passed"""
+    processor: float
+    """[s] of the whole"""
+    whole: float
+    """[s] that passed"""
+    steps: int
+    programs: int
+    """compiled on the way"""
+
+
+def timed(problem: Problem) -> Took:
+    compiled.clear()
+    begin, processor = time.perf_counter(), time.process_time()
+    # One start: where delays are free several would be tried, each as long as this.
+    found = fit(problem, starts=1)
+    whole, processor = time.perf_counter() - begin, time.process_time() - processor
+    assert found.status == "converged", found.status
+    return Took(found.timing["fit"], processor, whole, found.steps, len(compiled))
+
+
+def r50(method: str) -> Callable[[int], Problem]:
+    options = closed_loop_frequency.METHODS[method]
+    return lambda seed: closed_loop_frequency.problem(seed, **options)
+
+
+def main(runs: int) -> None:
+    print("| fit | cold [s] | steps | search [s] | whole [s]: processor | passed | compiled |")
+    print("|---" * 7 + "|")
+    cases = {
+        "bench": lambda seed: frequency_error.problem(seed, 1.04, "frequency-error"),
+        "R-50, direct": r50("direct"),
+        "R-50, by instrument": r50("by instrument"),
+    }
+    for name, make in cases.items():
+        problems = [make(1), make(2)]
+        cold = timed(problems[0])
+        each = [timed(problems[(k + 1) % 2]) for k in range(runs)]
+        best = Took(*(min(values) for values in zip(*each, strict=True)))
+        steps = sorted({took.steps for took in each})
+        print(
+            f"| {name} | {cold.whole:.1f} | {' or '.join(map(str, steps))} | {best.search:.3f} | "
+            f"{best.processor:.3f} | {best.whole:.3f} | {max(t.programs for t in each[1:])} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)

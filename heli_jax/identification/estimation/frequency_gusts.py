@@ -1,0 +1,202 @@
+r"""The noise's spectrum by what the machine makes of gusts, and a mean over lines of what is left.
+
+Gusts come out of a machine with its integrations and modes in them: outputs that are coherent with
+a gain that changes from line to line. A mean over lines makes something else of that, estimates
+lose most of what the record tells, and intervals are too narrow. So the spectrum is first described
+as
+
+$$S_0 = \sum_i h_i\, q_i\, h_i^H + R, \qquad [h_1 \ldots h_n] = C (zI - A_d)^{-1}$$
+
+with a gust at every state whose spectrum $q_i \ge 0$ falls with frequency somehow, and white noise
+of each output in R. The errors, whitened by $S_0$, have a spectrum that is nearly flat, and the
+mean over lines is taken of that: it may be wide, and corrects whatever the description lacks.
+
+A spectrum from n averages of p outputs weighs by $n / (n - p)$ too much, and the estimate is by
+about the same worse than with the true one: both are allowed for.
+
+Sources: Blackman and Tukey (1958) for prewhitening; Sawada, Kameoka, Araki and Ueda (2013) for the
+multiplicative steps to the largest likelihood; Brillinger (1981), chapter 8, for weights that are
+estimated.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from heli_jax.identification.estimation.frequency_lines import alike, machines_of
+from heli_jax.identification.estimation.frequency_spectrum import (
+    averages,
+    knots_of,
+    smoothed,
+    whitening_of,
+)
+from heli_jax.identification.unknowns.layout import Data, Layout, unpack
+
+LEAST, PART = 12.0, 0.12
+"""sd of the Gaussian that smooths what is left: lines at least, and as a part of the frequency"""
+_CELLS = 0.16, 6.0
+"""the same of what the description rests on: each line by itself up to the fiftieth, since slow
+modes are no wider, and from there on 4 % of the frequency"""
+_OCTAVES = 2
+"""from one corner of the gusts' spectra to the next"""
+_STEPS = 8
+"""towards the largest likelihood: what they leave is for the mean over lines"""
+_NOTHING = 1e-9
+"""of an output's power, below which none of it is noise"""
+
+
+class Machine(NamedTuple):
+    """What turns gusts into outputs."""
+
+    Ad: Float[Array, "n n"]
+    C: Float[Array, "p n"]
+
+
+@eqx.filter_jit
+def machine_of(layout: Layout, data: Data, z: Float[Array, " q"]) -> Machine:
+    """That of the first flight: records of one length share a spectrum.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        z: the unknowns.
+    """
+    members = alike(layout, data)[0]
+    matrices = machines_of(layout, data, unpack(layout, data, z), members).matrices
+    if matrices.Ad.ndim == 3:
+        matrices = jax.tree.map(lambda v: v[0], matrices)
+    return Machine(matrices.Ad, matrices.C)
+
+
+def whitening_by(
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]]
+) -> tuple[Complex[np.ndarray, "K p p"], ...]:
+    """By record what makes its errors white; of records of one length the same array.
+
+    Args:
+        machine: that gusts come through.
+        errors: by record at its own frequencies.
+    """
+    size = np.sqrt(sum(np.sum(np.abs(e) ** 2, axis=0) for e in errors) / sum(map(len, errors)))
+    size = np.where(size > 0, size, 1.0)
+    scaled = [e / size for e in errors]
+    before = _before(machine, scaled, size)
+    left = smoothed([np.einsum("kij,kj->ki", before[len(e)], e) for e in scaled], PART, least=LEAST)
+    counts = {len(e): sum(len(v) == len(e) for v in errors) for e in errors}
+    p, made = errors[0].shape[1], {}
+    for e, W in zip(errors, whitening_of(left), strict=True):
+        K = len(e)
+        if K not in made:
+            n = np.maximum(averages(K, counts, PART, LEAST), p + 1.0)
+            made[K] = ((n - p) / n)[:, None, None] * (W @ before[K]) / size[None, None, :]
+    return tuple(made[len(e)] for e in errors)
+
+
+class _Cells(NamedTuple):
+    """Lines that are taken together, of records of every length."""
+
+    f: Float[np.ndarray, " c"]
+    """in cycles a sample"""
+    H: Complex[np.ndarray, "c p n"]
+    power: Complex[np.ndarray, "c p p"]
+    """mean of e e^H"""
+    lines: Float[np.ndarray, " c"]
+
+
+def _before(
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], size: Float[np.ndarray, " p"]
+) -> dict[int, Complex[np.ndarray, "K p p"]]:
+    """By length of the record S0^(-1/2); ones where the machine says nothing of the errors."""
+    p = errors[0].shape[1]
+    lengths = dict.fromkeys(len(e) for e in errors)
+    flat = {K: np.broadcast_to(np.eye(p, dtype=complex), (K, p, p)) for K in lengths}
+    with np.errstate(all="ignore"):
+        at = {K: _cells(machine, [e for e in errors if len(e) == K], size) for K in lengths}
+        cells = _Cells(*(np.concatenate(v) for v in zip(*at.values(), strict=True)))
+        corners = _corners(cells.f)
+        # A line on a mode that does not decay has no finite response.
+        cells = _Cells(*(v[np.isfinite(cells.H).all((1, 2))] for v in cells))
+        if not cells.f.size:
+            return flat
+        found = _described(cells, corners)
+    if not all(np.isfinite(v).all() for v in found):
+        return flat
+    q, r = found
+    made = {}
+    for K, of in at.items():
+        S0 = _spectrum(np.nan_to_num(of.H), q @ _shapes(of.f, corners), r)
+        root = np.linalg.inv(np.linalg.cholesky(S0))
+        _, (low, share) = knots_of(K, *_CELLS)
+        made[K] = root[low] + share[:, None, None] * (root[low + 1] - root[low])
+    return made
+
+
+def _cells(
+    machine: Machine, errors: Sequence[Complex[np.ndarray, "K p"]], size: Float[np.ndarray, " p"]
+) -> _Cells:
+    """A cell around each knot of records of one length."""
+    K = len(errors[0])
+    at, _ = knots_of(K, *_CELLS)
+    edges = np.concatenate([[0], (at[1:] + at[:-1] + 1) // 2])
+    power = sum(e[:, :, None] * np.conj(e[:, None, :]) for e in errors) / len(errors)
+    count = np.diff(np.append(edges, K)).astype(float)
+    power = np.add.reduceat(power, edges, axis=0) / count[:, None, None]
+    f = (at + 1) / (2 * K + 1)
+    Ad, C = np.asarray(machine.Ad, float), np.asarray(machine.C, float)
+    n = len(Ad)
+    z = np.exp(2j * np.pi * f)[:, None, None]
+    H = (C / size[:, None]) @ np.linalg.inv(z * np.eye(n) - Ad)
+    return _Cells(f, H, power, count * len(errors))
+
+
+def _corners(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:
+    first, last = float(np.min(f)), 0.5
+    return last * 0.5 ** np.arange(1.0, np.log2(last / first), _OCTAVES)
+
+
+def _shapes(
+    f: Float[np.ndarray, " c"], corners: Float[np.ndarray, " b"]
+) -> Float[np.ndarray, "b1 c"]:
+    """Spectra that a gust's is a sum of: a white one and first-order lags."""
+    return np.concatenate([np.ones((1, f.size)), 1.0 / (1.0 + (f / corners[:, None]) ** 2)])
+
+
+def _spectrum(
+    H: Complex[np.ndarray, "c p n"], Q: Float[np.ndarray, "n c"], r: Float[np.ndarray, " p"]
+) -> Complex[np.ndarray, "c p p"]:
+    return (H * Q.T[:, None, :]) @ np.conj(np.swapaxes(H, 1, 2)) + np.diag(r)
+
+
+def _described(
+    cells: _Cells, corners: Float[np.ndarray, " b"]
+) -> tuple[Float[np.ndarray, "n b1"], Float[np.ndarray, " p"]]:
+    """Powers of the gusts, by state and shape, and of the outputs' own noise."""
+    shapes, own = _shapes(cells.f, corners), np.real(np.einsum("cii->ci", cells.power))
+    gains = np.abs(cells.H) ** 2
+    # To begin with as much as the output that shows least of a state leaves room for.
+    room = np.median(np.min(own[:, :, None] / np.maximum(gains, 1e-300), axis=1), axis=0)
+    room = np.where(np.max(gains, axis=(0, 1)) > 0, room, 0.0)
+    q = np.tile(room[:, None] / len(shapes), (1, len(shapes)))
+    r = np.maximum(0.3 * np.median(own, axis=0), _NOTHING)
+    ends = np.conj(np.swapaxes(cells.H, 1, 2))
+    for _ in range(_STEPS):
+        # Without the root that would make sure that each step gains: half as many are enough.
+        inverse = np.linalg.inv(_spectrum(cells.H, q @ shapes, r))
+        seen = inverse @ cells.power @ inverse
+        # By gust what of it the errors show, and what they should.
+        shown, due = (
+            np.real(np.sum(ends * np.swapaxes(M @ cells.H, 1, 2), axis=2)) * cells.lines[:, None]
+            for M in (seen, inverse)
+        )
+        q = q * _part((shapes @ shown).T, (shapes @ due).T)
+        of_r = [np.real(np.einsum("cii,c->i", M, cells.lines)) for M in (seen, inverse)]
+        r = np.maximum(r * _part(*of_r), _NOTHING)
+    return q, r
+
+
+def _part(shown: np.ndarray, due: np.ndarray) -> np.ndarray:
+    return np.maximum(shown, 0.0) / np.where(due > 0, due, 1.0)

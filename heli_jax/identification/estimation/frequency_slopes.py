@@ -1,0 +1,261 @@
+r"""Products of errors, their derivatives by the unknowns, and instruments, over all lines.
+
+With $H = W C (zI - A_d)^{-1}$ the derivative of the whitened response is
+$H (dA_d X + dB\,U) + W (dC X + dD\,U)$: one product for each line and unknown in place of a
+solution, of which all unknowns share the first factor.
+
+Source: Pintelon and Schoukens (2012), chapter 9.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from heli_jax.identification.estimation.frequency_lines import (
+    Machines,
+    Matrices,
+    Resolved,
+    Signals,
+    alike,
+    at_lines,
+    by_flight,
+    errors,
+    machines_of,
+    measured,
+    parts_of_group,
+    resolved,
+    stacked,
+    states,
+)
+from heli_jax.identification.estimation.frequency_records import Record
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
+
+_BLOCK = 256
+"""lines whose derivatives are made and summed before the next"""
+
+
+class Products(NamedTuple):
+    """Of whitened errors e (of white noise of variance 1), their derivatives J by the unknowns and
+    instruments Z, all without what the ends of the records may add."""
+
+    ee: Float[Array, ""]
+    Ze: Float[Array, " q"]
+    ZZ: Float[Array, "q q"]
+    ZJ: Float[Array, "q q"]
+
+
+class _Driven(NamedTuple):
+    """Lines of one record: the states, what drives them, and the derivatives of that."""
+
+    X: Complex[Array, "K n"]
+    lines: Signals
+    slopes: Signals
+    """(K, c, q); None for those that do not move"""
+
+
+class _Block(NamedTuple):
+    """Lines of one record with all that their products are made of."""
+
+    H: Float[Array, "K 2p 2n"]
+    W: Float[Array, "K 2p 2p"]
+    Q: Float[Array, "K 2p n"]
+    e: Float[Array, "K 2p"]
+    own: _Driven
+    by: _Driven | None
+
+
+class _Sums(NamedTuple):
+    """Products, and the components along what the ends may add."""
+
+    ee: Array
+    Ze: Array
+    ZZ: Array
+    ZJ: Array
+    Qe: Array
+    QZ: Array
+    QJ: Array
+
+    def products(self) -> Products:
+        """Z P e and Z P J with the projection P: only the small products change (Kaufman)."""
+        made = Products(
+            self.ee - self.Qe @ self.Qe,
+            -(self.Ze - self.Qe @ self.QZ),
+            self.ZZ - self.QZ.T @ self.QZ,
+            self.ZJ - self.QZ.T @ self.QJ,
+        )
+        # Of a complex normal error each part has half of the variance.
+        return jax.tree.map(lambda v: 2.0 * v, made)
+
+
+def products_of_lines(
+    layout: Layout,
+    data: Data,
+    noise: Noise,
+    v: Float[Array, " q"],
+    unknowns: Callable[[Array], Unknowns],
+) -> Products:
+    """Over all records. Directly Z = J; by instrument the derivatives of the response to the inputs
+    by instrument.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: with the whitening of each record, and whether instruments are used.
+        v: the unknowns that lines depend on.
+        unknowns: makes all of them out of these.
+    """
+    total = []
+    for members in alike(layout, data):
+        parts = parts_of_group(layout, noise, members)
+        machines, slopes = _differentiated(
+            lambda v, members=members: machines_of(layout, data, unknowns(v), members), v
+        )
+
+        def ready(common: Any, parts: Any = parts) -> Any:
+            m, dm = common
+            return m, dm, [resolved(m, record, W) for record, W in parts]
+
+        def of_one(common: Any, one: Any, parts: Any = parts) -> Products:
+            m, dm, ats = common
+            signals, ds, by, dby, y = one
+            made = []
+            for at, (record, _) in zip(ats, parts, strict=True):
+                e = errors(at, m, record, signals, y)
+                own, other = _Driven(e.X, e.signals, _lines(record, ds)), None
+                if by is not None:
+                    other = _driven_by(at, m, record, by, dby)
+                Q = at.Q.reshape(*e.rows.shape, -1)
+                whole = _Block(at.H, at.W, Q, e.rows, own, other)
+                made.append(_summed(m, dm, noise.by_instrument, whole).products())
+            return jax.tree.map(lambda *v: sum(v), *made)
+
+        each = (machines.signals, slopes.signals, machines.by, slopes.by)
+        each = (*each, measured(layout, data, members))
+        common = (machines.matrices, slopes.matrices)
+        made = by_flight(data, members, ready, of_one, common, each)
+        total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
+    return jax.tree.map(lambda *v: sum(v), *total)
+
+
+def _driven_by(at: Resolved, m: Matrices, record: Record, by: Signals, dby: Signals) -> _Driven:
+    lines = Signals(*(at_lines(record, v) for v in by))
+    X = states(at, lines.U @ m.B.T.astype(at.z.dtype))
+    return _Driven(X, lines, _lines(record, dby))
+
+
+def _summed(m: Matrices, dm: Matrices, by_instrument: Array, whole: _Block) -> _Sums:
+    """Over all lines, some hundred at a time: the derivatives of all would leave every cache."""
+    K = whole.e.shape[0]
+    count = -(-K // _BLOCK)
+    size = -(-K // count)
+
+    def blocks(v: Array) -> Array:
+        # Lines of zeros add nothing.
+        v = jnp.pad(v, [(0, count * size - K)] + [(0, 0)] * (v.ndim - 1))
+        return v.reshape(count, size, *v.shape[1:])
+
+    def made(block: _Block) -> _Sums:
+        return _sums(m, dm, by_instrument, block)
+
+    def more(total: _Sums, block: _Block) -> tuple[_Sums, None]:
+        return jax.tree.map(jnp.add, total, made(block)), None
+
+    stacked_blocks = jax.tree.map(blocks, whole)
+    shapes = jax.eval_shape(made, jax.tree.map(lambda v: v[0], stacked_blocks))
+    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    return jax.lax.scan(more, zeros, stacked_blocks)[0]
+
+
+def _sums(m: Matrices, dm: Matrices, by_instrument: Array, block: _Block) -> _Sums:
+    J = Z = _slopes(block, m, dm, block.own)
+    if block.by is not None:
+        # One program for both: the direct estimate is where the search by instrument begins.
+        by = block.by
+        Z = jax.lax.cond(by_instrument > 0.5, lambda: _slopes(block, m, dm, by), lambda: J)
+    # J and Z are minus the derivatives: a sign that `products` gives back to Z e.
+    q = J.shape[2]
+    e, J, Z = block.e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
+    Q = block.Q.reshape(e.size, -1)
+    return _Sums(e @ e, e @ Z, Z.T @ Z, Z.T @ J, Q.T @ e, Q.T @ Z, Q.T @ J)
+
+
+def _lines(record: Record, ds: Signals) -> Signals:
+    """At the lines the derivatives (N, c, q) of signals; None where there are none."""
+
+    def lines(v: Array) -> Array:
+        flat = at_lines(record, v.reshape(v.shape[0], -1))
+        return flat.reshape(flat.shape[0], *v.shape[1:])
+
+    return Signals(*(None if v is None else lines(v) for v in ds))
+
+
+def _slopes(block: _Block, m: Matrices, dm: Matrices, of: _Driven) -> Float[Array, "K a q"]:
+    """The derivatives of the whitened response, real parts and imaginary ones."""
+    driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
+    passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
+    made = [M @ v for M, v in ((block.H, driving), (block.W, passing)) if v is not None]
+    return made[0] if len(made) == 1 else made[0] + made[1]
+
+
+def _moved(
+    X: Complex[Array, "K n"],
+    u: Complex[Array, "K r"],
+    slopes: tuple[Any, Any],
+    of_signals: tuple[Array, Any],
+) -> Any:
+    """dF X + dG u + G du (K, 2a, q), real parts and imaginary ones; None where all are zero.
+
+    Args:
+        X: states.
+        u: signals.
+        slopes: dF (a, n, q) and dG (a, r, q), None where zero.
+        of_signals: G (a, r) and du (K, r, q), None where zero.
+    """
+    total, K = None, X.shape[0]
+    pairs = [(v, d) for v, d in zip((X, u), slopes, strict=True) if d is not None]
+    if pairs:
+        # One product of large real matrices: real and imaginary parts are rows of the first.
+        v = stacked(jnp.concatenate([v for v, _ in pairs], axis=1)).reshape(2 * K, -1)
+        d = jnp.concatenate([d for _, d in pairs], axis=1)
+        a, c, q = d.shape
+        total = (v @ jnp.swapaxes(d, 0, 1).reshape(c, a * q)).reshape(K, 2 * a, q)
+    G, du = of_signals
+    if du is not None:
+        part = jnp.einsum("ar,ksrq->ksaq", G, stacked(du)).reshape(K, 2 * G.shape[0], -1)
+        total = part if total is None else total + part
+    return total
+
+
+def _differentiated(
+    make: Callable[[Array], Machines], v: Float[Array, " q"]
+) -> tuple[Machines, Machines]:
+    """Machines and their derivatives by v, a last axis; None in place of those that are zero."""
+
+    def along(direction: Array) -> tuple[Machines, Machines]:
+        return jax.jvp(make, (v,), (direction,))
+
+    value, slopes = jax.vmap(along, out_axes=(None, -1))(jnp.eye(v.size, dtype=v.dtype))
+    leaves, structure = jax.tree.flatten(slopes)
+    kept = [d if moves else None for d, moves in zip(leaves, _moving(make, v), strict=True)]
+    return value, jax.tree.unflatten(structure, kept)
+
+
+def _moving(make: Callable[[Array], Machines], v: Float[Array, " q"]) -> list[bool]:
+    """Of each array of the machines whether it hangs on v: what does not costs nothing then."""
+    found: list[bool] = []
+
+    @jax.custom_jvp
+    def look(*leaves: Array) -> Array:
+        return jnp.zeros((), v.dtype)
+
+    def rule(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        zero = jax.custom_derivatives.SymbolicZero
+        found.extend(not isinstance(t, zero) for t in tangents)
+        return jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+
+    look.defjvp(rule, symbolic_zeros=True)
+    jax.eval_shape(lambda t: jax.jvp(lambda v: look(*jax.tree.leaves(make(v))), (v,), (t,)), v)
+    return found

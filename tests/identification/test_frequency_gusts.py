@@ -1,0 +1,124 @@
+"""The spectrum of gusts that come through a machine, and which parameters feedback leaves alone."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
+from heli_jax.identification.estimation.frequency_gusts import Machine, whitening_by
+from heli_jax.identification.estimation.frequency_spectrum import smoothed, whitening_of
+from heli_jax.identification.validation.closed_loop_trust import (
+    Loop,
+    Moved,
+    feedback_trust_notes,
+    untrusted,
+)
+from heli_jax.identification.validation.feedback import Feedback
+
+DT, N = 0.02, 4500
+ROLL = """
+name: roll
+states: {phi: rad, p: rad/s}
+inputs: {lat: "1"}
+outputs: {phi: rad, p: rad/s}
+parameters:
+  Lp: {value: -2.0, unit: 1/s, source: none}
+  Llat: {value: 20.0, unit: rad/s^2, source: none}
+A: {phi: {p: 1}, p: {p: Lp}}
+B: {p: {lat: Llat}}
+"""
+TRUTH = {"Lp": -2.0, "Llat": 20.0}
+
+
+def discrete(A: list, B: list) -> tuple[np.ndarray, np.ndarray]:
+    n, m = np.shape(B)
+    M = np.zeros((n + m, n + m))
+    M[:n, :n], M[:n, n:] = A, B
+    E = scipy.linalg.expm(M * DT)
+    return E[:n, :n], E[:n, n:]
+
+
+def gust(rng: np.random.Generator, size: float) -> np.ndarray:
+    keeps = np.exp(-DT / 0.5)
+    white = size * np.sqrt(1 - keeps**2) * rng.standard_normal(N)
+    return scipy.signal.lfilter([1.0], [1.0, -keeps], white)
+
+
+def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
+    """Against the spectrum that they were drawn from, where a mean over lines is far from it."""
+    Ad, _ = discrete([[-0.3, -9.0, 0], [1, 0, 0], [1, 0, 0]], [[0], [0], [0]])
+    f = np.arange(1, (N - 1) // 2 + 1) / N
+    z = np.exp(2j * np.pi * f)
+    H = np.linalg.inv(z[:, None, None] * np.eye(3) - Ad)
+    q = 1e-3 / (1.0 + (f / DT * np.pi) ** 2)
+    S = q[:, None, None] * H[:, :, :1] @ np.conj(np.swapaxes(H[:, :, :1], 1, 2))
+    S = S + np.diag([1e-4, 1e-6, 1e-6])
+    rng = np.random.default_rng(0)
+    white = (rng.standard_normal((2, 2, f.size, 3)) * [[[[1.0]]], [[[1j]]]]).sum(axis=0) / 2**0.5
+    errors = [np.einsum("kij,kj->ki", np.linalg.cholesky(S), v) for v in white]
+
+    def sizes(W: np.ndarray) -> np.ndarray:
+        """Of the whitened errors' true covariance, over the lowest 10 Hz; ones are right."""
+        covariance = (W @ S @ np.conj(np.swapaxes(W, 1, 2)))[: round(10.0 * N * DT)]
+        return np.linalg.eigvalsh(covariance)
+
+    by, plain = (
+        sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0]),
+        sizes(whitening_of(smoothed(errors))[0]),
+    )
+    assert np.mean(by) == pytest.approx(1.0, abs=0.1)
+    assert np.quantile(by, 0.99) < 1.6
+    assert np.quantile(plain, 0.99) > 4.0
+
+
+def one_run(of_file, seed: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Errors in stated standard deviations, in gusts and without any feedback."""
+    rng = np.random.default_rng(seed)
+    Ad, Bd = discrete([[0, 1], [0, -2.0]], [[0], [20.0]])
+    u = np.repeat(rng.uniform(-0.05, 0.05, N), rng.integers(15, 75, N))[:N]
+    disturbance = gust(rng, 0.5) * DT
+    x, y = np.zeros(2), np.zeros((N, 2))
+    for k in range(N):
+        y[k] = x
+        x = Ad @ x + Bd[:, 0] * u[k] + [0.0, disturbance[k]]
+    y = y + 0.003 * rng.standard_normal(y.shape)
+    flight = Flight(
+        dt=DT,
+        inputs={"lat": u},
+        outputs={"phi": y[:, 0], "p": y[:, 1]},
+        hold={"lat": "zero-order"},
+    )
+    free = {n: Free(1.2 * v) for n, v in TRUTH.items()}
+    params = of_file.vehicle().params
+    off = Nuisance(input_offset=False)
+    found = fit(Problem(of_file.model, params, [flight], free, off, method="frequency-error"))
+    each = found.estimates.items()
+    return np.array([(e.value - TRUTH[n]) / e.sd for n, e in each]), found.untrusted
+
+
+@pytest.mark.slow
+def test_intervals_of_an_angle_and_its_rate_hold_in_gusts(tmp_path):
+    (tmp_path / "roll.yaml").write_text(ROLL)
+    of_file = linear_model(tmp_path / "roll.yaml")
+    runs = [one_run(of_file, seed) for seed in range(24)]
+    z = np.array([z for z, _ in runs])
+    assert np.sqrt(np.mean(z**2)) < 1.3
+    assert np.mean(np.abs(z) < 1.96) > 0.85
+    assert not any(doubted for _, doubted in runs)
+
+
+def test_a_closed_loop_is_said_only_of_inputs_without_an_instrument():
+    moved = {"Mm": Moved(0.0, 0.6), "Ll": Moved(2.0, 0.1), "Lp": Moved(0.0, 0.0)}
+    loops = [Feedback("one", n, "p", 0.3, (0.1, 0.1), 1e-6) for n in ("lat", "lon")]
+    assert untrusted(moved, Loop(loops)) == ("Mm", "Ll")
+    assert untrusted(moved, Loop(loops, ("lat", "lon"))) == ()
+    assert feedback_trust_notes(moved, Loop(loops, ("lat", "lon"))) == []
+    [note] = feedback_trust_notes({"Mm": moved["Mm"]}, Loop(loops, ("lat",)))
+    assert note.startswith("Closed loop without an instrument for lon: ")
+    # However coherent the residual is with the response: no loop was found.
+    open_loop = [one._replace(p_value=0.5) for one in loops]
+    assert untrusted(moved, Loop(open_loop)) == ()
+    assert feedback_trust_notes(moved, Loop(open_loop)) == []
+    [note] = feedback_trust_notes(moved, Loop(open_loop, held=True))
+    assert "somebody holds the machine): this fit cannot be trusted on Mm, Ll." in note
