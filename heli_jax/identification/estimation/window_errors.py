@@ -19,7 +19,7 @@ from heli_jax.identification.estimation.bounded_solution import (
 )
 from heli_jax.identification.estimation.linear_machine import machine_of
 from heli_jax.identification.estimation.response_weights import ResponseWeights
-from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns
+from heli_jax.identification.unknowns.layout import Data, Layout, Unknowns, unpack
 
 
 def rows_of_responses(
