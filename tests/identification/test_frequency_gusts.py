@@ -63,13 +63,13 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
         covariance = (W @ S @ np.conj(np.swapaxes(W, 1, 2)))[: round(10.0 * N * DT)]
         return np.linalg.eigvalsh(covariance)
 
-    by, plain = (
-        sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0]),
-        sizes(whitening_of(smoothed(errors))[0]),
-    )
+    by = sizes(whitening_by(Machine(Ad, np.eye(3)), errors)[0])
+    plain = sizes(whitening_of(smoothed(errors))[0])
     assert np.mean(by) == pytest.approx(1.0, abs=0.1)
-    assert np.quantile(by, 0.99) < 1.6
-    assert np.quantile(plain, 0.99) > 4.0
+    # What an integration shows twice is known far better than a mean over lines has it.
+    assert np.quantile(by, [0.0, 0.01, 0.99, 1.0]) == pytest.approx([0.4, 0.7, 1.2, 1.2], abs=0.2)
+    assert np.quantile(plain, 0.01) < 0.02
+    assert np.max(plain) > 2.0
 
 
 def one_run(of_file, seed: int) -> tuple[np.ndarray, tuple[str, ...]]:

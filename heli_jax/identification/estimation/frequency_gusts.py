@@ -43,7 +43,7 @@ _CELLS = 0.16, 6.0
 modes are no wider, and from there on 4 % of the frequency"""
 _OCTAVES = 2
 """from one corner of the gusts' spectra to the next"""
-_STEPS = 8
+_STEPS = 24
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
@@ -183,7 +183,8 @@ def _described(
     q = np.tile(room[:, None] / len(shapes), (1, len(shapes)))
     r = np.maximum(0.3 * np.median(own, axis=0), _NOTHING)
     ends = np.conj(np.swapaxes(cells.H, 1, 2))
-    for _ in range(_STEPS):
+    # One output has no coherence with another that would have to be right.
+    for _ in range(_STEPS if own.shape[1] > 1 else _STEPS // 4):
         # Without the root that would make sure that each step gains: half as many are enough.
         inverse = np.linalg.inv(_spectrum(cells.H, q @ shapes, r))
         seen = inverse @ cells.power @ inverse
