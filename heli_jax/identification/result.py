@@ -147,11 +147,11 @@ class Fit:
     """by flight and input, whether it follows the response"""
     moved_by_feedback: Mapping[str, Moved] = field(default_factory=dict)
     """frequency error without an instrument: by parameter what feedback may have done to it"""
-    held_upright: bool = False
-    """frequency error: whether the model is unstable and the record does not grow, so that somebody
-    closes a loop even where no input was found to follow the response"""
     weak_instrument: tuple[str, ...] = ()
     """the parameters of which an instrument tells too little"""
+    held_upright: bool = False
+    """in frequency: whether the model is unstable and the record does not grow, so that somebody
+    closes a loop even where no input was found to follow the response"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
     seed: int = 0

@@ -115,14 +115,15 @@ def _of_responses(at: Solution) -> dict[str, Moved]:
     """The same of fitted responses: how much of the inputs feedback may have brought in."""
     layout, data, noise, z = at
     w, density = noise.whitening.windows, np.asarray(noise.whitening.density)
-    if w.instruments:
+    direct = np.array([n not in w.instruments for n in w.inputs])
+    if not direct.any():
         return {}
     # A method of the estimator: its module stands above this one in the order of imports.
     E = np.asarray(layout.estimator.errors_in_windows(layout, data, noise, z))
     joint = np.concatenate([np.asarray(w.U), np.asarray(w.Y)], axis=2)
     S = np.einsum("wka,wkb->kab", joint, np.conj(joint)) / len(joint)
     See = np.einsum("wka,wkb->kab", E, np.conj(E)) / len(E)
-    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See)
+    room = _room(np.linalg.inv(np.linalg.cholesky(density)), S, See, direct)
     by_line = information_by_line(at)
     may_be = mean_share(by_line.sum(axis=0))(np.einsum("k,kab->ab", room, by_line))
     return {n: Moved(0.0, float(m)) for n, m in zip(layout.of_interest, may_be, strict=True)}
@@ -149,7 +150,7 @@ def held_upright(at: Solution) -> bool:
         at: where the fit ended.
     """
     layout, data, *_, z = at
-    if not layout.estimator.by_instrument:
+    if not layout.estimator.by_instrument or layout.estimator.fits_responses:
         return False
     rate = float(np.log(np.max(np.abs(np.linalg.eigvals(machine_of(layout, data, z).Ad)))))
     for names, flight in zip(layout.outputs, data.flights, strict=True):
@@ -259,14 +260,15 @@ def _room_for_feedback(lines: _Lines) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency the part of the input that a constant gain may have brought in."""
     joint = [np.concatenate(v, axis=1) for v in zip(lines.inputs, lines.measured, strict=True)]
     spectra = (lines.W, smoothed(joint, _PART), smoothed(lines.errors, _PART))
-    return [_room(*of_record, lines.direct) for of_record in zip(*spectra, strict=True)]
+    direct = np.array(lines.direct)
+    return [_room(*of_record, direct) for of_record in zip(*spectra, strict=True)]
 
 
 def _room(
-    W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: Sequence[bool] | None = None
+    W: np.ndarray, S: np.ndarray, See: np.ndarray, direct: np.ndarray
 ) -> Float[np.ndarray, " k"]:
     """By frequency the same, of the whitening, the spectra of inputs and outputs together, and
-    those of the residual; of the inputs `direct`, all unless given."""
+    those of the residual; of the inputs that are taken directly."""
     m = S.shape[1] - See.shape[1]
     e, u = (np.real(np.einsum("kii->ki", v)) for v in (See, S[:, :m, :m]))
     u = np.where(u > 0, u, 1e-300)
@@ -278,8 +280,7 @@ def _room(
     # Each input by what it does: one that hardly acts moves no estimate.
     H = np.swapaxes(np.linalg.pinv(S[:, :m, :m], rcond=1e-9, hermitian=True) @ S[:, :m, m:], 1, 2)
     effect = np.sum(np.abs(W @ np.conj(H)) ** 2, axis=1) * u
-    of = np.ones(m, bool) if direct is None else np.asarray(direct)
-    room, effect = room[:, of], effect[:, of]
+    room, effect = room[:, direct], effect[:, direct]
     return np.sum(room * effect, axis=1) / np.maximum(np.sum(effect, axis=1), 1e-300)
 
 

@@ -1,4 +1,4 @@
-"""Machines that remember longer than a window or than a record's lines tell, against NumPy."""
+"""Machines that remember longer than a window, against NumPy."""
 
 import jax.numpy as jnp
 import numpy as np
