@@ -595,7 +595,10 @@ def test_a_real_record(tmp_path, capsys, flybar_free):
     code = main(["fit", str(path), "--out", str(tmp_path / "run")])
     result = json.loads((tmp_path / "run" / "fit.json").read_text())
     assert result["metrics"]["roll_rate"]["vaf"] >= 0.97
-    assert -0.25 < result["nuisance"]["time_shift"]["value"] < -0.05
+    # With the flybar's inertia free, which a moderate record hardly tells from a delay, no number.
+    shift = result["nuisance"]["time_shift"]
+    assert (shift["value"] is None) == (shift["sd"] is None)
+    assert flybar_free or -0.25 < shift["value"] < -0.05
     assert not result["residuals"]["white"]
     if flybar_free:
         assert code in (0, 3)

@@ -201,7 +201,7 @@ def test_nothing_imports_the_command_line(name):
                 "flights/convert.py",
                 "exports.py",
                 "simulation/trajectory.py",
-                "workflow.py",
+                "sweep_workflow.py",
             },
         ),
         ("pickle", set()),

@@ -35,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the demo's report and figures to the site, below made/."""
     made = _made()
     for path in sorted(made.rglob("*")):
-        if path.suffix in (".svg", ".html"):
+        if path.suffix in (".svg", ".png", ".html", ".yaml", ".json", ".csv"):
             place = f"made/{path.relative_to(made).as_posix()}"
             files.append(File.generated(config, place, abs_src_path=str(path)))
     return files
