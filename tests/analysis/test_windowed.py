@@ -111,7 +111,7 @@ def test_noise_and_its_correlation_are_found_whatever_the_inputs_explain():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (ResponseOptions(window=400.0), "averages"),
+        (ResponseOptions(window=400.0), "too short for a window"),
         (ResponseOptions(window=5.0, band=(0.1, 2.0)), "at least one period in a window of 5 s"),
         (ResponseOptions(window=5.0, band=(0.5, 11.0)), "below half the rate of 20 Hz"),
         (ResponseOptions(window=5.0, band=(0.41, 0.45)), "holds a line of the window"),
