@@ -25,6 +25,7 @@ def run(folder, *arguments):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_skeleton_passes_its_own_test(tmp_path, capsys):
     assert main(["new-model", "swing", "--out", str(tmp_path / "swing")]) == 0
     said = capsys.readouterr()
