@@ -226,6 +226,7 @@ def test_a_log_too_slow_for_the_machine_is_refused_in_words():
     assert verdicts == {5: "ok", 16: "doubt", 31: "refuse"}
 
 
+@pytest.mark.slow
 def test_a_missing_output_costs_what_the_fit_with_it_would_gain():
     f = flight(0)
     without = problem(f)

@@ -71,6 +71,7 @@ def test_a_method_of_ones_own_goes_all_the_way(differences, tmp_path):
     assert "least squares on differences" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_three_parameters_are_no_more_identifiable_by_another_method(differences):
     free = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0)}
     problem = Problem(

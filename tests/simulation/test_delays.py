@@ -241,6 +241,7 @@ def test_noise_is_drawn_beside_delays(run, machine):
     np.testing.assert_allclose(moved, still, rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [None, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_delays_are_found_beside_the_parameters(run, window):
     """In one piece and in windows, whose inputs begin before them."""
