@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from heli_jax import naming
 from heli_jax.dynamics.check_model import explained
@@ -20,7 +20,7 @@ from heli_jax.simulation.blocks import without_next
 from heli_jax.simulation.delays import at
 from heli_jax.simulation.discretize import Discrete, scalars
 from heli_jax.simulation.hold import FlightOrInputs, linear_inputs
-from heli_jax.simulation.options import DEFAULT
+from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.solvers import ZeroOrderHoldArgs, acting_at, advance, dot
 from heli_jax.simulation.stepping import (
     check_countable,
@@ -104,6 +104,87 @@ def accumulated(
     """
     # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
     options = keywords.pop("options", DEFAULT).changed(keywords)
+    reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
+    _, args, _, _ = run
+    block = options.block
+    if block != 1 and (args.discrete is None or block < 1):
+        raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
+    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
+    # inputs, since a block's coefficients know no sample before its first.
+    if block > 1 and reducer.limits is None and args.delays is None:
+        value, state = _in_blocks(reducer, args, block, x0, start, data)
+        return Accumulated(value, state, {}, dfx.RESULTS.successful)
+    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
+    steps = _by_samples(reducer, run, x0, start, data)
+    dtype = jax.tree.leaves(x0)[0].dtype
+    sol = dfx.diffeqsolve(
+        steps.term,
+        steps.solver,
+        t0=jnp.zeros((), dtype),
+        t1=jnp.asarray(steps.samples - 1, dtype),
+        dt0=jnp.ones((), dtype),
+        y0=steps.carry,
+        args=steps.args,
+        saveat=dfx.SaveAt(
+            t1=True
+        ),  # the end alone: what a large batch has no memory for is the rest
+        max_steps=steps.samples - 1,
+        adjoint=adjoint,
+        throw=False,
+    )
+    carry = jax.tree.map(lambda v: v[0], sol.ys)
+    return steps.last(carry)._replace(result=sol.result)
+
+
+def sample_by_sample(
+    model: Model,
+    params: Record,
+    flight: FlightOrInputs,
+    update: Callable[[Any, Any, Any], Any],
+    start: PyTree,
+    *,
+    data: PyTree = (),
+    limits: bool = False,
+    options: SimulationOptions = DEFAULT,
+) -> "Samples":
+    """What `accumulated` does at each sample, for a loop that somebody else makes.
+
+    Args and exceptions are those of `accumulated`; `options.block` does not count.
+    """
+    reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
+    return _by_samples(reducer, run, x0, start, data)
+
+
+class Samples(NamedTuple):
+    """A run in its steps."""
+
+    solver: dfx.AbstractSolver
+    term: dfx.ODETerm
+    args: Any
+    carry: PyTree
+    """before the first sample: the State, the value and the limits left"""
+    samples: int
+    last: Callable[[PyTree], Accumulated]
+    """what is left of the run, from the carry at the last sample, of which nothing is counted yet"""
+
+    def step(self, carry: PyTree, k: Int[Array, ""]) -> PyTree:
+        """The carry a sample after the k-th."""
+        t = k.astype(jax.tree.leaves(carry)[0].dtype)
+        return self.solver.step(self.term, t, t + 1.0, carry, self.args, None, False)[0]
+
+
+type _Stepping = tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm, tuple[bool, ...]]
+
+
+def _prepared(
+    model: Model,
+    params: Record,
+    flight: FlightOrInputs,
+    update: Callable[[Any, Any, Any], Any],
+    limits: bool,
+    options: SimulationOptions,
+) -> "tuple[_Reducer, _Stepping, Record]":
+    """What is done at a sample, how it is stepped from one to the next, and the first State."""
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")
@@ -111,17 +192,8 @@ def accumulated(
     inputs, dt = held_inputs(model, flight, options.dt)
     x0 = start_state(model, params, options.initial_state, inputs)
     run = per_sample(model, params, inputs, options._replace(dt=dt), linear)
-    block = options.block
-    if block != 1 and (run[1].discrete is None or block < 1):
-        raise ValueError(f"block must be 1, or more with solver='exact', got {block}")
-    # Limits are looked at sample by sample, so they take the way of one step a sample; so do late
-    # inputs, since a block's coefficients know no sample before its first.
     reducer = _Reducer(model, params, update, model.limits if limits else None)
-    if block > 1 and reducer.limits is None and run[1].delays is None:
-        value, state = _in_blocks(reducer, run[1], block, x0, start, data)
-        return Accumulated(value, state, {}, dfx.RESULTS.successful)
-    adjoint = dfx.DirectAdjoint() if options.adjoint is None else options.adjoint
-    return _by_samples(reducer, (*run, linear), x0, start, data, adjoint)
+    return reducer, (*run, linear), x0
 
 
 class _Reducer(NamedTuple):
@@ -142,13 +214,8 @@ class _Reducer(NamedTuple):
 
 
 def _by_samples(
-    reducer: _Reducer,
-    run: tuple[dfx.AbstractSolver, ZeroOrderHoldArgs, dfx.ODETerm, tuple[bool, ...]],
-    x0: Record,
-    start: PyTree,
-    data: PyTree,
-    adjoint: dfx.AbstractAdjoint,
-) -> Accumulated:
+    reducer: _Reducer, run: _Stepping, x0: Record, start: PyTree, data: PyTree
+) -> Samples:
     """The run one step a sample."""
     method, args, term, linear = run
     model, params, inputs = reducer.model, reducer.params, args.inputs
@@ -166,27 +233,18 @@ def _by_samples(
         # Numbers, since diffrax counts with all that it carries: 1 from where the range is left on.
         names = reducer.limits(params, x0, at(inputs, 0))
         outside = dict.fromkeys(names, jnp.zeros((), dtype))
-    sol = dfx.diffeqsolve(
-        term,
-        # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
-        Accumulating(method, lambda *now: reducer(*now), linear),
-        t0=jnp.zeros((), dtype),
-        t1=jnp.asarray(n - 1, dtype),
-        dt0=jnp.ones((), dtype),
-        y0=(x0, (start, outside)),
-        args=(args, data),
-        saveat=dfx.SaveAt(
-            t1=True
-        ),  # the end alone: what a large batch has no memory for is the rest
-        max_steps=n - 1,
-        adjoint=adjoint,
-        throw=False,
-    )
-    state, carried = jax.tree.map(lambda v: v[0], sol.ys)
-    # The solver updates the value before each step, so the last sample is left.
-    last = acting_at(args, n - 1, linear)
-    value, outside = reducer(carried, state, last, at(data, n - 1))
-    return Accumulated(value, state, {n: v > 0 for n, v in outside.items()}, sol.result)
+
+    def last(carry: PyTree) -> Accumulated:
+        # The solver updates the value before each step, so the last sample is left.
+        state, carried = carry
+        now = acting_at(args, n - 1, linear)
+        value, left = reducer(carried, state, now, at(data, n - 1))
+        left = {name: v > 0 for name, v in left.items()}
+        return Accumulated(value, state, left, dfx.RESULTS.successful)
+
+    # A function of its own: diffrax compares solvers, and a record of tracers has no hash.
+    solver = Accumulating(method, lambda *now: reducer(*now), linear)
+    return Samples(solver, term, (args, data), (x0, (start, outside)), n, last)
 
 
 class _Block(NamedTuple):

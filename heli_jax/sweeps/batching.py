@@ -16,6 +16,7 @@ from heli_jax.sweeps.program import Program, arguments, shapes
 from heli_jax.sweeps.spec import Job
 from heli_jax.sweeps.worker import BLOCKS, Split
 
+BACKENDS = ("auto", "xla", "fused")
 # Elements side by side where nothing is measured: on a core a few vectors of them, so that their
 # states stay in its cache; on a GPU enough for all its threads.
 _CPU, _GPU = 64, 1 << 17
@@ -41,6 +42,7 @@ def split_for(
     devices: Sequence[Any] | None = None,
     chunk: int | None = None,
     lanes: int | None = None,
+    backend: str = "auto",
     shares: int = 1,
     memory: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
@@ -53,21 +55,49 @@ def split_for(
         devices: of JAX; those of this process unless given.
         chunk: elements written at a time; taken as it is where it is given.
         lanes: elements computed side by side on a device; likewise.
+        backend: "xla", "fused" (a run as one program of machine code, on CPUs), or "auto": fused
+            where it can be.
         shares: how many processes take chunks side by side; each shall have several.
         memory: a file that keeps what was measured.
-        say: called with a sentence where measuring takes a while.
+        say: called with a sentence where measuring takes a while, or a run has no fused program.
+
+    Raises:
+        ValueError: no such backend, or fused where it cannot be.
     """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
     devices = tuple(jax.local_devices() if devices is None else devices)
     kind = "cpu" if devices[0].platform == "cpu" else "gpu"
     share = math.ceil(job.design.size / len(devices))
+    asked = lanes
     if lanes is None:
         # A small sweep still has BLOCKS blocks a device, or XLA would write other code for it.
         lanes = min(_default(job, kind), _power(share / BLOCKS))
-        if share > 8 * max(_CANDIDATES[kind]):
-            lanes = _measured(job, devices, kind, lanes, memory, say)
+    chosen = "xla" if backend == "xla" else _fused_or_xla(job, devices, lanes, backend, say)
+    # A fused program has its own number of vehicles in flight.
+    if asked is None and chosen == "xla" and share > 8 * max(_CANDIDATES[kind]):
+        lanes = _measured(job, devices, kind, lanes, memory, say)
     if chunk is None:
         chunk = _chunk_for(job, kind, len(devices), lanes, shares)
-    return Split(chunk, lanes)
+    return Split(chunk, lanes, chosen)
+
+
+def _fused_or_xla(
+    job: Job, devices: tuple[Any, ...], lanes: int, backend: str, say: Callable[[str], None]
+) -> str:
+    if devices[0].platform != "cpu" and backend == "auto":
+        return "xla"
+    # Here, since it loads another compiler.
+    from heli_jax.sweeps.fused_program import refusal
+
+    why = refusal(job, devices, lanes)
+    if why is None:
+        return "fused"
+    if backend == "fused":
+        raise ValueError(f"backend: this sweep cannot be fused: {why}; expected auto or xla")
+    if job.streamed and job.simulated:
+        say(f"each run is computed by XLA step by step, not as one program: {why}")
+    return "xla"
 
 
 def _chunk_for(job: Job, kind: str, n_devices: int, lanes: int, shares: int) -> int:

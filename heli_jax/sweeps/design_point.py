@@ -14,7 +14,7 @@ from heli_jax import naming
 from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
-from heli_jax.simulation.accumulate import accumulated
+from heli_jax.simulation.accumulate import Samples, accumulated, sample_by_sample
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
@@ -111,17 +111,12 @@ def design_point(
         values: of the axes, scalars, SI.
         trim: the steady flight to begin in; None for the model's initial state.
     """
-    model, dtype = plan.model, numbers.dt.dtype
     params, special = _params(plan, numbers, values)
-    state, inputs = _beginning(model, params, numbers, special, trim)
+    state, inputs = _beginning(plan.model, params, numbers, special, trim)
     if trim is not None and numbers.pilot is not None:
         # The gains are those for the vehicle as it is given, the flight is this one's own.
         numbers = numbers._replace(pilot=numbers.pilot._replace(trimmed=trim.state))
-    # From here on the later question wins, so that the order of these steps is the order of
-    # importance.
-    status = jnp.asarray(OK)
-    results: Scalars = {}
-    kept: dict[str, jax.Array] = {}
+    run = None
     if plan.simulated:
         # Streamed wherever that is possible: a run is then never held, and a device has room for
         # more of them.
@@ -129,6 +124,64 @@ def design_point(
             run = _streamed(plan, numbers, params, state, inputs)
         else:
             run = _whole(plan, numbers, params, state, inputs, special)
+    return _concluded(plan, numbers, values, trim, run)
+
+
+def samples_of(
+    plan: Plan, numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None
+) -> Samples:
+    """The run of one element in its steps, for a plan that is streamed; arguments as
+    `design_point` has them."""
+    params, special = _params(plan, numbers, values)
+    state, inputs = _beginning(plan.model, params, numbers, special, trim)
+    update, start, data = _streaming(plan, numbers)
+    return sample_by_sample(
+        plan.model,
+        params,
+        inputs,
+        update,
+        start,
+        data=data,
+        limits=True,
+        options=plan.simulation(dt=numbers.dt, initial_state=state),
+    )
+
+
+def of_samples(
+    plan: Plan,
+    numbers: FlightNumbers,
+    values: Scalars,
+    trim: InitialTrim | None,
+    reduced: tuple[Any, Any, dict[str, Any]],
+) -> ElementResults:
+    """The element of which `samples_of` gave the steps.
+
+    Args:
+        plan, numbers, values, trim: as `design_point` has them.
+        reduced: the running values after the last sample, the State there, and by name whether a
+            limit was left.
+    """
+    value, state, outside = reduced
+    n = jax.tree.leaves(numbers.inputs)[0].shape[0]
+    results = _finished(plan, numbers, value, n)
+    return _concluded(plan, numbers, values, trim, (results, {}, state, list(outside.values())))
+
+
+def _concluded(
+    plan: Plan,
+    numbers: FlightNumbers,
+    values: Scalars,
+    trim: InitialTrim | None,
+    run: _Run | None,
+) -> ElementResults:
+    """Results and status, from what is left of the run."""
+    model, dtype = plan.model, numbers.dt.dtype
+    # From here on the later question wins, so that the order of these steps is the order of
+    # importance.
+    status = jnp.asarray(OK)
+    results: Scalars = {}
+    kept: dict[str, jax.Array] = {}
+    if run is not None:
         results, kept, last, outside = run
         for left in outside:
             status = jnp.where(left, OUT_OF_RANGE, status)
@@ -143,6 +196,8 @@ def design_point(
     if any(r.how in reducers.LINEAR for _, r in plan.reduce):
         # Eigenvalues and margins are made of these by NumPy after the chunk, in float64 whatever
         # the device.
+        params, special = _params(plan, numbers, values)
+        state, inputs = _beginning(model, params, numbers, special, trim)
         at_start = jax.tree.map(lambda u: u[0], inputs)
         matrices = jacobians(model, params, state, at_start)
     results = {n: jnp.asarray(v, dtype) for n, v in results.items()}

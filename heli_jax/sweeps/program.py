@@ -66,14 +66,40 @@ def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, An
     """The functions that compute steady flights and elements on some devices, and how what is
     mapped is shared among these."""
     # Remembered, since every flight of a sweep and every sweep of the same plan asks for it.
-    mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
-    split = PartitionSpec("device")
+    run, split = spread(functools.partial(design_point, plan), devices, lanes)
+    return trims_of(plan, lanes), run, split
 
-    def part(numbers: FlightNumbers, mapped: Any) -> ElementResults:
-        return _batched(lambda m: design_point(plan, numbers, *m), mapped, lanes)
+
+def trims_of(plan: Plan, lanes: int) -> Any:
+    """The function of (numbers, values of the axes) that gives the steady flights in which elements
+    begin; None where they do not."""
 
     def starts(numbers: FlightNumbers, values: Scalars) -> InitialTrim:
         return _batched(functools.partial(steady, plan, numbers), values, lanes)
+
+    # Apart, since lineax does not work within shard_map.
+    return None if plan.trimmed is None else jax.jit(starts)
+
+
+def spread(
+    function: Callable[..., Any], devices: tuple[Any, ...], lanes: int
+) -> tuple[Any, jax.sharding.NamedSharding]:
+    """A function of elements, compiled for many of them.
+
+    Args:
+        function: of the numbers of a flight and of what an element has of its own.
+        devices: among which the elements are cut.
+        lanes: elements side by side on each.
+
+    Returns:
+        The function of the numbers and of a tuple of arrays with an element a row, and how those
+        rows lie on the devices.
+    """
+    mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
+    split = PartitionSpec("device")
+
+    def part(numbers: FlightNumbers, mapped: Any) -> Any:
+        return _batched(lambda m: function(numbers, *m), mapped, lanes)
 
     options = _CPU_OPTIONS if devices[0].platform == "cpu" else None
     # Each device runs the program of its own part, as it would alone: how many there are changes no
@@ -84,9 +110,7 @@ def _compiled(plan: Plan, devices: tuple[Any, ...], lanes: int) -> tuple[Any, An
         ),
         compiler_options=options,
     )
-    # Apart, since lineax does not work within shard_map.
-    before = None if plan.trimmed is None else jax.jit(starts)
-    return before, run, jax.sharding.NamedSharding(mesh, split)
+    return run, jax.sharding.NamedSharding(mesh, split)
 
 
 class Program:
@@ -100,12 +124,17 @@ class Program:
     def __call__(self, values: dict[str, np.ndarray], size: int) -> ElementResults:
         """Begin to compute a chunk of values (k,), filled up to `size` elements; arrays (size,)
         that JAX may still be computing."""
-        # The last chunk of a sweep is filled up with its last element: a program of its own size
-        # would be compiled for it alone, and might give other digits.
-        size = -(-size // self._step) * self._step
-        filled = {n: np.pad(v, (0, size - v.size), mode="edge") for n, v in values.items()}
+        filled = filled_up(values, size, self._step)
         trims = None if self._trims is None else self._trims(self._numbers, filled)
         return self._run(self._numbers, jax.device_put((filled, trims), self._split))
+
+
+def filled_up(values: dict[str, np.ndarray], size: int, step: int) -> dict[str, np.ndarray]:
+    """The values of a chunk, as many as whole steps of it have."""
+    # The last chunk of a sweep is filled up with its last element: a program of its own size
+    # would be compiled for it alone, and might give other digits.
+    size = -(-size // step) * step
+    return {n: np.pad(v, (0, size - v.size), mode="edge") for n, v in values.items()}
 
 
 def _batched(function: Callable[[Any], Any], mapped: Any, lanes: int) -> Any:

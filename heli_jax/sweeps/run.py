@@ -52,6 +52,9 @@ class Options(NamedTuple):
     """elements written at a time; chosen unless given"""
     lanes: int | None = None
     """elements computed side by side on a device; measured unless given"""
+    backend: str = "auto"
+    """what computes a run over time: "xla" step by step, "fused" as one program of machine code (on
+    CPUs), or "auto", fused where it can be"""
     devices: Sequence[Any] | None = None
     """of this process: all unless given"""
     client: Any = None
@@ -85,7 +88,8 @@ def sweep(
         reduce: by name, what is kept of each run.
         out: a directory for sweep.zarr and summary.json; in memory unless given.
         **options: fields of `RunOptions`: solver, substeps, precision, trajectories, trimmed,
-            pilot; and of `Options`: resume, chunk, lanes, devices, client, progress.
+            pilot; and of `Options`: resume, chunk, lanes, backend, devices, client,
+            progress.
 
     Returns:
         A Dataset over `element`, with axes and `status` as coordinates.
@@ -205,7 +209,8 @@ def _cut(job: Job, options: Options, words: dict[str, Any]) -> tuple[Split, dict
             raise ValueError(f"{name} must be at least 1, got {number}")
     # More lanes than elements would fill the memory with copies of the last one.
     lanes = None if options.lanes is None else min(options.lanes, job.design.size)
-    asked = {"chunk": options.chunk, "lanes": lanes, "memory": options.memory}
+    asked = {"chunk": options.chunk, "lanes": lanes, "backend": options.backend}
+    asked["memory"] = options.memory
     if options.client is not None:
         from heli_jax.sweeps.cluster import split_there
 
@@ -228,6 +233,11 @@ def _same_cut(store: stores.Store, job: Job, options: Options, where: str) -> No
             raise InputError(
                 f"{where}: was begun with {name} {kept}, expected the same, got {number}"
             )
+    if options.backend not in ("auto", store.split.backend):
+        raise InputError(
+            f"{where}: was begun with backend {store.split.backend}, expected the same or auto, "
+            f"got {options.backend}"
+        )
 
 
 def _compute(job: Job, store: stores.Store, done: np.ndarray, options: Options) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 import functools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -54,6 +55,9 @@ class Split(NamedTuple):
     """elements written at a time"""
     lanes: int
     """elements computed side by side on a device"""
+    backend: str = "xla"
+    """what computes a run over time: "xla", or "fused", one program of machine code for the whole
+    run"""
 
     def chunks(self, size: int) -> int:
         """How many chunks a sweep of so many elements has."""
@@ -182,8 +186,8 @@ class Pending(NamedTuple):
     stop: int
     columns: dict[str, np.ndarray]
     """values of the axes, (stop - start,)"""
-    by_flight: tuple[ElementResults, ...]
-    """of arrays with the filled chunk's size, which JAX may still be computing"""
+    by_flight: tuple[Callable[[], ElementResults], ...]
+    """what gives arrays with the filled chunk's size, which JAX may still be computing"""
 
 
 class Worker:
@@ -195,9 +199,16 @@ class Worker:
         # Fewer where a chunk has no BLOCKS blocks for each: the others would compute copies.
         used = max(1, min(len(devices), split.chunk // (BLOCKS * split.lanes)))
         self.devices = tuple(devices[:used])
+        kind = Program
+        if split.backend == "fused":
+            # Here, since XLA alone needs no other compiler.
+            from heli_jax.sweeps.fused_program import FusedProgram
+
+            kind = FusedProgram
         self._programs = [
-            Program(job, i, self.devices, split.lanes) for i in range(len(job.flights))
+            kind(job, i, self.devices, split.lanes) for i in range(len(job.flights))
         ]
+        self._beside = ThreadPoolExecutor(1)
 
     def begin(self, chunk: int) -> Pending:
         """Set the devices to work on a chunk; `finish` waits for it."""
@@ -206,16 +217,17 @@ class Worker:
         stop = min(start + self.split.chunk, self.job.design.size)
         columns = self.job.design.values(start, stop)
         values = arguments(self.job, columns)
-        return Pending(
-            start, stop, columns, tuple(p(values, self.split.chunk) for p in self._programs)
-        )
+        # In a thread beside: JAX returns before it has computed, other programs do not.
+        begun = [self._beside.submit(p, values, self.split.chunk) for p in self._programs]
+        return Pending(start, stop, columns, tuple(f.result for f in begun))
 
     def finish(self, pending: Pending) -> dict[str, np.ndarray]:
         """The chunk's variables, arrays (stop - start, ...)."""
         count = pending.stop - pending.start
         # Without the elements that the last chunk was filled up with.
-        by_flight = jax.tree.map(lambda v: np.asarray(v)[:count], pending.by_flight)
-        parts = [self._results(computed) for computed in by_flight]
+        computed = [result() for result in pending.by_flight]
+        by_flight = jax.tree.map(lambda v: np.asarray(v)[:count], computed)
+        parts = [self._results(of_flight) for of_flight in by_flight]
         results = parts[0]
         if len(parts) > 1:
             results = {n: np.stack([p[n] for p in parts], axis=1) for n in results}

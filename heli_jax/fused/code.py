@@ -1,0 +1,185 @@
+"""LLVM assembly, written line by line: scalars that all vehicles share, and vectors over vehicles."""
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+
+class UnsupportedError(Exception):
+    """An operation that has no translation; in words what it is."""
+
+
+class Value(NamedTuple):
+    """A number of the program."""
+
+    operand: str
+    """a register such as %7, or a constant"""
+    dtype: np.dtype
+    shared: bool
+    """the same for all vehicles: a scalar, no vector"""
+
+
+_TYPES = {
+    "float64": "double",
+    "float32": "float",
+    "int64": "i64",
+    "int32": "i32",
+    "uint64": "i64",
+    "uint32": "i32",
+    "uint8": "i8",
+    "bool": "i1",
+}
+
+
+def type_of(dtype: np.dtype) -> str:
+    """LLVM's name of a type.
+
+    Raises:
+        UnsupportedError: it has none here, as a complex number.
+    """
+    if str(dtype) not in _TYPES:
+        raise UnsupportedError(f"numbers of type {dtype}")
+    return _TYPES[str(dtype)]
+
+
+def constant(value: float | bool | np.generic, dtype: np.dtype) -> Value:
+    """A number that is known when the program is written."""
+    dtype = np.dtype(dtype)
+    if dtype == np.bool_:
+        return Value("true" if value else "false", dtype, True)
+    if dtype.kind in "iu":
+        return Value(str(int(value)), dtype, True)
+    type_of(dtype)
+    # In hexadecimal digits of a double for both precisions: no digit is lost, and what is not
+    # finite has them too.
+    (bits,) = struct.unpack("<Q", struct.pack("<d", float(np.asarray(value, dtype))))
+    return Value(f"0x{bits:016X}", dtype, True)
+
+
+class Code:
+    """Lines of one function, in the order in which they are run.
+
+    Every loop is entered at least once and left at its end alone, so that what was written before
+    stands for all that comes after.
+    """
+
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        self.lines: list[str] = []
+        self.block = "entry"
+        self.declared: dict[str, str] = {}
+        self.globals: dict[str, str] = {}
+        self._count = 0
+        self._spread: dict[tuple[str, str], str] = {}
+
+    def register(self) -> str:
+        """A name that is new."""
+        self._count += 1
+        return f"%v{self._count}"
+
+    def write(self, line: str) -> None:
+        """A line as it is."""
+        self.lines.append(f"  {line}")
+
+    def made(self, right: str, dtype: np.dtype, shared: bool) -> Value:
+        """The value of an instruction."""
+        name = self.register()
+        self.write(f"{name} = {right}")
+        return Value(name, np.dtype(dtype), shared)
+
+    def begin(self, kind: str) -> str:
+        """A new block of lines, by its name; the one before has to end with a branch to it."""
+        self._count += 1
+        self.block = f"{kind}{self._count}"
+        return self.block
+
+    def label(self, name: str) -> None:
+        """Here begins a block."""
+        self.block = name
+        self.lines.append(f"{name}:")
+
+    def typed(self, dtype: np.dtype, shared: bool) -> str:
+        """The type of a number, or of one a vehicle."""
+        kind = type_of(np.dtype(dtype))
+        return kind if shared else f"<{self.lanes} x {kind}>"
+
+    def of(self, value: Value, shared: bool) -> str:
+        """The operand for a shared number or, spread over the vehicles, for one each."""
+        if shared or not value.shared:
+            return value.operand
+        kind = type_of(value.dtype)
+        if not value.operand.startswith("%"):
+            return f"splat ({kind} {value.operand})"
+        key = (value.operand, kind)
+        if key not in self._spread:
+            vector = f"<{self.lanes} x {kind}>"
+            first = self.register()
+            self.write(f"{first} = insertelement {vector} poison, {kind} {value.operand}, i64 0")
+            name = self.register()
+            mask = f"<{self.lanes} x i32> zeroinitializer"
+            self.write(f"{name} = shufflevector {vector} {first}, {vector} poison, {mask}")
+            self._spread[key] = name
+        return self._spread[key]
+
+    def operation(self, name: str, *values: Value) -> Value:
+        """An instruction of operands of one type, such as `fadd contract`."""
+        shared = all(v.shared for v in values)
+        kind = self.typed(values[0].dtype, shared)
+        operands = ", ".join(self.of(v, shared) for v in values)
+        return self.made(f"{name} {kind} {operands}", values[0].dtype, shared)
+
+    def compare(self, name: str, a: Value, b: Value) -> Value:
+        """A truth value, by `fcmp olt` and the like."""
+        return self.operation(name, a, b)._replace(dtype=np.dtype(bool))
+
+    def intrinsic(self, name: str, *values: Value) -> Value:
+        """A function that LLVM knows, such as `sqrt`; of vectors it makes the machine's own, or
+        calls the C library's for each vehicle."""
+        shared = all(v.shared for v in values)
+        kind = self.typed(values[0].dtype, shared)
+        suffix = {"double": "f64", "float": "f32"}.get(type_of(values[0].dtype))
+        suffix = suffix or type_of(values[0].dtype)
+        full = f"@llvm.{name}.{suffix if shared else f'v{self.lanes}{suffix}'}"
+        self.declared[full] = f"declare {kind} {full}({', '.join([kind] * len(values))})"
+        operands = ", ".join(f"{kind} {self.of(v, shared)}" for v in values)
+        return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
+
+    def choose(self, which: Value, yes: Value, no: Value) -> Value:
+        """One of two."""
+        shared = which.shared and yes.shared and no.shared
+        kind = self.typed(yes.dtype, shared)
+        # One truth value for whole vectors is a scalar to LLVM too.
+        of_which = f"i1 {which.operand}" if which.shared else f"<{self.lanes} x i1> {which.operand}"
+        operands = f"{kind} {self.of(yes, shared)}, {kind} {self.of(no, shared)}"
+        return self.made(f"select {of_which}, {operands}", yes.dtype, shared)
+
+    def cast(self, name: str, value: Value, dtype: np.dtype) -> Value:
+        """Another type, by `sitofp` and the like."""
+        source = self.typed(value.dtype, value.shared)
+        target = self.typed(dtype, value.shared)
+        return self.made(f"{name} {source} {value.operand} to {target}", dtype, value.shared)
+
+    def load(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
+        """The element of an array that all vehicles share."""
+        at, kind = self.register(), type_of(np.dtype(dtype))
+        stored = "i8" if kind == "i1" else kind
+        place = f"{type_of(index.dtype)} {index.operand}"
+        self.write(f"{at} = getelementptr {stored}, ptr {pointer}, {place}")
+        value = self.made(f"load {stored}, ptr {at}", np.dtype(dtype), True)
+        if kind != "i1":
+            return value
+        return self.made(f"trunc i8 {value.operand} to i1", np.dtype(dtype), True)
+
+    def table(self, values: np.ndarray) -> str:
+        """A pointer to numbers that are known when the program is written."""
+        kind = type_of(values.dtype)
+        if kind == "i1":
+            kind, values = "i8", values.astype(np.uint8)
+        each = ", ".join(f"{kind} {constant(v, values.dtype).operand}" for v in values.ravel())
+        text = f"private unnamed_addr constant [{values.size} x {kind}] [{each}]"
+        name = next((n for n, t in self.globals.items() if t == text), None)
+        if name is None:
+            name = f"@table{len(self.globals)}"
+            self.globals[name] = text
+        return name

@@ -1,0 +1,237 @@
+"""What the primitives of JAX are in LLVM, for one number of each vehicle at a time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from heli_jax.fused.code import Code, UnsupportedError, Value, constant, type_of
+
+# A product and a sum may become one instruction, as XLA and every C compiler for these machines has
+# it; nothing else is allowed that would change a digit or lose what is not a number.
+_F = "contract"
+
+type Operation = Callable[..., Value]
+"""(code, values, the primitive's parameters) -> value"""
+
+
+def _arithmetic(of_floats: str, of_integers: str) -> Operation:
+    def made(code: Code, *values: Value, **_: Any) -> Value:
+        kind = values[0].dtype.kind
+        if kind == "b":
+            raise UnsupportedError(f"{of_integers} of truth values")
+        return code.operation(f"{of_floats} {_F}" if kind == "f" else of_integers, *values)
+
+    return made
+
+
+def _quotient(code: Code, a: Value, b: Value, **_: Any) -> Value:
+    if a.dtype.kind != "f":
+        raise UnsupportedError("a quotient of integers")
+    return code.operation(f"fdiv {_F}", a, b)
+
+
+def _extreme(of_floats: str, signed: str, unsigned: str) -> Operation:
+    # `maximum` gives what is not a number on, as JAX does; `maxnum` would lose it.
+    def made(code: Code, a: Value, b: Value, **_: Any) -> Value:
+        names = {"f": of_floats, "i": signed, "u": unsigned}
+        if a.dtype.kind not in names:
+            raise UnsupportedError(f"{of_floats} of truth values")
+        return code.intrinsic(names[a.dtype.kind], a, b)
+
+    return made
+
+
+def _comparison(of_floats: str, signed: str, unsigned: str) -> Operation:
+    def made(code: Code, a: Value, b: Value, **_: Any) -> Value:
+        if a.dtype.kind == "f":
+            return code.compare(f"fcmp {of_floats}", a, b)
+        return code.compare(f"icmp {signed if a.dtype.kind == 'i' else unsigned}", a, b)
+
+    return made
+
+
+def _function(name: str) -> Operation:
+    def made(code: Code, *values: Value, **_: Any) -> Value:
+        if values[0].dtype.kind != "f":
+            raise UnsupportedError(f"{name} of integers")
+        return code.intrinsic(name, *values)
+
+    return made
+
+
+def _absolute(code: Code, a: Value, **_: Any) -> Value:
+    if a.dtype.kind == "f":
+        return code.intrinsic("fabs", a)
+    zero = constant(0, a.dtype)
+    return code.choose(
+        code.compare("icmp slt", a, zero), code.operation("sub", zero, a), a
+    )
+
+
+def _negative(code: Code, a: Value, **_: Any) -> Value:
+    if a.dtype.kind == "f":
+        return code.operation("fneg", a)
+    return code.operation("sub", constant(0, a.dtype), a)
+
+
+def _rounded(code: Code, a: Value, *, rounding_method: Any, **_: Any) -> Value:
+    nearest_even = int(rounding_method) == 1
+    return code.intrinsic("roundeven" if nearest_even else "round", a)
+
+
+def _power(code: Code, a: Value, *, y: int, **_: Any) -> Value:
+    if y == 0:
+        return constant(1, a.dtype)
+    result, square, left = None, a, abs(y)
+    while left:
+        if left & 1:
+            result = square if result is None else code.operation(f"fmul {_F}", result, square)
+        left >>= 1
+        if left:
+            square = code.operation(f"fmul {_F}", square, square)
+    assert result is not None
+    return result if y > 0 else code.operation(f"fdiv {_F}", constant(1, a.dtype), result)
+
+
+def _square(code: Code, a: Value, **_: Any) -> Value:
+    return code.operation(f"fmul {_F}" if a.dtype.kind == "f" else "mul", a, a)
+
+
+def _inverse_root(code: Code, a: Value, **_: Any) -> Value:
+    return code.operation(f"fdiv {_F}", constant(1, a.dtype), code.intrinsic("sqrt", a))
+
+
+def _sign(code: Code, a: Value, **_: Any) -> Value:
+    if a.dtype.kind != "f":
+        raise UnsupportedError("the sign of an integer")
+    # Zero and what is not a number are their own sign.
+    unit = code.intrinsic("copysign", constant(1, a.dtype), a)
+    nonzero = code.compare("fcmp one", a, constant(0, a.dtype))
+    return code.choose(nonzero, unit, a)
+
+
+def _finite(code: Code, a: Value, **_: Any) -> Value:
+    return code.compare("fcmp olt", code.intrinsic("fabs", a), constant(np.inf, a.dtype))
+
+
+def _logic(name: str) -> Operation:
+    return lambda code, *values, **_: code.operation(name, *values)
+
+
+def _not(code: Code, a: Value, **_: Any) -> Value:
+    ones = constant(True, a.dtype) if a.dtype.kind == "b" else constant(-1, a.dtype)
+    return code.operation("xor", a, ones)
+
+
+def _selected(code: Code, which: Value, *cases: Value, **_: Any) -> Value:
+    if which.dtype.kind == "b":
+        return code.choose(which, cases[1], cases[0]) if len(cases) > 1 else cases[0]
+    chosen = cases[-1]
+    for i in range(len(cases) - 2, -1, -1):
+        here = code.compare("icmp sle", which, constant(i, which.dtype))
+        chosen = code.choose(here, cases[i], chosen)
+    return chosen
+
+
+def _clamped(code: Code, low: Value, a: Value, high: Value, **_: Any) -> Value:
+    return OPERATIONS["min"](code, OPERATIONS["max"](code, low, a), high)
+
+
+def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
+    """A number in another type."""
+    target = np.dtype(new_dtype)
+    if target == a.dtype:
+        return a
+    source, to = a.dtype.kind, target.kind
+    if to == "b":
+        zero = constant(0, a.dtype)
+        return code.compare("fcmp une" if source == "f" else "icmp ne", a, zero)
+    if source == "f" and to == "f":
+        wider = target.itemsize > a.dtype.itemsize
+        return code.cast("fpext" if wider else "fptrunc", a, target)
+    if source == "f":
+        # Saturating, as XLA has it: `fptosi` of a number past the type's range is anything.
+        return _saturated(code, a, target)
+    if to == "f":
+        return code.cast("sitofp" if source == "i" else "uitofp", a, target)
+    if source == "b":
+        return code.cast("zext", a, target)
+    if type_of(a.dtype) == type_of(target):
+        return a._replace(dtype=target)
+    if target.itemsize < a.dtype.itemsize:
+        return code.cast("trunc", a, target)
+    return code.cast("sext" if source == "i" else "zext", a, target)
+
+
+def _saturated(code: Code, a: Value, target: np.dtype) -> Value:
+    kind = "fptosi" if target.kind == "i" else "fptoui"
+    f, i = {"double": "f64", "float": "f32"}[type_of(a.dtype)], type_of(target)
+    lanes = "" if a.shared else f"v{code.lanes}"
+    name = f"@llvm.{kind}.sat.{lanes}{i}.{lanes}{f}"
+    source, result = code.typed(a.dtype, a.shared), code.typed(target, a.shared)
+    code.declared[name] = f"declare {result} {name}({source})"
+    return code.made(f"call {result} {name}({source} {a.operand})", target, a.shared)
+
+
+def _logistic(code: Code, a: Value, **_: Any) -> Value:
+    one = constant(1, a.dtype)
+    e = code.intrinsic("exp", code.operation("fneg", a))
+    return code.operation(f"fdiv {_F}", one, code.operation("fadd", one, e))
+
+
+def _power_of(code: Code, a: Value, b: Value, **_: Any) -> Value:
+    if b.dtype.kind != "f":
+        b = converted(code, b, new_dtype=a.dtype)
+    return code.intrinsic("pow", a, b)
+
+
+OPERATIONS: dict[str, Operation] = {
+    "add": _arithmetic("fadd", "add"),
+    "add_any": _arithmetic("fadd", "add"),
+    "sub": _arithmetic("fsub", "sub"),
+    "mul": _arithmetic("fmul", "mul"),
+    "div": _quotient,
+    "neg": _negative,
+    "abs": _absolute,
+    "max": _extreme("maximum", "smax", "umax"),
+    "min": _extreme("minimum", "smin", "umin"),
+    "clamp": _clamped,
+    "sqrt": _function("sqrt"),
+    "rsqrt": _inverse_root,
+    "square": _square,
+    "integer_pow": _power,
+    "pow": _power_of,
+    "floor": _function("floor"),
+    "ceil": _function("ceil"),
+    "round": _rounded,
+    "sign": _sign,
+    "is_finite": _finite,
+    "exp": _function("exp"),
+    "exp2": _function("exp2"),
+    "log": _function("log"),
+    "logistic": _logistic,
+    "sin": _function("sin"),
+    "cos": _function("cos"),
+    "tan": _function("tan"),
+    "asin": _function("asin"),
+    "acos": _function("acos"),
+    "atan": _function("atan"),
+    "atan2": _function("atan2"),
+    "sinh": _function("sinh"),
+    "cosh": _function("cosh"),
+    "tanh": _function("tanh"),
+    "lt": _comparison("olt", "slt", "ult"),
+    "le": _comparison("ole", "sle", "ule"),
+    "gt": _comparison("ogt", "sgt", "ugt"),
+    "ge": _comparison("oge", "sge", "uge"),
+    "eq": _comparison("oeq", "eq", "eq"),
+    "ne": _comparison("une", "ne", "ne"),
+    "and": _logic("and"),
+    "or": _logic("or"),
+    "xor": _logic("xor"),
+    "not": _not,
+    "select_n": _selected,
+    "convert_element_type": converted,
+}
+"""by the primitive's name; numbers of equal shape, element by element"""
