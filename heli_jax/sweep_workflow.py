@@ -55,7 +55,14 @@ def run_sweep(
         notes.append("disturbance: nothing is drawn without an axis seed, as seed: {values: [0]}")
     out = None if out is None else Path(out)
     # What is given here goes before what the configuration says.
-    carrying = Options(**{"chunk": design.chunk, "lanes": design.lanes, **options})
+    carrying = Options(
+        **{
+            "chunk": design.chunk,
+            "lanes": design.lanes,
+            "backend": design.backend,
+            **options,
+        }
+    )
     try:
         dataset = run_job(
             job,

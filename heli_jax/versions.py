@@ -3,7 +3,17 @@
 import importlib.metadata
 import platform
 
-_PACKAGES = ("heli_jax", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "scipy")
+_PACKAGES = (
+    "heli_jax",
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "optimistix",
+    "numpy",
+    "scipy",
+    "llvmlite",
+)
 
 
 def version() -> str:

@@ -43,7 +43,8 @@ ALLOWED = {
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "models": {"dynamics", *BASE},
-    "sweeps": {"analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
+    "fused": set(),
+    "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
     "report": {
         "identification", "sweeps", "analysis", "simulation", "dynamics", "flights", "models",
         *BASE,

@@ -98,3 +98,6 @@ class SweepConfig(DesignConfig):
     """design points written at a time"""
     lanes: int | None = None
     """batch size: design points computed side by side on a device"""
+    backend: Literal["auto", "xla", "fused"] = "auto"
+    """what computes each run over time: xla, sample by sample for a batch; fused, one program of
+    machine code for a whole run, on CPUs; auto, fused where it can be"""

@@ -1,4 +1,4 @@
-"""LLVM assembly, written line by line: scalars that all vehicles share, and vectors over vehicles."""
+"""LLVM assembly, line by line: scalars that all vehicles share, and vectors over vehicles."""
 
 import struct
 from typing import NamedTuple
@@ -77,6 +77,15 @@ class Code:
         """A name that is new."""
         self._count += 1
         return f"%v{self._count}"
+
+    def mark(self) -> tuple[int, str, dict[tuple[str, str], str]]:
+        """A place to come back to."""
+        return len(self.lines), self.block, dict(self._spread)
+
+    def back_to(self, mark: tuple[int, str, dict[tuple[str, str], str]]) -> None:
+        """Take back what was written since."""
+        del self.lines[mark[0] :]
+        self.block, self._spread = mark[1], dict(mark[2])
 
     def write(self, line: str) -> None:
         """A line as it is."""

@@ -1,4 +1,4 @@
-"""A program for a whole run of many vehicles: from the first sample to the last without leaving it."""
+"""A program for whole runs of many vehicles: from the first sample to the last."""
 
 import ctypes
 import functools
@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.fused.code import Code, UnsupportedError, Value, type_of
-from heli_jax.fused.translate import Elements, Operand, Stored, elements, loop, translate
-
-_INDEX = np.dtype(np.int32)
+from heli_jax.fused.loops import loop
+from heli_jax.fused.operands import INDEX, Elements, Operand, Stored, elements
+from heli_jax.fused.translate import translate
 
 
 class Argument(NamedTuple):
@@ -27,7 +27,7 @@ class Run(NamedTuple):
     """What is compiled; jaxprs as `jax.make_jaxpr` gives them."""
 
     step: Any
-    """of (what stays, what is stored, carry, the sample's number int32): the carry a sample later"""
+    """of (what stays, what is stored, carry, the sample, int32): the carry a sample later"""
     last: Any
     """of (what stays, what is stored, carry): the results"""
     stays: tuple[Argument, ...]
@@ -86,7 +86,8 @@ class Kernel:
             The results, with the vehicles as the last dimension.
         """
         count = carry[0].shape[-1]
-        assert count % self.lanes == 0 and samples >= 2
+        assert count % self.lanes == 0
+        assert samples >= 2
         # Kept until the call is over: the program has pointers to them.
         given = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
@@ -132,7 +133,7 @@ def _assembly(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     code.write(f"%b = phi i64 [ %begin, %{entry} ], [ %following, %done ]")
     stays = [_of_row(code, *v) if v[1] else shared[i] for i, v in enumerate(rows)]
     carry = [_of_row(code, *v) for v in starts]
-    steps = Value("%steps", _INDEX, True)
+    steps = Value("%steps", INDEX, True)
 
     def step(index: Value, carried: list[Operand]) -> list[Operand]:
         return translate(
@@ -157,7 +158,9 @@ def _assembly(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     code.write("ret void")
     head = [f"{name} = {text}" for name, text in code.globals.items()]
     head += code.declared.values()
-    arguments = "ptr %stays, ptr %stored, ptr %carry, ptr %results, i64 %begin, i64 %end, i32 %steps"
+    arguments = (
+        "ptr %stays, ptr %stored, ptr %carry, ptr %results, i64 %begin, i64 %end, i32 %steps"
+    )
     body = "\n".join(code.lines)
     # Without the attributes LLVM would take half of AVX-512's width.
     attributes = '"prefer-vector-width"="512" "min-legal-vector-width"="512"'
@@ -213,7 +216,7 @@ def _tables(
         rows.append((argument, []))
         values = np.empty(argument.shape, object)
         for k, at in enumerate(np.ndindex(argument.shape)):
-            index = Value(str(k), _INDEX, True)
+            index = Value(str(k), INDEX, True)
             values[at] = code.load(pointers[0], index, argument.dtype)
         shared[i] = values
     return rows, shared

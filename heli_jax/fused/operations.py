@@ -64,9 +64,7 @@ def _absolute(code: Code, a: Value, **_: Any) -> Value:
     if a.dtype.kind == "f":
         return code.intrinsic("fabs", a)
     zero = constant(0, a.dtype)
-    return code.choose(
-        code.compare("icmp slt", a, zero), code.operation("sub", zero, a), a
-    )
+    return code.choose(code.compare("icmp slt", a, zero), code.operation("sub", zero, a), a)
 
 
 def _negative(code: Code, a: Value, **_: Any) -> Value:
@@ -126,7 +124,8 @@ def _not(code: Code, a: Value, **_: Any) -> Value:
 
 def _selected(code: Code, which: Value, *cases: Value, **_: Any) -> Value:
     if which.dtype.kind == "b":
-        return code.choose(which, cases[1], cases[0]) if len(cases) > 1 else cases[0]
+        no, yes = cases
+        return code.choose(which, yes, no)
     chosen = cases[-1]
     for i in range(len(cases) - 2, -1, -1):
         here = code.compare("icmp sle", which, constant(i, which.dtype))

@@ -165,7 +165,7 @@ class Samples(NamedTuple):
     """before the first sample: the State, the value and the limits left"""
     samples: int
     last: Callable[[PyTree], Accumulated]
-    """what is left of the run, from the carry at the last sample, of which nothing is counted yet"""
+    """what is left of the run, from the carry at the last sample, which is not yet counted"""
 
     def step(self, carry: PyTree, k: Int[Array, ""]) -> PyTree:
         """The carry a sample after the k-th."""

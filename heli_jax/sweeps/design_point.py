@@ -11,18 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.analysis.trim import STICKS, Trim, equilibrium, plausible
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model
 from heli_jax.simulation.accumulate import Samples, accumulated, sample_by_sample
 from heli_jax.simulation.simulate import simulate
 from heli_jax.simulation.trajectory import Trajectory
 from heli_jax.sweeps import reducers
+from heli_jax.sweeps.flight_numbers import (
+    FlightNumbers,
+    InitialTrim,
+    Scalars,
+    params_of,
+)
 from heli_jax.sweeps.reducers import Measured, Reduce
-from heli_jax.sweeps.spec import Job, Plan
+from heli_jax.sweeps.spec import Plan
 
-Scalars = dict[str, jax.Array]
-"""numbers () by name"""
 _Run = tuple[Scalars, dict[str, jax.Array], Any, list[jax.Array]]
 """results, trajectories (samples kept,), the last State, and whether each limit was left"""
 
@@ -38,25 +41,6 @@ RUNAWAY = 1e12
 # Samples per step of the exact solver: fastest where many elements are side by side (see
 # `SimulationOptions.block`).
 _BLOCK = 4
-# Accelerations [SI] below which a flight is steady. `trim` asks for 1e-10 and tries from several
-# places; an element of a batch has one try, and may end a little above.
-_TRIMMED = 1e-6
-
-
-class FlightNumbers(NamedTuple):
-    """The numbers of a flight and of the vehicle, in the sweep's precision."""
-
-    # Arguments of the compiled part and no constants in it: another flight of the same length, or
-    # another vehicle, needs no new program.
-
-    base: dict[str, Any]
-    """the vehicle's"""
-    dt: Any
-    inputs: Any
-    known: dict[str, Any]
-    measured: dict[str, Measured]
-    """by result, of those that compare with the flight"""
-    pilot: Any
 
 
 class ElementResults(NamedTuple):
@@ -67,37 +51,6 @@ class ElementResults(NamedTuple):
     matrices: Any
     """the linearisation where the run begins, if a result needs it"""
     status: Any
-
-
-def flight_numbers(job: Job, index: int) -> FlightNumbers:
-    """The numbers of one of the job's flights."""
-    # All numbers are cast here, once: a single float64 among them would make JAX compute in
-    # float64.
-    dtype, flight, model = np.dtype(job.precision), job.flights[index], job.model
-    inputs = {n: flight.inputs[n].astype(dtype) for n in naming.names(model.Inputs)}
-    against = {
-        name: reducers.measured(flight.outputs[str(r.signal)], dtype)
-        for name, r in job.reduce.items()
-        if (s := reducers.streaming(r)) is not None and s.against_flight
-    }
-    return FlightNumbers(
-        {n: np.asarray(v, dtype) for n, v in job.params.items()},
-        np.asarray(flight.dt, dtype),
-        model.Inputs(**inputs),
-        {n: np.asarray(v, dtype) for n, v in flight.known.items()},
-        against,
-        jax.tree.map(lambda v: np.asarray(v, dtype), job.pilot),
-    )
-
-
-class InitialTrim(NamedTuple):
-    """The steady flight that an element begins in."""
-
-    state: Any
-    sticks: Any
-    """the model's Inputs, added to the flight's"""
-    sound: Any
-    """whether there is such a flight"""
 
 
 def design_point(
@@ -111,7 +64,7 @@ def design_point(
         values: of the axes, scalars, SI.
         trim: the steady flight to begin in; None for the model's initial state.
     """
-    params, special = _params(plan, numbers, values)
+    params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     if trim is not None and numbers.pilot is not None:
         # The gains are those for the vehicle as it is given, the flight is this one's own.
@@ -132,7 +85,7 @@ def samples_of(
 ) -> Samples:
     """The run of one element in its steps, for a plan that is streamed; arguments as
     `design_point` has them."""
-    params, special = _params(plan, numbers, values)
+    params, special = params_of(plan, numbers, values)
     state, inputs = _beginning(plan.model, params, numbers, special, trim)
     update, start, data = _streaming(plan, numbers)
     return sample_by_sample(
@@ -196,7 +149,7 @@ def _concluded(
     if any(r.how in reducers.LINEAR for _, r in plan.reduce):
         # Eigenvalues and margins are made of these by NumPy after the chunk, in float64 whatever
         # the device.
-        params, special = _params(plan, numbers, values)
+        params, special = params_of(plan, numbers, values)
         state, inputs = _beginning(model, params, numbers, special, trim)
         at_start = jax.tree.map(lambda u: u[0], inputs)
         matrices = jacobians(model, params, state, at_start)
@@ -220,58 +173,6 @@ def _beginning(
         n.removeprefix("initial."): v for n, v in special.items() if n.startswith("initial.")
     }
     return naming.replace(state, **initial), _gained_and_offset(inputs, special)
-
-
-def _params(plan: Plan, numbers: FlightNumbers, values: Scalars) -> tuple[Any, Scalars]:
-    """The element's parameters, and the axes that are not among them."""
-    names = naming.names(plan.model.Params)
-    swept = {n: v for n, v in values.items() if n in names}
-    # In this order: what a flight knows of its machine goes before the vehicle's, an axis before
-    # both.
-    params = plan.model.Params(**{**numbers.base, **numbers.known, **swept})
-    return params, {n: v for n, v in values.items() if n not in names}
-
-
-def steady(plan: Plan, numbers: FlightNumbers, values: Scalars) -> InitialTrim:
-    """The steady flight of one element.
-
-    Args:
-        plan: what is compiled; its `trimmed` says which flight.
-        numbers: of the flight and the vehicle, SI.
-        values: of the axes, scalars, SI.
-    """
-    assert plan.trimmed is not None
-    whole, dtype = plan.trimmed.of or plan.model, numbers.dt.dtype
-    params, _ = _params(plan, numbers, values)
-    plain = whole.Params(**{n: getattr(params, n) for n in naming.names(whole.Params)})
-    # In the default precision whatever the sweep's: an iteration in float32 ends at residuals that
-    # are no proof of a steady flight.
-    plain, condition, wind = jax.tree.map(
-        lambda v: jnp.asarray(v, jnp.result_type(float)),
-        (plain, plan.trimmed.condition, tuple(plan.trimmed.wind)),
-    )
-    # Of the model without a disturbance: a steady flight is one in still air or steady wind.
-    trim = equilibrium(whole, plain, condition, wind)
-    sound = _is_trimmed(trim)
-    # The states of a disturbance have no trim and keep their own beginning.
-    state = naming.replace(plan.model.initial_state(params), **naming.asdict(trim.state))
-    share = 1.0 if plan.trimmed.sticks else 0.0
-    sticks = jax.tree.map(lambda v: jnp.asarray(share * v, dtype), trim.inputs)
-    state = jax.tree.map(lambda v: jnp.asarray(v, dtype), state)
-    return InitialTrim(state, sticks, sound)
-
-
-def _is_trimmed(trim: Trim) -> jax.Array:
-    """Whether it is a steady flight that the sticks' travel allows."""
-    # `trim` raises where there is none; one of a batch can only be flagged.
-    sound = plausible(trim) & (trim.residual < _TRIMMED)
-    for name, (low, high) in STICKS.items():
-        if not hasattr(trim.inputs, name):
-            continue
-        stick = getattr(trim.inputs, name)
-        # A governor's stick stands at its end, which rounding may pass.
-        sound = sound & (stick >= low - _TRIMMED) & (stick <= high + _TRIMMED)
-    return sound
 
 
 def _gained_and_offset(inputs: Any, special: Scalars) -> Any:

@@ -11,14 +11,12 @@ import numpy as np
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.kernel import Argument, Kernel, Run, lanes_for
 from heli_jax.numerics.hoist import hoisted
-from heli_jax.sweeps.design_point import (
-    ElementResults,
+from heli_jax.sweeps.design_point import ElementResults, of_samples, samples_of
+from heli_jax.sweeps.flight_numbers import (
     FlightNumbers,
     InitialTrim,
     Scalars,
     flight_numbers,
-    of_samples,
-    samples_of,
     steady,
 )
 from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of

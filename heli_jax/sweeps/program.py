@@ -12,12 +12,11 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from heli_jax import naming
-from heli_jax.sweeps.design_point import (
-    ElementResults,
+from heli_jax.sweeps.design_point import ElementResults, design_point
+from heli_jax.sweeps.flight_numbers import (
     FlightNumbers,
     InitialTrim,
     Scalars,
-    design_point,
     flight_numbers,
     steady,
 )

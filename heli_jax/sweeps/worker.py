@@ -205,9 +205,7 @@ class Worker:
             from heli_jax.sweeps.fused_program import FusedProgram
 
             kind = FusedProgram
-        self._programs = [
-            kind(job, i, self.devices, split.lanes) for i in range(len(job.flights))
-        ]
+        self._programs = [kind(job, i, self.devices, split.lanes) for i in range(len(job.flights))]
         self._beside = ThreadPoolExecutor(1)
 
     def begin(self, chunk: int) -> Pending:

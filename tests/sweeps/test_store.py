@@ -63,7 +63,7 @@ def test_xarray_reads_the_store_by_itself(whole):
     assert found["mode_real"].dims == ("element", "mode")
     assert found["rms"].attrs["units"] == "rad"
     assert found["Ixx"].attrs["units"] == "kg m^2"
-    assert found.attrs["split"] == {"chunk": 32, "lanes": 16}
+    assert found.attrs["split"] == {"chunk": 32, "lanes": 16, "backend": "fused"}
     assert found.attrs["axes"] == ["Ixx", "a"]
     assert json.loads(found.attrs["description"])["design"]["n"] == 300
     np.testing.assert_array_equal(found["a"], DESIGN.values(0, 300)["a"])
@@ -319,7 +319,7 @@ def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
     def cut(n, **asked):
         design = sobol({"Ixx": Range(0.02, 0.05)}, n)
         wanted = job(ROLL, bench30, record, design, {"rms": Reduce("rms", "roll")})
-        return split_for(wanted, devices=jax.local_devices()[:1], **asked)
+        return split_for(wanted, devices=jax.local_devices()[:1], **{"backend": "xla", **asked})
 
     assert cut(10).lanes == 8
     assert cut(10).chunk == 16
@@ -328,7 +328,8 @@ def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
     assert cut(100_000).chunk <= 100_000 / 2
     assert cut(100_000, shares=8).chunk < cut(100_000).chunk
     assert cut(1_000_000).chunk <= 1 << 16
-    assert cut(1000, chunk=77, lanes=5) == (77, 5)
+    assert cut(1000, chunk=77, lanes=5) == (77, 5, "xla")
+    assert cut(1000, chunk=77, lanes=5, backend="auto") == (77, 5, "fused")
     # Measured where it pays, once, and remembered.
     calls = []
     monkeypatch.setattr(lanes, "_WORTH_S", 0.0)

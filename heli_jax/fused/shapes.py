@@ -1,0 +1,197 @@
+"""The primitives that change the shape of arrays, or sum over them."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from heli_jax.fused.code import Code, UnsupportedError, Value, constant
+from heli_jax.fused.operands import (
+    INDEX,
+    MOST,
+    Elements,
+    Operand,
+    Stored,
+    at_place,
+    dtype_of,
+    elements,
+    scalar,
+)
+from heli_jax.fused.operations import OPERATIONS, converted
+
+
+def _moved(
+    operand: Stored, shape: tuple[int, ...], where: Callable[[tuple[Value, ...]], tuple[Value, ...]]
+) -> Stored:
+    """Another view of what is stored."""
+    return Stored(shape, operand.dtype, lambda at: operand.element(where(at)))
+
+
+def _squeezed(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    (operand,) = inputs
+    gone = {d % len(operand.shape) for d in params["dimensions"]}
+    if not isinstance(operand, Stored):
+        return np.squeeze(operand, tuple(gone))
+    zero = constant(0, INDEX)
+    shape = tuple(n for d, n in enumerate(operand.shape) if d not in gone)
+
+    def where(at: tuple[Value, ...]) -> tuple[Value, ...]:
+        rest = iter(at)
+        return tuple(zero if d in gone else next(rest) for d in range(len(operand.shape)))
+
+    view = _moved(operand, shape, where)
+    return view if shape else _only(view)
+
+
+def _only(operand: Stored) -> Elements:
+    """The one element of a view without dimensions."""
+    single = np.empty((), object)
+    single[()] = operand.element(())
+    return single
+
+
+def _taken(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    """dynamic_slice."""
+    operand, starts = inputs[0], [scalar(code, v) for v in inputs[1:]]
+    sizes = params["slice_sizes"]
+    indices = []
+    for start, size, length in zip(starts, sizes, operand.shape, strict=True):
+        start = converted(code, start, new_dtype=INDEX)
+        if not start.shared:
+            raise UnsupportedError("an index that is not the same for all vehicles")
+        # Within the array whatever is asked for, as JAX has it.
+        indices.append(
+            OPERATIONS["clamp"](code, constant(0, INDEX), start, constant(length - size, INDEX))
+        )
+    if isinstance(operand, Stored):
+        return _moved(
+            operand,
+            tuple(sizes),
+            lambda at: tuple(code.operation("add", i, a) for i, a in zip(indices, at, strict=True)),
+        )
+    result = np.empty(sizes, object)
+    for at in np.ndindex(*sizes):
+        places = [
+            code.operation("add", i, constant(a, INDEX)) for i, a in zip(indices, at, strict=True)
+        ]
+        result[at] = at_place(code, operand, tuple(places))
+    return result
+
+
+def _cut(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    """slice, of fixed bounds."""
+    (operand,) = inputs
+    strides = params["strides"] or (1,) * len(operand.shape)
+    bounds = tuple(zip(params["start_indices"], params["limit_indices"], strides, strict=True))
+    if not isinstance(operand, Stored):
+        return operand[tuple(slice(*b) for b in bounds)]
+    shape = tuple(len(range(*b)) for b in bounds)
+
+    def where(at: tuple[Value, ...]) -> tuple[Value, ...]:
+        moved = []
+        for index, (start, _, stride) in zip(at, bounds, strict=True):
+            scaled = code.operation("mul", index, constant(stride, INDEX))
+            moved.append(code.operation("add", scaled, constant(start, INDEX)))
+        return tuple(moved)
+
+    return _moved(operand, shape, where)
+
+
+def _broadcast(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    operand, shape, places = inputs[0], tuple(params["shape"]), params["broadcast_dimensions"]
+    if int(np.prod(shape)) > MOST or isinstance(operand, Stored):
+        zero = constant(0, INDEX)
+
+        def element(at: tuple[Value, ...]) -> Value:
+            inner = tuple(zero if operand.shape[i] == 1 else at[d] for i, d in enumerate(places))
+            return at_place(code, operand, inner)
+
+        return Stored(shape, np.dtype(dtype_of(operand)), element)
+    source = operand if operand.dtype == object else elements(code, operand)
+    unit = [1] * len(shape)
+    for i, d in enumerate(places):
+        unit[d] = source.shape[i]
+    return np.broadcast_to(source.reshape(unit), shape)
+
+
+def _reshaped(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    return elements(code, inputs[0]).reshape(params["new_sizes"])
+
+
+def _transposed(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    return np.transpose(elements(code, inputs[0]), params["permutation"])
+
+
+def _joined(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    return np.concatenate([elements(code, v) for v in inputs], params["dimension"])
+
+
+def _stacked(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    return np.stack([elements(code, v) for v in inputs], params["axis"])
+
+
+def _reversed(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    return np.flip(elements(code, inputs[0]), tuple(params["dimensions"]))
+
+
+def _reduction(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        source = elements(code, inputs[0])
+        axes = tuple(params["axes"])
+        kept = [d for d in range(source.ndim) if d not in axes]
+        moved = np.transpose(source, (*kept, *axes)).reshape(*(source.shape[d] for d in kept), -1)
+        if moved.shape[-1] == 0:
+            raise UnsupportedError(f"{operation} of nothing")
+        result = np.empty(moved.shape[:-1], object)
+        for at in np.ndindex(result.shape):
+            total = moved[at][0]
+            for value in moved[at][1:]:
+                total = OPERATIONS[operation](code, total, value)
+            result[at] = total
+        return result
+
+    return made
+
+
+def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+    """dot_general, of small arrays: sums of products written out."""
+    a, b = (elements(code, v) for v in inputs)
+    (of_a, of_b), (batch_a, batch_b) = params["dimension_numbers"]
+    if batch_a or batch_b:
+        raise UnsupportedError("a product of batches of matrices")
+    free_a = [d for d in range(a.ndim) if d not in of_a]
+    free_b = [d for d in range(b.ndim) if d not in of_b]
+    shape = (*(a.shape[d] for d in free_a), *(b.shape[d] for d in free_b))
+    rows = np.transpose(a, (*free_a, *of_a)).reshape(-1, int(np.prod([a.shape[d] for d in of_a])))
+    columns = np.transpose(b, (*free_b, *of_b)).reshape(-1, rows.shape[1])
+    result = np.empty((len(rows), len(columns)), object)
+    for i, j in itertools.product(range(len(rows)), range(len(columns))):
+        total = None
+        for x, y in zip(rows[i], columns[j], strict=True):
+            term = OPERATIONS["mul"](code, x, y)
+            total = term if total is None else OPERATIONS["add"](code, total, term)
+        if total is None:
+            raise UnsupportedError("a product of nothing")
+        result[i, j] = total
+    return result.reshape(shape)
+
+
+SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
+    "squeeze": _squeezed,
+    "dynamic_slice": _taken,
+    "slice": _cut,
+    "broadcast_in_dim": _broadcast,
+    "reshape": _reshaped,
+    "transpose": _transposed,
+    "concatenate": _joined,
+    "stack": _stacked,
+    "rev": _reversed,
+    "reduce_sum": _reduction("add"),
+    "reduce_max": _reduction("max"),
+    "reduce_min": _reduction("min"),
+    "reduce_prod": _reduction("mul"),
+    "reduce_and": _reduction("and"),
+    "reduce_or": _reduction("or"),
+    "dot_general": _product,
+}

@@ -1,0 +1,208 @@
+"""What is translated against JAX itself, operation by operation and in random expressions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from heli_jax.fused.code import UnsupportedError
+from heli_jax.fused.kernel import Argument, Kernel, Run
+
+LANES, N = 8, 5
+RECORD = np.array([0.3, -0.7, 1.1, 0.2, -0.4])
+
+
+def compiled(step, stays, carry, dtype=np.float64, vehicles=LANES, lanes=LANES):
+    """The carry after N samples: by the program, and by JAX vehicle by vehicle.
+
+    Args:
+        step: of (what stays, the record, carry, sample).
+        stays: an array with the vehicles last, or a number for all.
+        carry: an array (vehicles,).
+    """
+    stays = [np.asarray(v, dtype) for v in stays]
+    record = RECORD.astype(dtype)
+    one = [v[..., 0] if v.ndim else v for v in stays]
+    sample = np.zeros((), np.int32)
+    whole = jax.make_jaxpr(lambda s, u, x, k: step(s, u, x, k))
+    last = jax.make_jaxpr(lambda s, u, x: step(s, u, x, jnp.int32(N - 1)))
+    run = Run(
+        whole(one, record, carry[0], sample),
+        last(one, record, carry[0]),
+        tuple(
+            Argument(w.shape, np.dtype(dtype), v.ndim == 0) for v, w in zip(stays, one, strict=True)
+        ),
+        (Argument((N,), np.dtype(dtype), True),),
+        (Argument((), np.dtype(dtype), False),),
+    )
+    found = Kernel(run, lanes)(stays, [record], [carry], N, 1)
+
+    def alone(i):
+        own = [v[..., i] if v.ndim else v for v in stays]
+        x = jnp.asarray(carry[i])
+        for k in range(N):
+            x = step(own, jnp.asarray(record), x, jnp.int32(k))
+        return np.asarray(x)
+
+    return found[0], np.stack([alone(i) for i in range(vehicles)], axis=-1)
+
+
+def agree(step, stays=None, dtype=np.float64, low=-2.0, high=2.0, rtol=None):
+    rng = np.random.default_rng(1)
+    stays = [rng.uniform(0.5, 1.5, LANES), 0.7] if stays is None else stays
+    carry = rng.uniform(low, high, LANES).astype(dtype)
+    found, expected = compiled(step, stays, carry, dtype)
+    assert found.dtype == expected.dtype == dtype
+    rtol = (1e-12 if dtype == np.float64 else 2e-5) if rtol is None else rtol
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol)
+
+
+UNARY = {
+    name: getattr(jnp, name)
+    for name in (
+        *("sin", "cos", "tan", "exp", "exp2", "arctan", "tanh", "sinh", "cosh", "floor", "ceil"),
+        *("round", "sign", "abs", "square", "negative"),
+    )
+} | {
+    "sqrt": lambda x: jnp.sqrt(jnp.abs(x)),
+    "log": lambda x: jnp.log(1.0 + jnp.abs(x)),
+    "rsqrt": lambda x: jax.lax.rsqrt(1.0 + x * x),
+    "arcsin": lambda x: jnp.arcsin(jnp.tanh(x)),
+    "arccos": lambda x: jnp.arccos(jnp.tanh(x)),
+    "sigmoid": jax.nn.sigmoid,
+    "power": lambda x: jnp.power(1.0 + x * x, 0.3),
+    "cube": lambda x: x**3,
+    "inverse square": lambda x: (2.0 + x) ** -2,
+    "clip": lambda x: jnp.clip(x, -0.5, 0.5),
+    "where": lambda x: jnp.where(x > 0.1, x, -2.0 * x),
+    "isfinite": lambda x: jnp.where(jnp.isfinite(1.0 / (x - x)), 1.0, x),
+    "logic": lambda x: jnp.where(((x > 0) & ~(x > 1)) | (x < -1), x, 0.5 * x),
+    "integers": lambda x: (jnp.floor(3 * x).astype(int) * 2 - 1).astype(x.dtype),
+    "atan2": lambda x: jnp.arctan2(x, x - 0.5),
+    "minimum": lambda x: jnp.minimum(x, 0.3) + jnp.maximum(x, -0.2),
+}
+
+
+@pytest.mark.parametrize("name", UNARY)
+def test_an_operation(name):
+    def step(stays, u, x, k):
+        return 0.3 * UNARY[name](stays[0] * x + u[k]) + stays[1]
+
+    agree(step)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_records_loops_and_small_arrays(dtype):
+    def step(stays, u, x, k):
+        a, b = stays
+        # Clipped, as the simulation reads its records; before the first the first.
+        before = u[jnp.clip(k - 1, 0, N - 1)]
+        late = 2.0 * u + 1.0  # of a whole record: computed of the element that is read
+        M = jnp.stack([jnp.stack([a, b]), jnp.stack([-b, x])])
+        v = M @ jnp.stack([x, before])
+        reach = jnp.asarray([0.0, 0.5, 0.5, 1.0], x.dtype)
+        total, _ = jax.lax.scan(lambda c, r: (c + 0.1 * r * jnp.sin(c + a), None), v[0], reach)
+        inner = jax.lax.fori_loop(0, 3, lambda i, y: 0.5 * y + 0.1 * i, v[1])
+        kept = jax.lax.scan(lambda c, _: (0.5 * c, c + a), x, None, length=3)[1]
+        chosen = jax.lax.cond(x > 0, lambda y: y, lambda y: -2.0 * y, total)
+        return 0.2 * (chosen + inner + late[k] + jnp.sum(kept) + jnp.max(v) + kept[::-1][0])
+
+    agree(step, dtype=dtype)
+
+
+def test_a_loop_that_all_leave_together():
+    def step(stays, u, x, k):
+        # As often as the record says; not at all is a case too.
+        count = jnp.floor(4.0 * jnp.abs(u[k])).astype(jnp.int32)
+        return jax.lax.while_loop(
+            lambda c: c[1] < count, lambda c: (0.5 * c[0] + stays[0], c[1] + 1), (x, 0)
+        )[0]
+
+    agree(step)
+
+
+def test_what_is_not_a_number_stays_so():
+    def step(stays, u, x, k):
+        return jnp.maximum(jnp.where(k == 2, x - jnp.inf + jnp.inf, x), 0.0)
+
+    found, expected = compiled(step, [np.ones(LANES), 1.0], np.linspace(-1, 1, LANES))
+    assert np.isnan(expected).all()
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (
+            lambda s, u, x, k: jax.lax.while_loop(lambda y: y > 1e-3, lambda y: 0.5 * y, x),
+            "another pass for each vehicle",
+        ),
+        (lambda s, u, x, k: jax.scipy.special.erf(x), "erf"),
+        (lambda s, u, x, k: u[(jnp.abs(x) * 2).astype(int)], "not the same for all"),
+        (lambda s, u, x, k: jnp.sort(jnp.stack([x, s[0]]))[0], "sort"),
+    ],
+)
+def test_what_has_no_translation_is_named(step, words):
+    with pytest.raises(UnsupportedError, match=words):
+        compiled(step, [np.ones(LANES), 1.0], np.ones(LANES))
+
+
+def test_threads_share_the_vehicles():
+    def step(stays, u, x, k):
+        return 0.9 * x + stays[0] * u[k]
+
+    rng = np.random.default_rng(2)
+    gains, carry = rng.uniform(0.5, 1.5, 64), rng.uniform(-1, 1, 64)
+    found, expected = compiled(step, [gains, 1.0], carry, vehicles=64)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    sample = np.zeros((), np.int32)
+    run = Run(
+        jax.make_jaxpr(step)([1.0, 1.0], RECORD, 1.0, sample),
+        jax.make_jaxpr(lambda s, u, x: step(s, u, x, N - 1))([1.0, 1.0], RECORD, 1.0),
+        (Argument((), np.dtype(float), False), Argument((), np.dtype(float), True)),
+        (Argument((N,), np.dtype(float), True),),
+        (Argument((), np.dtype(float), False),),
+    )
+    kernel = Kernel(run, 16)
+    for threads in (1, 2, 3, 9):
+        given = ([gains, np.asarray(1.0)], [RECORD], [carry], N, threads)
+        np.testing.assert_array_equal(kernel(*given)[0], kernel(*given[:-1], 1)[0])
+        np.testing.assert_allclose(kernel(*given)[0], expected, rtol=1e-13)
+
+
+_SMOOTH = ("sin", "cos", "tanh", "arctan", "where", "clip", "sqrt", "log", "square", "abs")
+
+
+@st.composite
+def expressions(draw, depth=4):
+    """Functions of (a, b, u, x) that JAX can trace, of bounded size."""
+    if depth == 0 or (draw(st.booleans()) and depth < 3):
+        pick = draw(st.integers(0, 4))
+        number = draw(st.floats(-2, 2, allow_nan=False, width=32))
+        return lambda *v: v[pick] if pick < 4 else jnp.asarray(number, v[3].dtype)
+    if draw(st.booleans()):
+        function, inner = draw(st.sampled_from(_SMOOTH)), draw(expressions(depth=depth - 1))
+        return lambda *v: jnp.clip(UNARY[function](inner(*v)), -50.0, 50.0)
+    left, right = draw(expressions(depth=depth - 1)), draw(expressions(depth=depth - 1))
+    how = draw(st.sampled_from(["+", "-", "*", "/", "min", "max"]))
+    return {
+        "+": lambda *v: left(*v) + right(*v),
+        "-": lambda *v: left(*v) - right(*v),
+        "*": lambda *v: left(*v) * right(*v),
+        "/": lambda *v: left(*v) / (1.5 + right(*v) ** 2),
+        "min": lambda *v: jnp.minimum(left(*v), right(*v)),
+        "max": lambda *v: jnp.maximum(left(*v), right(*v)),
+    }[how]
+
+
+@settings(max_examples=15, deadline=None)
+@given(expressions())
+def test_a_random_expression(expression):
+    # One sample, bounded: what follows from a difference in the last digit is not of interest.
+    def step(stays, u, x, k):
+        value = jnp.tanh(0.1 * expression(stays[0], stays[1], u[k], x))
+        return jnp.where(k == 0, value, x)
+
+    agree(step, rtol=1e-9)
