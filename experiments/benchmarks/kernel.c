@@ -4,7 +4,9 @@
 #include <math.h>
 #include <stddef.h>
 
-#define LANES 8
+#ifndef LANES
+#define LANES 8 /* vehicles in flight at once: -DLANES=16 */
+#endif
 
 /* coef: (20, n): Ad row by row (16), then Bd (4). */
 void exact(const double *coef, const double *u, const double *y, double *cost, size_t n, size_t N) {
@@ -32,6 +34,10 @@ void exact(const double *coef, const double *u, const double *y, double *cost, s
   }
 }
 
+#define SLOPES(P, Q, F, G, a, b, c, d)                                                    \
+  double a = (Q), b = p[4][l] * u[k] + p[5][l] * (F) - p[6][l] * (P) - p[7][l] * (Q), c = (G), \
+         d = p[0][l] * (u[k] * p[1][l] - ((G) + (Q)) * p[2][l]) - p[3][l] * (F);
+
 /* par: (8, n): k1, 1/L5, 1/Omega, Omega^2, k2 L3, k2 L2 L4, kappa, zeta. */
 void rk4(const double *par, const double *u, const double *y, double *cost, size_t n, size_t N,
          double dt, int substeps) {
@@ -47,20 +53,15 @@ void rk4(const double *par, const double *u, const double *y, double *cost, size
       }
       for (int s = 0; s < substeps; s++)
         for (int l = 0; l < LANES; l++) {
-          double w[4], f[4], g[4] = {0, 0, 0, 0};
-          for (int i = 0; i < 4; i++) w[i] = x[i][l];
-          for (int stage = 0; stage < 4; stage++) {
-            f[0] = w[1];
-            f[1] = p[4][l] * u[k] + p[5][l] * w[2] - p[6][l] * w[0] - p[7][l] * w[1];
-            f[2] = w[3];
-            f[3] = p[0][l] * (u[k] * p[1][l] - (w[3] + w[1]) * p[2][l]) - p[3][l] * w[2];
-            double weight = (stage == 1 || stage == 2) ? 2.0 : 1.0;
-            double ahead = (stage == 2) ? h : 0.5 * h;
-            for (int i = 0; i < 4; i++) g[i] += weight * f[i];
-            if (stage < 3)
-              for (int i = 0; i < 4; i++) w[i] = x[i][l] + ahead * f[i];
-          }
-          for (int i = 0; i < 4; i++) x[i][l] += h / 6.0 * g[i];
+          double P = x[0][l], Q = x[1][l], F = x[2][l], G = x[3][l];
+          SLOPES(P, Q, F, G, a1, b1, c1, d1)
+          SLOPES(P + h / 2 * a1, Q + h / 2 * b1, F + h / 2 * c1, G + h / 2 * d1, a2, b2, c2, d2)
+          SLOPES(P + h / 2 * a2, Q + h / 2 * b2, F + h / 2 * c2, G + h / 2 * d2, a3, b3, c3, d3)
+          SLOPES(P + h * a3, Q + h * b3, F + h * c3, G + h * d3, a4, b4, c4, d4)
+          x[0][l] = P + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4);
+          x[1][l] = Q + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4);
+          x[2][l] = F + h / 6 * (c1 + 2 * c2 + 2 * c3 + c4);
+          x[3][l] = G + h / 6 * (d1 + 2 * d2 + 2 * d3 + d4);
         }
     }
     for (int l = 0; l < LANES; l++) cost[v + l] = c[l] / N;

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.kernel import Argument, Kernel, Run, lanes_for
@@ -90,7 +91,7 @@ class FusedProgram:
         stays = [_rows(next(own)) if v else np.asarray(next(shared)) for v in parts.varies]
         stored = jax.tree.leaves(_records(numbers))
         samples = stored[0].shape[0]
-        carry = [_rows(v) for v in jax.tree.leaves(carry)]
+        carry = [_rows(v) for v in carry]
         results = parts.kernel(stays, stored, carry, samples, self._threads)
         reduced = jax.tree.unflatten(parts.reduced, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
@@ -132,7 +133,8 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
 
 class _Traced(NamedTuple):
     begin: Any
-    """of (numbers, values, trim): what is carried, and what stays"""
+    """the jaxpr of (numbers, values, trim): what is carried before the first sample, then what
+    stays"""
     run: Run
     reduced: Any
 
@@ -163,17 +165,16 @@ def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> _
         own = (_without(numbers), values, trim)
         of_step, a_step = hoisted(step, own, _records(numbers), carry, sample)
         of_last, the_last = hoisted(last, own, _records(numbers), carry)
-        if not found:
-            n = len(of_step)
-            both = [*of_step, *of_last]
-            found["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
-                both, records, carry, sample
-            )
-            found["last"], shape = jax.make_jaxpr(
-                lambda v, *rest: the_last(v[n:], *rest), return_shape=True
-            )(both, records, carry)
-            found["reduced"] = jax.tree.structure(shape)
-        return carry, [*of_step, *of_last]
+        both, n = [*of_step, *of_last], len(of_step)
+        # Traced here, where the values that they stay with are at hand.
+        found["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
+            both, records, carry, sample
+        )
+        found["last"], shape = jax.make_jaxpr(
+            lambda v, *rest: the_last(v[n:], *rest), return_shape=True
+        )(both, records, carry)
+        found["reduced"] = jax.tree.structure(shape)
+        return carry, both
 
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(numbers, values, trim)
     carried, stay = (jax.tree.leaves(part) for part in shape)
@@ -188,7 +189,7 @@ def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> _
         tuple(Argument(v.shape, v.dtype, True) for v in jax.tree.leaves(records)),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
     )
-    return _Traced(begin, run, found["reduced"])
+    return _Traced(closed, run, found["reduced"])
 
 
 def _vary(jaxpr: Any, n_shared: int) -> list[bool]:
@@ -212,15 +213,19 @@ def _compiled(
     """The program, remembered as `program` does it."""
     example = jax.tree.unflatten(structure, [np.zeros(*kind) for kind in kinds])
     begin, run, reduced = _traced(plan, *example)
+    evaluate = core.jaxpr_as_fun(begin)
     varies = tuple(not argument.shared for argument in run.stays)
 
+    n_carry = len(run.carry)
+
     def own(numbers: FlightNumbers, *element: Any) -> Any:
-        carry, stay = begin(numbers, *element)
-        return carry, [v for v, varying in zip(stay, varies, strict=True) if varying]
+        outputs = evaluate(*jax.tree.leaves((numbers, *element)))
+        stay = zip(outputs[n_carry:], varies, strict=True)
+        return outputs[:n_carry], [v for v, varying in stay if varying]
 
     def shared(numbers: FlightNumbers, *element: Any) -> Any:
-        _, stay = begin(numbers, *element)
-        return [v for v, varying in zip(stay, varies, strict=True) if not varying]
+        outputs = evaluate(*jax.tree.leaves((numbers, *element)))
+        return [v for v, varying in zip(outputs[n_carry:], varies, strict=True) if not varying]
 
     before, split = spread(own, devices, lanes)
     conclude, _ = spread(functools.partial(of_samples, plan), devices, lanes)
