@@ -58,7 +58,10 @@ def decide(values: np.ndarray) -> Decision:
     # The larger of a move's two neighbours; before the first and after the last there is none.
     beside = np.maximum(np.r_[0.0, size[:-1]], np.r_[size[1:], 0.0])
     jumps = (evident > 0) & (beside <= _QUIET * evident)
-    weight = evident**_POWER
+    # No move counts for more than the range of nearly all samples: a single absurd number goes
+    # farther than all steps together.
+    low, high = np.quantile(values, [0.01, 0.99])
+    weight = np.minimum(evident, (high - low) or span) ** _POWER
     if weight[jumps].sum() >= 0.5 * weight.sum():
         return Decision("zero-order", _steps(jumps))
     return Decision("linear", f"moves at {_percent(share)}")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heli_jax.flights.band_limited import PASSED, decimate
+from heli_jax.flights.clock_steps import step_notes
 
 # What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
 # still near a straight line. What lies in a longer gap nobody knows.
@@ -37,6 +38,7 @@ def new_clock(seconds: np.ndarray, rate: float) -> Clock:
     count = int(np.floor((seconds[-1] - seconds[0]) * rate + 1e-6)) + 1
     # Counted and multiplied, never added up: the sum of 1e6 rounded steps would drift.
     notes = [f"resampled to {rate:.6g} Hz from about {1 / usual:.6g} Hz"]
+    notes += step_notes(seconds, rate, longest_gap(seconds))
     if rate * usual < _GOES_DOWN:
         passed = PASSED * rate
         notes.append(f"low-pass filtered first: {passed:.3g} Hz and below pass, not held inputs")

@@ -135,3 +135,14 @@ def test_units_and_signs_do_not_matter(name):
 )
 def test_the_reason_is_said(values, words):
     assert decide(values).reason.startswith(words)
+
+
+def test_a_single_absurd_number_changes_no_hold():
+    rng = np.random.default_rng(4)
+    steps = np.repeat(rng.uniform(-0.2, 0.2, 40), 150)
+    assert decide(steps).hold == "zero-order"
+    steps[1234] = 50.0
+    assert decide(steps).hold == "zero-order"
+    smooth = np.sin(0.01 * np.arange(6000))
+    smooth[1234] = 50.0
+    assert decide(smooth).hold == "linear"

@@ -218,7 +218,9 @@ def input_rate(flight: Flight, name: str, u: Float[np.ndarray, " N"]) -> float |
 def _corner_rate(dt: float, u: np.ndarray) -> float:
     """The rate of the samples between which an input follows straight lines."""
     bends = np.abs(np.diff(u, 2))
-    corners = np.flatnonzero(bends > 1e-6 * np.ptp(u))
+    # Of most samples: a single absurd one would make the stick's own corners look like rounding.
+    low, high = np.quantile(u, [0.01, 0.99])
+    corners = np.flatnonzero(bends > 1e-6 * ((high - low) or np.ptp(u)))
     if corners.size < _STEPS:
         return 1.0 / dt
     usual = float(np.median(np.diff(corners)))

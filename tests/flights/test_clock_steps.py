@@ -1,0 +1,47 @@
+"""Clocks that were set, lost samples, or went on at another rate."""
+
+import numpy as np
+import pytest
+
+from heli_jax.flights.clock_steps import step_notes
+from heli_jax.flights.resample import new_clock
+
+
+def test_a_step_of_the_clock_is_told_with_its_time():
+    t = 0.01 * np.arange(6000)
+    t[3000:] += 0.1
+    (note,) = step_notes(t, 100.0, 0.25)
+    assert note.startswith("the clock has a step of 0.11 s, at 29.99 s, where 0.01 s is usual")
+    assert "the clock was set" in note
+    assert note in new_clock(t, 100.0).notes
+
+
+def test_several_long_steps_are_counted():
+    t = 0.01 * np.arange(6000)
+    for at in (1000, 2000, 4000):
+        t[at:] += 0.03 + 1e-5 * at
+    (note,) = step_notes(t, 100.0, 0.25)
+    assert "has 3 steps of up to 0.08 s, the longest at" in note
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.01, 0.02), (0.02, 0.01)])
+def test_a_second_rate(first, second):
+    rng = np.random.default_rng(0)
+    steps = np.r_[np.full(3000, first), np.full(2000, second)]
+    t = np.cumsum(steps * (1 + 0.1 * rng.uniform(-1, 1, steps.size)))
+    (note,) = step_notes(t, 100.0, 0.25)
+    until = float(note.partition("until ")[2].partition(" s")[0])
+    assert abs(until - t[2999]) <= 0.03
+    assert "has samples that were not measured; `rate: " in note
+    (note,) = step_notes(t, 45.0, 0.25)
+    assert "rate:" not in note
+
+
+def test_nothing_is_said_of_an_ordinary_clock():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        t = 0.01 * np.arange(4000) + 0.002 * rng.uniform(-1, 1, 4000)
+        assert step_notes(t, 50.0, 0.25) == ()
+        # Many samples lost here and there: the shares of missing samples say so.
+        kept = t[rng.uniform(size=t.size) > 0.4]
+        assert step_notes(kept, 50.0, 0.25) == ()
