@@ -89,8 +89,14 @@ def trajectory_dataset(run: Any) -> "xr.Dataset":
 
 
 # arviz is an extra, so its class cannot be named here.
-def posterior_tree(draws: Mapping[str, np.ndarray]) -> Any:
-    """Posterior draws, each (chains, draws), as arviz' inference data with a group `posterior`.
+def posterior_tree(
+    draws: Mapping[str, np.ndarray], statistics: Mapping[str, np.ndarray] | None = None
+) -> Any:
+    """Posterior draws, each (chains, draws), as arviz' inference data.
+
+    Args:
+        draws: of the group `posterior`.
+        statistics: of the group `sample_stats`; none unless given.
 
     Raises:
         ValueError: arviz is not installed.
@@ -102,4 +108,7 @@ def posterior_tree(draws: Mapping[str, np.ndarray]) -> Any:
             "to_arviz: arviz is not installed, expected the extra bayes: "
             "pip install 'heli_jax[bayes]'"
         ) from e
-    return arviz.from_dict({"posterior": dict(draws)})
+    groups = {"posterior": dict(draws)}
+    if statistics:
+        groups["sample_stats"] = dict(statistics)
+    return arviz.from_dict(groups)

@@ -150,10 +150,13 @@ def in_words(stage: Stage, compiling: float | None, now: float) -> str:
     spent = now - stage.began
     if compiling is not None and now - compiling > _AFTER:
         return f"{stage.words}: compiling, {now - compiling:.0f} s"
+    detail = [stage.detail] if stage.detail else []
+    if stage.part is not None:
+        detail = [f"start {stage.part[0]} of {stage.part[1]}", *detail]
     if stage.first is None:
-        return f"{stage.words}: {_time(spent)}"
+        return f"{stage.words}: {', '.join([*detail, _time(spent)])}"
     of = f"{stage.done} of {stage.total}" if stage.total else f"step {stage.done}"
-    parts = [of, *([stage.detail] if stage.detail else [])]
+    parts = [of, *detail]
     done, since = stage.done - stage.first[0], now - stage.first[1]
     # The first step compiles: a rate that contained it would foretell hours.
     if done and since > 0:
@@ -161,6 +164,12 @@ def in_words(stage: Stage, compiling: float | None, now: float) -> str:
     parts.append(_time(spent))
     if done and stage.total and stage.done < stage.total:
         parts.append(f"{_time((stage.total - stage.done) * since / done)} left")
+    elif stage.part is not None and stage.part[0] > 1:
+        over, of_all = stage.part[0] - 1, stage.part[1]
+        parts.append(f"about {_time(spent * (of_all - over) / over)} left")
+    elif done and stage.part is None and stage.limit is not None and stage.done < stage.limit:
+        # A search has no length: it ends where it arrives, and is given up after so many steps.
+        parts.append(f"search ends within {_time((stage.limit - stage.done) * since / done)}")
     return f"{stage.words}: {', '.join(parts)}"
 
 

@@ -29,6 +29,10 @@ class Stage:
     began: float = field(default_factory=time.perf_counter)
     first: tuple[int, float] | None = None
     """what was done, and when, as the first of them was: it may have been compiled before"""
+    limit: int | None = None
+    """how many steps may be done when the search under way ends at the latest"""
+    part: tuple[int, int] | None = None
+    """which of how many equal parts is under way, from 1: starts of an optimiser"""
 
 
 class Observer(Protocol):
@@ -133,6 +137,40 @@ def watched() -> bool:
     """Whether anybody looks: what it costs to say how far a stage is can be saved otherwise."""
     work = _work.get()
     return work is not None and work.observer is not None
+
+
+def note(detail: str) -> None:
+    """What the innermost stage is at, between two of its steps.
+
+    Args:
+        detail: in words.
+    """
+    work = _work.get()
+    if work is not None and work.stack:
+        work.stack[-1].detail = detail
+
+
+def at_most(steps: int) -> None:
+    """The innermost stage begins a search that ends after so many further steps at the latest.
+
+    Args:
+        steps: how many.
+    """
+    work = _work.get()
+    if work is not None and work.stack:
+        inner = work.stack[-1]
+        inner.limit = inner.done + steps
+
+
+def part(which: tuple[int, int] | None) -> None:
+    """The innermost stage begins one of several parts that take about as long as each other.
+
+    Args:
+        which: its number from 1, and how many there are; None after the last of them.
+    """
+    work = _work.get()
+    if work is not None and work.stack:
+        work.stack[-1].part = which
 
 
 def advance(steps: int = 1, detail: str = "") -> None:

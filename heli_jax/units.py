@@ -26,7 +26,7 @@ meter = [length] = m = metre
 second = [time] = s = sec
 gram = [mass] = g
 radian = [angle] = rad
-stick = [] = stick
+stick = []
 percent = 0.01 = %
 permille = 0.001
 degree = 0.017453292519943295 * radian = deg = °

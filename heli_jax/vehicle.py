@@ -17,7 +17,7 @@ import numpy as np
 from heli_jax import naming, units
 from heli_jax.errors import InputError, nearest
 from heli_jax.naming import Record, Scalar
-from heli_jax.yaml_file import read_mapping
+from heli_jax.yaml_file import EDIT, read_mapping
 
 
 def _scalar(value: Any) -> Any:
@@ -285,6 +285,8 @@ def constant(entry: Any, name: str, si: str | None, where: str) -> Constant:
             raise InputError(f"{place}: expected a number under value, got none")
         unit, source = str(entry.get("unit", unit)), str(entry.get("source", ""))
         entry = entry["value"]
+    if entry == EDIT:
+        raise InputError(f"{place}: is still {EDIT}, expected its value in {unit}")
     # YAML's true is a bool, which Python counts among the integers.
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         raise InputError(f"{place}: expected a number, got {entry!r:.40}")

@@ -222,6 +222,12 @@ def run_check(config: Experiment | str | Path, *, progress: Say = _silent) -> Ch
 def reading_notes(problem: Problem) -> list[str]:
     """What the reader of each log assumed or did, a sentence each that begins with the log; and
     where the starts come from, if they were found."""
+    guess = problem.first_guess
+    return list(dict.fromkeys((*log_notes(problem), *(guess.sentences if guess else ()))))
+
+
+def log_notes(problem: Problem) -> list[str]:
+    """What the reader of each log assumed or did, a sentence each that begins with the log."""
     notes = []
     for flight in problem.flights:
         where = flight.source.path if flight.source else flight.name
@@ -232,7 +238,6 @@ def reading_notes(problem: Problem) -> list[str]:
             # Held inputs are what a reader expects of a stick, and need no word.
             if flight.hold[name] == "linear"
         ]
-    notes += problem.first_guess.sentences if problem.first_guess is not None else ()
     # Several flights may be windows of one log: what is the same for all of them is said once.
     return list(dict.fromkeys(notes))
 
@@ -328,16 +333,18 @@ def compare_models(
 
 
 def write_report(run: FitRun, out: str | Path) -> FitRun:
-    """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/.
+    """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
+    posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
     The directory appears whole or not at all. Returns the run with `directory` set.
 
     Raises:
-        InputError: `out` exists or cannot be written to.
+        InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
     """
     from heli_jax.report.drawings import Analysis
     from heli_jax.report.html import write_report as write_page
     from heli_jax.report.origin import origin
+    from heli_jax.report.sample_files import sample_files, write_samples
 
     out = Path(out)
     run_directory.require_free(out)
@@ -350,8 +357,10 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem
         analysis = Analysis(run.fit, run.problem, run.baseline, extra)
-        beside = ("config.yaml", "fit.json", "signals.csv")
-        write_page(folder, analysis, title, vehicle.constants, origin(text, beside))
+        sampled = sample_files(extra.intervals)
+        made = origin(text, ("config.yaml", "fit.json", "signals.csv", *sampled))
+        write_samples(folder, run.fit, extra.intervals, made, str(run.config.path))
+        write_page(folder, analysis, title, vehicle.constants, made)
         run.fit.timing["report"] = time.perf_counter() - started
         # fit.json comes last, since it holds how long all the rest took.
         run.fit.timing["total"] = time.perf_counter() - run.began

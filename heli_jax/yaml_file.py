@@ -15,6 +15,9 @@ from heli_jax.regular_file import read_regular
 _LIMIT_BYTES = 1_000_000
 _LIMIT_NODES = 100_000
 _LIMIT_DEPTH = 40
+EDIT = "EDIT"
+"""stands in a file that was written for the user where only the user knows the number: no file with
+it is accepted"""
 _LONGEST_KEY = 200
 """characters: a message that names a key stays a sentence"""
 

@@ -201,6 +201,7 @@ def test_nothing_imports_the_command_line(name):
                 "flights/array_table.py",
                 "flights/convert.py",
                 "exports.py",
+                "report/sample_files.py",
                 "simulation/trajectory.py",
                 "sweep_workflow.py",
             },

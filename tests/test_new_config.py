@@ -71,8 +71,55 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(
     vehicle = yaml_file.read_mapping(tmp_path / "mine-vehicle.yaml")
     assert vehicle["Omega"]["value"] == pytest.approx(1450 * np.pi / 30, rel=1e-4)
     assert vehicle["L3"] == {"value": "EDIT", "unit": "m"}
+    # A stand without spring would be believed if nothing marked it.
+    words = (tmp_path / "mine-vehicle.yaml").read_text()
+    for name, unset in (("kappa", "does not spring"), ("zeta", "does not damp")):
+        [line] = [v for v in words.splitlines() if v.startswith(f"{name}: {{value: 0,")]
+        assert f"GUESS: a stand that {unset}" in line
     assert cli.main(["check", str(out)]) == 2
-    assert "EDIT" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "is still EDIT, expected" in said
+
+
+def test_a_scale_that_only_the_user_knows_is_asked_for_in_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = write(tmp_path / "run.csv", table("roll_deg")), tmp_path / "mine.yaml"
+    vehicle = Path(__file__).parent.parent / "configs" / "vehicles" / "bench-30.yaml"
+    made = ["new", str(log), "--out", str(out), "--model", "roll-on-stand"]
+    assert cli.main([*made, "--vehicle", str(vehicle)]) == 0
+    capsys.readouterr()
+    assert cli.main(["check", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert (
+        "signals.inputs.x_roll.scale: is still EDIT, expected how much of the stated unit" in said
+    )
+    assert len(said.splitlines()) == 1
+
+
+def test_a_vehicle_file_below_or_beside_is_named_relative_to_the_configuration(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "home" / "vehicles").mkdir(parents=True)
+    (tmp_path / "home" / "runs").mkdir()
+    source = Path(__file__).parent.parent / "configs" / "vehicles" / "bench-30.yaml"
+    vehicle = tmp_path / "home" / "vehicles" / "mine.yaml"
+    vehicle.write_text(source.read_text())
+    log = write(tmp_path / "run.csv", table("roll_deg"))
+    named = {}
+    for place in ("home/a.yaml", "home/runs/a.yaml", "a.yaml", "home/runs/b/c/a.yaml"):
+        out = tmp_path / place
+        out.parent.mkdir(exist_ok=True, parents=True)
+        made = ["new", str(log), "--out", str(out), "--model", "roll-on-stand"]
+        assert cli.main([*made, "--vehicle", str(vehicle)]) == 0
+        named[place] = yaml_file.read_mapping(out)["vehicle"]
+        assert (out.parent / named[place]).resolve() == vehicle.resolve()
+    assert list(named.values()) == [
+        "vehicles/mine.yaml",
+        "../vehicles/mine.yaml",
+        "home/vehicles/mine.yaml",
+        str(vehicle.resolve()),
+    ]
 
 
 @pytest.mark.parametrize("log", ["none.csv", "text.csv"], ids=["missing", "nothing of a model"])

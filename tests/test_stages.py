@@ -67,6 +67,22 @@ def test_an_observer_hears_of_stages_of_its_own_thread_alone():
             None,
             "bootstrap: 28 of 1000, 2 a second, 14 s, 0:08:06 left",
         ),
+        # Given up after 61 steps; the third of five starts, two of which took 14 s.
+        (
+            Stage("fit", None, 11, "cost 2", 0.0, (1, 4.0), 61),
+            None,
+            "fit: step 11, cost 2, 1 a second, 14 s, search ends within 50 s",
+        ),
+        (
+            Stage("fit", None, 11, "cost 2", 0.0, (1, 4.0), 61, (3, 5)),
+            None,
+            "fit: step 11, start 3 of 5, cost 2, 1 a second, 14 s, about 21 s left",
+        ),
+        (
+            Stage("bootstrap", 1000, 0, "3 of 8 side by side arrived, step 7", 0.0),
+            None,
+            "bootstrap: 3 of 8 side by side arrived, step 7, 14 s",
+        ),
     ],
 )
 def test_a_stage_in_words(stage, compiling, words):

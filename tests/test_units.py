@@ -91,6 +91,14 @@ def test_wrong_kinds_are_named_on_both_sides(unit, si, have, want):
     assert repr(si) in str(e.value)
 
 
+def test_the_registry_is_built_without_a_word(caplog):
+    """pint warns, by a logger, of what is defined twice."""
+    units._registry.cache_clear()
+    units._parse.cache_clear()
+    assert units.factor("stick", "1") == 1.0
+    assert caplog.records == []
+
+
 def test_radians_do_not_pass_for_a_plain_number():
     # The other way round is SI's habit; this way a Hz could pass for 1/s.
     with pytest.raises(ValueError, match="Hz"):

@@ -21,7 +21,7 @@ from heli_jax.dynamics.start import starting_at
 from heli_jax.errors import InputError, nearest
 from heli_jax.linear_models.read import LinearModel, is_shipped, linear_model
 from heli_jax.vehicle import Vehicle, read_vehicle, vehicle_from_mapping
-from heli_jax.yaml_file import parse_value, read_mapping
+from heli_jax.yaml_file import EDIT, parse_value, read_mapping
 
 
 class Experiment(NamedTuple):
@@ -227,6 +227,10 @@ def _sentence(error: ErrorDetails) -> str:
         return f"{place}: unknown key{nearest(str(error['loc'][-1]), known)}"
     if error["type"] == "missing":
         return f"{place}: missing"
+    if value == EDIT:
+        return (
+            f"{place}: is still {EDIT}, expected {_MEANT.get(str(error['loc'][-1]), 'your number')}"
+        )
     # pydantic's sentence without its own beginning, made part of ours: "Input should be ...".
     message = str(error["msg"]).removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
@@ -237,6 +241,14 @@ def _sentence(error: ErrorDetails) -> str:
     if isinstance(value, dict | list) or error["type"] == "value_error":
         return f"{place}: {message}"
     return f"{place}: got {value!r:.60}, {message.replace('input should be', 'expected')}"
+
+
+_MEANT = {
+    "scale": "how much of the stated unit one unit of the log's own numbers is: the input's full "
+    "travel in that unit over its full travel in the log",
+    "start": "a value of the parameter to begin from, right to a factor of three or so",
+}
+"""by the last word of a key what `heli-jax new` could not know"""
 
 
 def _place(loc: tuple[int | str, ...]) -> str:

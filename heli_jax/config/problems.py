@@ -205,11 +205,12 @@ def _check_intervals(config: FitConfig, path: Path) -> None:
                 f"{path}: fit.intervals.profile: {name!r} is not free{nearest(name, config.free)}"
             )
     # Asked of the installation, not by an import, which takes seconds.
-    if config.intervals.nuts and importlib.util.find_spec("blackjax") is None:
-        raise InputError(
-            f"{path}: fit.intervals.nuts: blackjax is not installed, expected the extra bayes: "
-            "pip install 'heli_jax[bayes]'"
-        )
+    for package in ("blackjax", "h5netcdf"):  # that samples, and that keeps the draws
+        if config.intervals.nuts and importlib.util.find_spec(package) is None:
+            raise InputError(
+                f"{path}: fit.intervals.nuts: {package} is not installed, expected the extra "
+                "bayes: pip install 'heli_jax[bayes]'"
+            )
     if config.intervals.bootstrap and estimator_of(config.method).noise_spectrum:
         raise InputError(
             f"{path}: fit.intervals.bootstrap: not available with method {config.method}, which "

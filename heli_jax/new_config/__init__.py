@@ -20,7 +20,7 @@ from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess, Series
 from heli_jax.run_directory import require_place
 from heli_jax.vehicle import read_vehicle
-from heli_jax.yaml_file import parse_mapping
+from heli_jax.yaml_file import EDIT, parse_mapping
 
 _AXES = {
     "roll": ("roll-flybarless", ("roll_rate", "roll")),
@@ -100,10 +100,10 @@ def write_config(
     )
     for path, words in {out: content, **paths}.items():
         path.write_text(words, encoding="utf-8")
-    todo = sum(words.count(guess.EDIT) for words in (content, *paths.values()))
+    todo = sum(words.count(EDIT) for words in (content, *paths.values()))
     notes = [f"wrote {', '.join(map(str, (out, *paths)))}"]
     if todo:
-        notes.append(f"{todo} numbers are yours to give, where {guess.EDIT} stands")
+        notes.append(f"{todo} numbers are yours to give, where {EDIT} stands")
     notes.append(f"look over what is marked GUESS; next: heli-jax check {out}")
     return Written((out, *paths), tuple(notes))
 
@@ -113,6 +113,15 @@ def _relative(log: Path, out: Path) -> str:
     # Logs beside or below the configuration move with it.
     folder, path = out.absolute().parent.resolve(), log.absolute().resolve()
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+
+
+def _near(vehicle: Path, out: Path) -> str:
+    """The vehicle file as a configuration in `out` names it."""
+    # Vehicle files often lie in a folder beside that of the configurations: the two move together.
+    folder, path = out.absolute().parent.resolve(), vehicle.absolute().resolve()
+    beside = folder.parent != Path(folder.anchor) and path.is_relative_to(folder.parent)
+    together = beside or path.is_relative_to(folder)
+    return path.relative_to(folder, walk_up=True).as_posix() if together else str(path)
 
 
 def _read(path: Path, number: int | None) -> _Log:
@@ -320,7 +329,7 @@ def _vehicle(
     if vehicle is not None:
         read = read_vehicle(vehicle, chosen.model.Params, naming.names(chosen.model.Params))
         values = {n: c.value for n, c in read.constants.items()}
-        return {}, values, _relative(Path(vehicle), out)
+        return {}, values, _near(Path(vehicle), out)
     place = out.with_name(f"{out.stem}-vehicle.yaml")
     if place.exists():
         raise InputError(f"{place}: is there already; expected --vehicle with it, or another --out")
@@ -333,10 +342,10 @@ def _free(chosen: text.Chosen, constants: Mapping[str, float]) -> dict[str, floa
     known = naming.names(chosen.model.Params)
     if not chosen.linear:
         names = [n for n in listed["of the paper"] if n in known] or list(known)
-        return {n: constants.get(n, guess.EDIT) for n in names}
+        return {n: constants.get(n, EDIT) for n in names}
     assert isinstance(chosen.name, dict)
     file = chosen.name["linear"]
     own = linear_models.linear_model(file).vehicle().constants
     values = {n: c.value for n, c in own.items()} | dict(constants)
     # Gravity is known, whatever a model's file calls free.
-    return {n: values.get(n, guess.EDIT) for n in listed.get(file, known) if n not in _GRAVITY}
+    return {n: values.get(n, EDIT) for n in listed.get(file, known) if n not in _GRAVITY}

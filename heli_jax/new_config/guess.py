@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
+from heli_jax.yaml_file import EDIT
 
-EDIT = "EDIT"
-"""stands where only the user knows the number: no configuration with it is accepted"""
 # Longest first, so that deg/s is not read as deg.
 _UNIT_WORDS = {
     "deg/s": "deg/s", "deg per s": "deg/s", "degs": "deg/s", "dps": "deg/s", "rad/s": "rad/s",

@@ -10,9 +10,12 @@ from heli_jax import naming
 from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
 from heli_jax.errors import InputError
 from heli_jax.flights.describe import TimeInfo
-from heli_jax.new_config.guess import EDIT, Guess
+from heli_jax.new_config.guess import Guess
+from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
+_UNSET = {"kappa": "a stand that does not spring", "zeta": "a stand that does not damp"}
+"""what a constant's default says where it is not zero for every machine"""
 # Short words of YAML (on, y, null) and numbers are none of these.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
@@ -119,6 +122,8 @@ def vehicle(model: Any, found: Mapping[str, tuple[str, float]]) -> str:
         if name in found:
             channel, mean = found[name]
             value, meaning = f"{mean:.5g}", f"{meaning}; GUESS: mean of {channel}"
+        elif value != EDIT and name in _UNSET:
+            meaning = f"{meaning}; GUESS: {_UNSET[name]}; measure it, or let the fit find it"
         lines.append(f"{name}: {{value: {value}, unit: {_value(unit)}}}   # {_comment(meaning)}")
     return "\n".join(lines) + "\n"
 

@@ -1,10 +1,13 @@
 """The words under the report's figures, and those for who does not see them."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from heli_jax.identification.result import Fit
-from heli_jax.numbers import number, percent
+from heli_jax.numbers import measured, number, percent
 from heli_jax.report.drawings import Analysis
+from heli_jax.report.figures.samples import MOST, share_within
 from heli_jax.report.pictures import Picture
 
 _MOST = 6
@@ -22,6 +25,10 @@ _CAPTIONS = {
     "starts": "The misfit that each start of the optimiser reached, best first.",
     "rls": "Each coefficient while the record goes by: one to be trusted settles.",
     "intervals": "Of each parameter, by every method; the dotted line is the estimate.",
+    "trace": "Each colour is a chain. Chains to be trusted cannot be told apart and do not drift.",
+    "pairs": "Dots and bars: the samples. Blue: the fit's Gaussian approximation with its "
+    "intervals' sd; 95 % of it lie within a curve. Where the dots do not follow it, neither do "
+    "intervals and correlations.",
 }
 """by group, what a figure shows, after its title"""
 GROUPS = tuple(_CAPTIONS)
@@ -56,10 +63,46 @@ def alt_text(picture: Picture, analysis: Analysis) -> str:
             for method, (low, high) in methods.items()
         ]
         return f"{picture.title}. 95 % intervals: {'; '.join(words)}."
+    if picture.name == "trace" or picture.name.startswith("pairs"):
+        return f"{picture.title}. {_sampled(picture.name, analysis)}."
     for output, m in fit.metrics.items():
         if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
             return f"{picture.alt} Over the fitted flights: VAF {percent(m.vaf)}."
     return picture.alt
+
+
+def _sampled(name: str, analysis: Analysis) -> str:
+    """What the figures of draws and bootstrap show."""
+    comparison, fit = analysis.supplementary.intervals, analysis.fit
+    assert comparison is not None
+    posterior, booted = comparison.posterior, comparison.bootstrap
+    if name == "trace" and posterior is not None:
+        each = (f"{n} {_scatter(v, fit, n)}" for n, v in list(posterior.draws.items())[:MOST])
+        chains, draws = next(iter(posterior.draws.values())).shape
+        return (
+            f"{chains} chains of {draws} draws, {posterior.divergent} divergent; "
+            f"mean and sd of all: {'; '.join(each)}"
+        )
+    samples: Mapping[str, np.ndarray] = {}
+    if name == "pairs_posterior" and posterior is not None:
+        samples = posterior.draws
+    elif booted is not None:
+        samples = booted.values
+    names = list(samples)[:MOST]
+    each = "; ".join(f"{n} {_scatter(samples[n], fit, n)}" for n in names)
+    pairs = [(names[j], names[i]) for i in range(len(names)) for j in range(i)]
+    shares = [(p, s) for p in pairs if (s := share_within(fit, samples, *p)) is not None]
+    # What is furthest from the 95 % that the curve stands for is told first.
+    worst = sorted(shares, key=lambda s: -abs(s[1] - 0.95))[:_MOST]
+    inside = ", ".join(f"{x} and {y} {percent(share, 0)}" for (x, y), share in worst)
+    count = next(iter(samples.values())).size
+    told = f". Within the Gaussian 95 % curve: {inside}" if inside else ""
+    return f"{count} samples, mean and sd: {each}{told}"
+
+
+def _scatter(values: np.ndarray, fit: Fit, name: str) -> str:
+    mean, sd = measured(float(np.std(values)), float(np.mean(values)))
+    return f"{mean}, {sd} {fit.estimates[name].unit}".rstrip()
 
 
 def _correlations(fit: Fit) -> str:

@@ -12,6 +12,7 @@ from heli_jax.flights.flight import Signal
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
+from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import figures
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.fitted_responses import FittedPair
@@ -39,6 +40,7 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     model, drawings = problem.model, {}
     if supplementary.intervals is not None:
         drawings["intervals"] = _drawing(figures.intervals, supplementary.intervals, fit)
+        drawings |= _samples(supplementary.intervals, fit)
     parts = _parts([s.flight for s in fit.signals])
     for i in _drawn([s.hold_out for s in fit.signals]):
         s, part = fit.signals[i], parts[i]
@@ -58,6 +60,17 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     drawings["starts"] = _drawing(figures.waterfall, fit.starts)
     if baseline is not None:
         drawings["rls"] = _drawing(figures.rls_history, baseline)
+    return drawings
+
+
+def _samples(comparison: Intervals, fit: Fit) -> dict[str, Draw]:
+    """Of what was sampled; nothing where nothing was."""
+    drawings, posterior, booted = {}, comparison.posterior, comparison.bootstrap
+    if posterior is not None:
+        drawings["trace"] = _drawing(figures.trace, posterior, fit)
+        drawings["pairs_posterior"] = _drawing(figures.posterior_pairs, posterior, fit)
+    if booted is not None:
+        drawings["pairs_bootstrap"] = _drawing(figures.bootstrap_pairs, booted, fit)
     return drawings
 
 

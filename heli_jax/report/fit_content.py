@@ -170,6 +170,7 @@ def intervals(comparison: Intervals | None) -> dict[str, Any] | None:
             "effective": p.effective,
             "divergent": p.divergent,
             "trusted": p.trusted,
+            "by_parameter": {n: c._asdict() for n, c in p.convergence.items()},
         }
     return content
 

@@ -132,6 +132,7 @@ def _more_results(analysis: Analysis) -> dict[str, Any]:
         "supplementary": more,
         "choice": tables.choice(more.choice) if more.choice else None,
         "intervals": tables.intervals(more.intervals, fit) if more.intervals else None,
+        "sampling": _sampling(analysis),
         "methods": tables.methods(more.methods) if more.methods else None,
         "guess": guess,
         "guess_method": tables.start_method(guess) if guess else "",
@@ -143,6 +144,14 @@ def _more_results(analysis: Analysis) -> dict[str, Any]:
         "handling": tables.handling(handling),
         "handling_sentences": tables.handling_sentences(handling),
     }
+
+
+def _sampling(analysis: Analysis) -> tables.Table | None:
+    """Whether the chains agree; None where there are none."""
+    comparison = analysis.supplementary.intervals
+    if comparison is None or comparison.posterior is None:
+        return None
+    return tables.sampling(comparison.posterior)
 
 
 def _provenance(analysis: Analysis, vehicle_constants: Mapping[str, Constant]) -> dict[str, Any]:

@@ -36,6 +36,8 @@ class Outcome(NamedTuple):
     """by path within its directory"""
     sentence: str | None = None
     """why there is no fit; None where there is one"""
+    notes: tuple[str, ...] = ()
+    """what the readers of its logs assumed or did"""
 
 
 def fit_point(task: Task) -> Outcome:
@@ -45,7 +47,7 @@ def fit_point(task: Task) -> Outcome:
         task: what to fit.
     """
     try:
-        return Outcome(_files(task))
+        return _fitted(task)
     except InputError as e:
         return failure(" ".join(str(e).split()), task)
     except Exception as e:  # a fault of ours, whose traceback a report of it needs
@@ -68,7 +70,7 @@ def failure(sentence: str, task: Task, trace: str = "") -> Outcome:
     return Outcome({"failed.json": text.encode()}, sentence)
 
 
-def _files(task: Task) -> dict[str, bytes]:
+def _fitted(task: Task) -> Outcome:
     # Here, since the process that asks and writes needs neither.
     from heli_jax import workflow
     from heli_jax.config.experiment import from_content
@@ -80,11 +82,12 @@ def _files(task: Task) -> dict[str, bytes]:
             workflow.write_report(run, place)
         else:
             _write_plain(run, place)
-        return {
+        files = {
             file.relative_to(place).as_posix(): file.read_bytes()
             for file in sorted(place.rglob("*"))
             if file.is_file()
         }
+    return Outcome(files, notes=tuple(workflow.log_notes(run.problem)))
 
 
 # Any: a FitRun, whose module takes a second to import.
@@ -94,11 +97,15 @@ def _write_plain(run: Any, place: Path) -> None:
 
     from heli_jax.config import resolved
     from heli_jax.report import files
+    from heli_jax.report.origin import origin
+    from heli_jax.report.sample_files import write_samples
     from heli_jax.yaml_file import as_yaml
 
     place.mkdir()
     (place / "config.yaml").write_text(as_yaml(resolved(run.config)), encoding="utf-8")
     files.write_signals(place / "signals.csv", run.fit.signals)
+    further = run.supplementary.intervals
+    write_samples(place, run.fit, further, origin(), str(run.config.path))
     run.fit.timing["total"] = time.perf_counter() - run.began
     content = files.fit_json(run.fit, run.problem, run.baseline, run.supplementary)
     files.write_json(place / "fit.json", content)

@@ -146,9 +146,15 @@ def _compute(tasks: Sequence[Task], places: Sequence[Path], options: Options) ->
         return
     done = len(tasks) - len(todo)
     first: tuple[float, int] | None = None
+    said: set[str] = set()
     for number, outcome in _outcomes([tasks[k] for k in todo], options):
         place = places[todo[number]]
         directory.write_fit(place, outcome)
+        # Fits of one log share what its reader has to say.
+        for note in outcome.notes:
+            if note not in said:
+                options.say(note)
+        said.update(outcome.notes)
         if outcome.sentence is not None:
             options.say(f"{place.name}: no fit: {outcome.sentence}")
         done += 1

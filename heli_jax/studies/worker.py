@@ -28,7 +28,8 @@ def write_outcome(stream: IO[bytes], outcome: Outcome) -> None:
         outcome: of a fit.
     """
     sizes = {name: len(data) for name, data in outcome.files.items()}
-    head = json.dumps({"sentence": outcome.sentence, "files": sizes})
+    content = {"sentence": outcome.sentence, "files": sizes, "notes": outcome.notes}
+    head = json.dumps(content)
     stream.write(head.encode() + b"\n")
     for data in outcome.files.values():
         stream.write(data)
@@ -49,7 +50,7 @@ def read_outcome(stream: IO[bytes]) -> Outcome | None:
     # Cut off where the process died as it wrote.
     if any(len(files[name]) < size for name, size in head["files"].items()):
         return None
-    return Outcome(files, head["sentence"])
+    return Outcome(files, head["sentence"], tuple(head["notes"]))
 
 
 def main() -> None:

@@ -163,9 +163,21 @@ def test_what_is_wrong_ends_in_one_sentence(options, words, config, tmp_path, mo
     assert "is set twice" in capsys.readouterr().err
 
 
+def test_what_readers_of_logs_say_is_said_once(tmp_path, monkeypatch):
+    outcomes = [
+        Outcome({"fit.json": b"{}"}, None, ("a.csv: two rows were left out",)),
+        Outcome({"fit.json": b"{}"}, None, ("a.csv: two rows were left out", "b.csv: in ms")),
+    ]
+    monkeypatch.setattr(studies, "_outcomes", lambda tasks, options: enumerate(outcomes))
+    said = []
+    studies._compute([None] * 2, [tmp_path / "0", tmp_path / "1"], studies.Options(say=said.append))
+    assert said == ["a.csv: two rows were left out", "b.csv: in ms"]
+
+
 def test_an_answer_that_is_cut_off_is_none():
     stream = io.BytesIO()
-    outcome = Outcome({"fit.json": b"{}\n", "figures/a.png": bytes(range(256))}, None)
+    files = {"fit.json": b"{}\n", "figures/a.png": bytes(range(256))}
+    outcome = Outcome(files, None, ("bench.csv: ten rows were left out",))
     write_outcome(stream, outcome)
     whole = stream.getvalue()
     assert read_outcome(io.BytesIO(whole)) == outcome

@@ -1,5 +1,7 @@
 """Levenberg-Marquardt by optimistix on the one residual, from one start or many."""
 
+import functools
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -46,6 +48,8 @@ class Optimum(NamedTuple):
     """the optimiser's own word, and everything finite"""
 
 
+_SHOWN = 0.3
+"""s between two words of how far a run is: what that costs is then a few thousandths of it"""
 _MANY_STEPS = 60
 """steps after which a run among many, which began near its optimum, is given up"""
 
@@ -69,6 +73,9 @@ def _descend(
         if compiled is SINGLE and stages.watched():
             now = _optimum(constants.scaling.residual_norm, state, state.xi, count)
             stages.advance(detail=f"cost {float(now.cost):.4g}")
+        elif stages.watched():
+            arrived = int(np.sum(state.done))
+            stages.note(f"{arrived} of {np.size(state.done)} side by side arrived, step {k + 1}")
         # Asked before the residuals: those at a point that nobody steps to would cost the most.
         if k + 1 == max_steps or bool(np.all(state.done)):
             break
@@ -89,23 +96,28 @@ class _Run(NamedTuple):
     J: Array
 
 
-class _Loop(NamedTuple):
-    """A run that evaluates its residuals itself."""
+class _Standing(NamedTuple):
+    """How far a run is that evaluates its residuals itself; what it goes on from."""
 
     k: Array
+    """steps done; of none the rest means nothing"""
     scaling: Scaling
     state: State
+
+
+class _Loop(NamedTuple):
+    """Such a run while it goes on."""
+
+    standing: _Standing
     last: ResidualAndJacobian
     """of the last point that was tried"""
 
 
 class _End(NamedTuple):
-    """Where such a run ended."""
+    """Where it ended, or was interrupted."""
 
     z: Float[Array, " q"]
-    scaling: Scaling
-    """at its start"""
-    state: State
+    standing: _Standing
     last: ResidualAndJacobian
 
 
@@ -115,38 +127,92 @@ def _optimise_in_one_program(
     data: Data,
     noise: Noise,
     z0: Float[Array, " q"],
-    max_steps: np.ndarray,
+    begun: _Standing,
+    until: np.ndarray,
     trusted: np.ndarray,
 ) -> _End:
-    """`_descend` from one start as one program; with one step it evaluates z0 and nothing else."""
+    """`_descend` from one start as one program, up to `until` steps in all; with one step it
+    evaluates z0 and nothing else."""
 
     def more(now: _Loop) -> Array:
-        return (now.k < max_steps) & ~now.state.done
+        return (now.standing.k < until) & ~now.standing.state.done
 
     def step(now: _Loop) -> _Loop:
-        tried = point(constants_of(layout, z0, now.scaling), now.state.solver.y_eval)
+        k, units, state = now.standing
+        tried = point(constants_of(layout, z0, units), state.solver.y_eval)
         e = differentiate(layout, data, noise, tried)
         units = jax.tree.map(
-            lambda new, old: jnp.where(now.k == 0, new, old),
-            scaling(e.r, e.J, trusted),
-            now.scaling,
+            lambda new, old: jnp.where(k == 0, new, old), scaling(e.r, e.J, trusted), units
         )
         constants = constants_of(layout, z0, units)
-        state = advance(constants, now.state, compressed(constants, e.r, e.J))
-        return _Loop(now.k + 1, units, state, e)
+        state = advance(constants, state, compressed(constants, e.r, e.J))
+        return _Loop(_Standing(k + 1, units, state), e)
 
-    end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0))
-    constants = constants_of(layout, z0, end.scaling)
-    return _End(point(constants, end.state.xi), end.scaling, end.state, end.last)
+    end = jax.lax.while_loop(more, step, _before_the_loop(layout, data, noise, z0, begun))
+    constants = constants_of(layout, z0, end.standing.scaling)
+    return _End(point(constants, end.standing.state.xi), end.standing, end.last)
 
 
-def _before_the_loop(layout: Layout, data: Data, noise: Noise, z0: Array) -> _Loop:
+def _before_the_loop(
+    layout: Layout, data: Data, noise: Noise, z0: Array, begun: _Standing
+) -> _Loop:
     # The first point is z0: until its Jacobian is known, a unit of zero goes nowhere. Evaluated
     # before the loop it would be compiled twice, the residuals being most of the program.
     units = Scaling(jnp.zeros_like(z0), jnp.ones((), z0.dtype))
+    fresh = _Standing(jnp.asarray(0), units, begin(constants_of(layout, z0, units)))
+    standing = jax.tree.map(lambda new, old: jnp.where(begun.k == 0, new, old), fresh, begun)
     shapes = jax.eval_shape(lambda: differentiate(layout, data, noise, z0))
     last = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-    return _Loop(jnp.asarray(0), units, begin(constants_of(layout, z0, units)), last)
+    return _Loop(standing, last)
+
+
+@functools.cache
+def _not_begun(q: int, dtype: np.dtype) -> _Standing:
+    """What a run of q unknowns goes on from before its first step: of the shapes of what it will.
+
+    An argument like any other, so that going on takes the program that began.
+    """
+
+    def shapes() -> _Standing:
+        zeros = jnp.zeros(q, dtype)
+        units, none = Scaling(zeros, jnp.ones((), dtype)), jnp.zeros(q, bool)
+        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True))
+        return _Standing(jnp.asarray(0), units, begin(constants))
+
+    # Of NumPy: nothing is compiled for it.
+    return jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), jax.eval_shape(shapes))
+
+
+def _in_blocks(
+    problem: tuple[Layout, Data, Noise],
+    z0: Float[Array, " q"],
+    max_steps: int,
+    trusted: np.ndarray,
+    count: int,
+) -> _End:
+    """A run by `_optimise_in_one_program`; where somebody looks, interrupted now and then to say
+    how far it is.
+
+    The same program with the same numbers goes on, so that the end is the same to the last bit.
+    """
+    standing, steps = _not_begun(z0.shape[0], z0.dtype), 1
+    if not stages.watched():
+        return _optimise_in_one_program(*problem, z0, standing, np.asarray(max_steps), trusted)
+    done, over = 0, False
+    stages.at_most(max_steps)
+    while True:
+        began = time.perf_counter()
+        until = min(done + steps, max_steps)
+        end = _optimise_in_one_program(*problem, z0, standing, np.asarray(until), trusted)
+        standing, before = end.standing, done
+        done, over = int(standing.k), bool(standing.state.done)
+        cost = _optimum(standing.scaling.residual_norm, standing.state, end.z, count).cost
+        stages.advance(done - before, f"cost {float(cost):.4g}")
+        if over or done >= max_steps:
+            return end
+        # As many as take that long: the first one may have been compiled, and says nothing.
+        spent = time.perf_counter() - began
+        steps = max(1, int(_SHOWN * (done - before) / spent))
 
 
 def residual_and_jacobian(
@@ -163,8 +229,8 @@ def residual_and_jacobian(
     if layout.estimator.one_program(layout):
         # An array and not a number, which would be compiled in: with one step alone the program
         # of a whole run would then be another.
-        none = nothing_trusted(layout)
-        return _optimise_in_one_program(layout, data, noise, z, np.asarray(1), none).last
+        begun, none = _not_begun(z.shape[0], z.dtype), nothing_trusted(layout)
+        return _optimise_in_one_program(layout, data, noise, z, begun, np.asarray(1), none).last
     return differentiate(layout, data, noise, z)
 
 
@@ -237,11 +303,10 @@ def _run(
     """
     (max_steps, trusted, held), count = limits, measured_count(data)
     if layout.estimator.one_program(layout) and held is None:
-        end = _optimise_in_one_program(layout, data, noise, z0, np.asarray(max_steps), trusted)
-        optimum = _optimum(end.scaling.residual_norm, end.state, end.z, count)
-        if stages.watched():
-            stages.advance(int(optimum.steps), f"cost {float(optimum.cost):.4g}")
-        return _Run(optimum, end.scaling.unit, end.last.r, end.last.J)
+        end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
+        _, units, state = end.standing
+        optimum = _optimum(units.residual_norm, state, end.z, count)
+        return _Run(optimum, units.unit, end.last.r, end.last.J)
 
     def evaluate(z: Array) -> tuple[Array, Array]:
         e = differentiate(layout, data, noise, z)
@@ -253,6 +318,7 @@ def _run(
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
     constants = constants_of(layout, z0, scaling(r0, J0, trusted))
+    stages.at_most(max_steps)
     if held is not None:
         # Initial states alone, from far off: steps that are shortened end in the next valley (a
         # pendulum near the top of its swing).

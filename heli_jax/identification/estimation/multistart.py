@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from heli_jax import stages
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     measured_count,
@@ -215,6 +216,8 @@ class Search:
         # has converged, took four times as long as this, and had to be compiled besides.
         runs = []
         for i in range(points.shape[0]):
+            if points.shape[0] > 1:
+                stages.part((i + 1, points.shape[0]))
             optimum = optimise(layout, self.data, noise, points[i], self.max_steps, held=self._held)
             # z stays on the device, from where the next program takes it.
             run = jax.device_get(optimum)._replace(z=optimum.z)
@@ -225,6 +228,7 @@ class Search:
             runs.append(run)
             if progress is not None and points.shape[0] > 1:
                 progress(f"{i + 1} of {points.shape[0]} starts done")
+        stages.part(None)
         return runs
 
     @property

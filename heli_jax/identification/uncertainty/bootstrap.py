@@ -22,6 +22,8 @@ class Bootstrap(NamedTuple):
     """by free parameter, (runs that converged,)"""
     failures: int
     """runs that did not converge"""
+    records: tuple[int, ...] = ()
+    """the numbers of the records that these are of"""
 
     def interval(self, name: str) -> tuple[float, float]:
         """2.5 and 97.5 % of the values."""
@@ -69,14 +71,17 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
 
     # Every refit from the optimum, which is where the record was simulated.
     starts = jnp.tile(at.z[None, :], (runs, 1))
-    records = (outputs, jnp.asarray(means, at.z.dtype))
-    optima = optimise_many(at, data, starts, records, batch=_BATCH)
+    each = (outputs, jnp.asarray(means, at.z.dtype))
+    optima = optimise_many(at, data, starts, each, batch=_BATCH)
     converged = np.asarray(optima.converged)
+    # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
+    # than they are uncertain.
     estimates = {
         name: np.asarray(value_of(at.layout, at.data, i, jnp.asarray(optima.z[converged, i])))
         for i, name in enumerate(at.layout.free)
     }
-    return Bootstrap(estimates, int(runs - converged.sum()))
+    fitted = tuple(int(i) for i in np.flatnonzero(converged))
+    return Bootstrap(estimates, runs - len(fitted), fitted)
 
 
 def _records(

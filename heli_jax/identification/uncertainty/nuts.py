@@ -1,6 +1,7 @@
 """Draws from the posterior by the No-U-Turn sampler, on the residual that the fit minimised."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -13,7 +14,8 @@ from heli_jax import stages
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.residual import prior_rows, rows_of, weak_rows
 from heli_jax.identification.result import Fit
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, value_of
+from heli_jax.identification.uncertainty.named_samples import named_samples
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
 RHAT = 1.01
 """potential scale reduction below which the chains agree (Vehtari et al., 2021)"""
@@ -26,7 +28,15 @@ _TARGET = 0.8
 """acceptance rate that the step is adapted to (Hoffman and Gelman, 2014)"""
 
 
-class Posterior(NamedTuple):
+class Convergence(NamedTuple):
+    """Whether the chains agree on one parameter."""
+
+    rhat: float
+    effective: float
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
     """Draws of the free parameters and whether they may be believed."""
 
     draws: dict[str, np.ndarray]
@@ -36,6 +46,14 @@ class Posterior(NamedTuple):
     effective: float
     """the smallest effective number of draws"""
     divergent: int
+    convergence: dict[str, Convergence] = field(default_factory=dict)
+    """by free parameter, in the optimiser's coordinates"""
+    nuisance: dict[str, np.ndarray] = field(default_factory=dict)
+    """draws of what was sampled beside the free parameters, as `Fit.nuisance` names it; the scale
+    of the noise is integrated out and so has none"""
+    statistics: dict[str, np.ndarray] = field(default_factory=dict)
+    """by draw (chains, draws), by arviz' names: `diverging`, `energy`, `acceptance_rate`, `n_steps`
+    (of the integrator), `tree_depth`, `lp` (log density but for a constant), `step_size`"""
 
     @property
     def trusted(self) -> bool:
@@ -48,15 +66,15 @@ class Posterior(NamedTuple):
         return float(low), float(high)
 
     def to_arviz(self) -> Any:
-        """The draws as arviz' inference data (an xarray DataTree), group `posterior`, for its
-        diagnostics and plots.
+        """The draws as arviz' inference data (an xarray DataTree) for its diagnostics and plots:
+        groups `posterior`, of the free parameters, and `sample_stats`.
 
         Raises:
             ValueError: arviz is not installed (extra `bayes`).
         """
         from heli_jax.exports import posterior_tree
 
-        return posterior_tree(self.draws)
+        return posterior_tree(self.draws, self.statistics)
 
 
 def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Posterior:
@@ -108,9 +126,9 @@ def nuts(fit: Fit, draws: int = 500, *, warmup: int = 200, seed: int = 0) -> Pos
 
     # blackjax mixes dtypes and ranks where this package would not.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        positions, divergent = _sample(blackjax, forward, at, draws, warmup, seed)
-        z = np.asarray(at.z + positions @ root.T)
-        return _posterior(at, z, int(np.sum(np.asarray(divergent))))
+        positions, statistics = _sample(blackjax, forward, at, draws, warmup, seed)
+        z = jnp.asarray(at.z + positions @ root.T)
+        return _posterior(fit, z, statistics)
 
 
 def _sample(
@@ -120,8 +138,8 @@ def _sample(
     draws: int,
     warmup: int,
     seed: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (chains, draws, q) and whether each step diverged (chains, draws)."""
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Positions (chains, draws, q) and `Posterior.statistics`."""
     q = at.layout.size
     keys = jax.random.split(jax.random.key(seed), 3)
     adaptation = blackjax.window_adaptation(
@@ -130,7 +148,8 @@ def _sample(
     # Whitened coordinates: a tenth of a standard deviation off the optimum.
     first = 0.1 * jax.random.normal(keys[0], (q,), at.z.dtype)
     run = jax.jit(adaptation.run, static_argnums=2)
-    (state, parameters), _ = run(keys[1], first, warmup)
+    with stages.stage(f"NUTS, warm-up of {warmup} steps"):
+        (state, parameters), _ = jax.block_until_ready(run(keys[1], first, warmup))
     sampler = blackjax.nuts(density, **parameters)
     # Chains begin apart, so that R-hat can tell whether they meet; this much of them is left out.
     settling = warmup // 2
@@ -139,9 +158,17 @@ def _sample(
     def begin(key: Array) -> Any:
         return sampler.init(state.position + 0.5 * jax.random.normal(key, (q,), at.z.dtype))
 
-    def step(state: Any, key: Array) -> tuple[Any, tuple[Array, Array]]:
+    def step(state: Any, key: Array) -> tuple[Any, tuple[Array, dict[str, Array]]]:
         state, info = sampler.step(key, state)
-        return state, (state.position, info.is_divergent)
+        statistics = {
+            "diverging": info.is_divergent,
+            "energy": info.energy,
+            "acceptance_rate": info.acceptance_rate,
+            "n_steps": info.num_integration_steps,
+            "tree_depth": info.num_trajectory_expansions,
+            "lp": state.logdensity,
+        }
+        return state, (state.position, statistics)
 
     pairs = jax.vmap(jax.random.split)(jax.random.split(keys[2], _CHAINS))
     chains = jax.jit(jax.vmap(begin))(pairs[:, 0])
@@ -157,22 +184,33 @@ def _sample(
             chains, drawn = some(chains, split[:, i : i + block])
             found.append(jax.device_get(drawn))
             stages.advance(min(block, count - i))
-    positions, divergent = (np.concatenate(v, axis=1) for v in zip(*found, strict=True))
-    return positions[:, settling:count], divergent[:, settling:count]
+    joined = jax.tree.map(lambda *v: np.concatenate(v, axis=1)[:, settling:count], *found)
+    positions, statistics = joined
+    # One for all chains: it was adapted before they began.
+    size = np.broadcast_to(np.asarray(parameters["step_size"]), statistics["lp"].shape)
+    return positions, {**statistics, "step_size": size}
 
 
-def _posterior(at: Solution, z: Float[np.ndarray, "chains draws q"], divergent: int) -> Posterior:
+def _posterior(
+    fit: Fit, z: Float[Array, "chains draws q"], statistics: dict[str, np.ndarray]
+) -> Posterior:
     from blackjax import diagnostics
 
+    names = fit.reached.layout.free
     # In the optimiser's coordinates, in which the posterior is nearest to a normal distribution.
-    named = jnp.asarray(z[:, :, : len(at.layout.free)])
-    rhat = np.max(np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named)))
-    effective = np.min(np.asarray(jax.jit(diagnostics.effective_sample_size)(named)))
-    values = {
-        name: np.asarray(value_of(at.layout, at.data, i, named[:, :, i]))
-        for i, name in enumerate(at.layout.free)
-    }
-    return Posterior(values, float(rhat), float(effective), divergent)
+    named = z[:, :, : len(names)]
+    rhat = np.asarray(jax.jit(diagnostics.potential_scale_reduction)(named))
+    effective = np.asarray(jax.jit(diagnostics.effective_sample_size)(named))
+    samples = named_samples(fit, z)
+    return Posterior(
+        samples.parameters,
+        float(np.max(rhat)),
+        float(np.min(effective)),
+        int(np.sum(statistics["diverging"])),
+        {n: Convergence(float(rhat[i]), float(effective[i])) for i, n in enumerate(names)},
+        samples.nuisance,
+        statistics,
+    )
 
 
 def log_posterior(

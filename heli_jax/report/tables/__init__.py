@@ -9,6 +9,7 @@ from heli_jax.report.tables.estimates import (
     nuisances,
     parameters,
     prior_note,
+    sampling,
     starts,
     verdict,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "prior_note",
     "residuals",
     "responses",
+    "sampling",
     "selection_steps",
     "start_method",
     "starts",

@@ -7,6 +7,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
 from heli_jax.numbers import NOTHING, measured, number, percent, relative
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
 from heli_jax.report.unit_symbols import pretty
@@ -107,6 +108,20 @@ def intervals(comparison: Intervals, fit: Fit) -> Table:
         rows.append((name, *cells, pretty(fit.estimates[name].unit)))
     heads = {"gaussian": "Gaussian", "nuts": "NUTS"}
     return Table(("parameter", *(heads.get(m, m) for m in present), "unit"), rows)
+
+
+def sampling(posterior: Posterior) -> Table:
+    """Whether the chains of NUTS agree: R-hat and effective draws by parameter, divergent steps."""
+    rows = [
+        (name, f"{c.rhat:.3f}", f"{c.effective:.0f}", NOTHING)
+        for name, c in posterior.convergence.items()
+    ]
+    chains, draws = next(iter(posterior.draws.values())).shape
+    worst = (f"{posterior.rhat:.3f}", f"{posterior.effective:.0f}")
+    total = f"{posterior.divergent} of {chains * draws}"
+    rows.append((f"worst of {chains} chains of {draws} draws", *worst, total))
+    rows.append(("expected", f"below {RHAT}", f"above {EFFECTIVE}", "0"))
+    return Table(("parameter", "R-hat", "effective draws", "divergent steps"), rows)
 
 
 def verdict(fit: Fit) -> Table:

@@ -1,0 +1,185 @@
+"""Draws of the posterior and samples of the bootstrap as files: posterior.nc and bootstrap.nc."""
+
+import importlib.util
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heli_jax.errors import InputError
+from heli_jax.identification.result import Fit, Signals
+from heli_jax.identification.uncertainty.bootstrap import Bootstrap
+from heli_jax.identification.uncertainty.comparison import Intervals
+from heli_jax.identification.uncertainty.nuts import Posterior
+from heli_jax.report.origin import Origin
+from heli_jax.versions import version
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+POSTERIOR, BOOTSTRAP = "posterior.nc", "bootstrap.nc"
+_WHAT = {
+    POSTERIOR: "Draws from the posterior by the No-U-Turn sampler, warm-up left out. The prior is "
+    "flat in the optimiser's coordinates (the logarithm of a parameter of one sign) beside the "
+    "priors of the configuration; the scale of the noise is integrated out (Jeffreys' prior), so "
+    "that it has no draws.",
+    BOOTSTRAP: "Estimates from records that were simulated with the fit's estimates (parametric "
+    "bootstrap): how the estimator scatters about them. These are no draws from a posterior.",
+}
+_STATISTICS = {
+    "diverging": "whether the energy error of the trajectory was too large",
+    "energy": "of the trajectory, but for a constant",
+    "acceptance_rate": "mean acceptance probability over the trajectory",
+    "n_steps": "steps of the integrator",
+    "tree_depth": "doublings of the trajectory",
+    "lp": "log density in the optimiser's coordinates, but for a constant",
+    "step_size": "of the integrator, in units of the Gaussian approximation's sd",
+}
+type _Variables = dict[str, tuple[Any, np.ndarray, dict[str, str]]]
+
+
+def sample_files(comparison: Intervals | None) -> tuple[str, ...]:
+    """The names of the files that `write_samples` writes."""
+    if comparison is None:
+        return ()
+    posterior = (POSTERIOR,) if comparison.posterior is not None else ()
+    # Of no record that could be fitted there is nothing to keep.
+    booted = comparison.bootstrap is not None and comparison.bootstrap.records
+    return posterior + ((BOOTSTRAP,) if booted else ())
+
+
+def write_samples(
+    folder: Path, fit: Fit, comparison: Intervals | None, origin: Origin, config: str
+) -> None:
+    """Write posterior.nc (NetCDF 4, for arviz) and bootstrap.nc (NetCDF 3), where there are draws
+    and samples.
+
+    Args:
+        folder: where; it exists.
+        fit: whose unknowns they are.
+        comparison: with the draws and samples; None where nothing was sampled.
+        origin: command and date.
+        config: the path of the configuration.
+
+    Raises:
+        InputError: h5netcdf is not installed (extra `bayes`).
+    """
+    names = sample_files(comparison)
+    if comparison is None or not names:
+        return
+    attributes = {
+        "inference_library": "heli_jax",
+        "inference_library_version": version(),
+        "created_at": origin.date,
+        "command": origin.command,
+        "configuration": config,
+        "model": fit.model,
+        "method": fit.method_label,
+    }
+    if comparison.posterior is not None:
+        about = {"what": _WHAT[POSTERIOR], **attributes}
+        tree = posterior_tree(fit, comparison.posterior, about)
+        if importlib.util.find_spec("h5netcdf") is None:
+            raise InputError(
+                "posterior.nc: h5netcdf is not installed, expected the extra bayes: "
+                "pip install 'heli_jax[bayes]'"
+            )
+        tree.to_netcdf(folder / POSTERIOR, engine="h5netcdf")
+    if comparison.bootstrap is not None and BOOTSTRAP in names:
+        about = {"what": _WHAT[BOOTSTRAP], **attributes}
+        dataset = bootstrap_dataset(fit, comparison.bootstrap, about)
+        # The old format, which needs nothing beside scipy: the file has no groups.
+        dataset.to_netcdf(folder / BOOTSTRAP, engine="scipy")
+
+
+def posterior_tree(fit: Fit, posterior: Posterior, attributes: Mapping[str, str]) -> "xr.DataTree":
+    """The draws with what arviz looks for beside them: groups posterior, sample_stats,
+    observed_data (outputs as measured) and constant_data (inputs).
+
+    Args:
+        fit: whose unknowns they are.
+        posterior: the draws.
+        attributes: of the file.
+    """
+    import xarray as xr
+
+    dims = ("chain", "draw")
+    draws: _Variables = {
+        name: (dims, v, {"units": fit.estimates[name].unit, "role": "parameter"})
+        for name, v in posterior.draws.items()
+    }
+    for name, values in posterior.nuisance.items():
+        known = fit.nuisance.get(name)
+        about = {"units": known.unit if known else "1", "role": "nuisance", "long_name": name}
+        draws[_variable(name, draws)] = (dims, values, about)
+    statistics: _Variables = {
+        name: (dims, values, {"long_name": _STATISTICS.get(name, name)})
+        for name, values in posterior.statistics.items()
+    }
+    chains, count = next(iter(posterior.draws.values())).shape
+    coordinates = {"chain": np.arange(chains), "draw": np.arange(count)}
+    outputs, inputs = _records([s for s in fit.signals if not s.hold_out])
+    groups = {
+        # The attributes at each group too: arviz takes a group by itself.
+        "/": xr.Dataset(attrs=dict(attributes)),
+        "posterior": xr.Dataset(draws, coordinates, dict(attributes)),
+        "sample_stats": xr.Dataset(statistics, coordinates, dict(attributes)),
+        "observed_data": xr.Dataset(outputs[0], outputs[1]),
+        "constant_data": xr.Dataset(inputs[0], inputs[1]),
+    }
+    return xr.DataTree.from_dict({n: g for n, g in groups.items() if n == "/" or g.data_vars})
+
+
+def bootstrap_dataset(fit: Fit, booted: Bootstrap, attributes: Mapping[str, str]) -> "xr.Dataset":
+    """The samples of the bootstrap, each parameter over `record`, the number of the record.
+
+    Args:
+        fit: whose unknowns they are.
+        booted: the samples.
+        attributes: of the file.
+    """
+    import xarray as xr
+
+    variables: _Variables = {
+        name: ("record", v, {"units": fit.estimates[name].unit, "role": "parameter"})
+        for name, v in booted.values.items()
+    }
+    record = ("record", np.array(booted.records, np.int32), {"long_name": "simulated record"})
+    counts = {"records_that_could_not_be_fitted": booted.failures}
+    return xr.Dataset(variables, {"record": record}, {**attributes, **counts})
+
+
+type _Coordinates = dict[str, tuple[str, np.ndarray, dict[str, str]]]
+
+
+def _records(
+    signals: list[Signals],
+) -> tuple[tuple[_Variables, _Coordinates], tuple[_Variables, _Coordinates]]:
+    """Outputs as measured and inputs of the fitted flights, SI, each over its flight's time."""
+    outputs: _Variables = {}
+    inputs: _Variables = {}
+    times: _Coordinates = {}
+    for i, s in enumerate(signals):
+        # Flights differ in length: of several each has a time of its own.
+        end = f"_{i + 1}" if len(signals) > 1 else ""
+        time = f"time{end}"
+        times[time] = (time, s.times, {"units": "s", "flight": s.flight})
+        outputs |= {
+            n + end: (time, np.asarray(v), {"flight": s.flight}) for n, v in s.measured.items()
+        }
+        inputs |= {
+            n + end: (time, np.asarray(v), {"flight": s.flight}) for n, v in s.inputs.items()
+        }
+    return (outputs, times), (inputs, times)
+
+
+def _variable(name: str, taken: Mapping[str, Any]) -> str:
+    """A name that every reader of NetCDF takes: without slashes, which would begin a group."""
+    plain = re.sub(r"\W+", "_", name).strip("_") or "nuisance"
+    plain = f"_{plain}" if plain[0].isdigit() else plain
+    unique, k = plain, 2
+    while unique in taken:
+        unique, k = f"{plain}_{k}", k + 1
+    return unique

@@ -1,0 +1,47 @@
+"""A search that says how far it is ends where one that says nothing does."""
+
+import numpy as np
+import pytest
+
+from heli_jax import Free, Problem, fit, models, stages
+from heli_jax.identification.estimation import levenberg_marquardt
+from tests.identification.bench import BENCH, record, vehicle
+
+
+class Steps:
+    """Counts what the stages say of their steps."""
+
+    def __init__(self):
+        self.stages = []
+
+    def begin(self, stage):
+        self.stages.append(stage)
+
+    def end(self, stage):
+        pass
+
+
+@pytest.fixture(scope="module")
+def problem():
+    free = {"Ixx": Free(0.06), "If": Free(5e-4), "kappa": Free(2.0)}
+    flight = record(BENCH, seed=3, n=400, noise=2e-3)
+    return Problem(models.roll_on_stand, vehicle(BENCH), [flight], free)
+
+
+@pytest.mark.parametrize("every", [0.0, 1e3], ids=["after every step", "after the first"])
+def test_numbers_are_the_same_to_the_last_bit(problem, every, monkeypatch):
+    silent = fit(problem, starts=2)
+    monkeypatch.setattr(levenberg_marquardt, "_SHOWN", every)
+    heard = Steps()
+    with stages.observed_by(heard):
+        told = fit(problem, starts=2)
+    np.testing.assert_array_equal(np.asarray(told.reached.z), np.asarray(silent.reached.z))
+    assert told.starts == silent.starts
+    assert told.trace == silent.trace
+    assert told.estimates == silent.estimates
+    [search] = [s for s in heard.stages if s.words.startswith("fitting")]
+    # All steps of all starts, and those of the rounds that relax the noise.
+    assert search.done >= sum(row.steps for row in silent.starts)
+    assert search.detail.startswith("cost ")
+    assert search.limit is not None
+    assert search.part is None
