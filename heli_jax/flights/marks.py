@@ -142,8 +142,11 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
     notes = []
     for name, numbers in channels:
         x = np.asarray(numbers)
+        # A damaged log may hold NaNs that signal when they are converted.
+        with np.errstate(invalid="ignore"):
+            x = x.astype(np.float64) if x.dtype.kind in "biuf" else x
         # Of what was never logged nothing else is there, and a switch may have any value.
-        if x.dtype.kind in "biuf" and (at := at_marks(x := x.astype(np.float64))).any():
+        if x.dtype.kind == "f" and (at := at_marks(x)).any():
             # What counts first: a terminal shows the beginning.
             stand = "stands" if np.count_nonzero(at) == 1 else "stand"
             words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"
