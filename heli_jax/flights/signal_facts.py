@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from heli_jax.flights.marks import Counts
+from heli_jax.flights.noisy_rails import noisy_rail
 from heli_jax.flights.strays import Strays
 
 FEW = 8
@@ -59,12 +60,12 @@ _RUNS = 20
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """An end of a signal's range: its value, and the times (K,) [s] of the samples there, none
-    where it is no rail; `exact` where they are all of one value."""
+    """An end of a signal's range: its value, the times (K,) [s] of the samples there, none where it
+    is no rail, and the part of the range within which they are of that value."""
 
     value: float
     times: np.ndarray
-    exact: bool = True
+    width: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,8 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 
 
 def _rail(seconds: np.ndarray, x: np.ndarray, at: np.ndarray, end: float) -> Rail:
-    return Rail(end, seconds[at], bool(np.all(x[at] == end)))
+    width = float(np.max(np.abs(x[at] - end)) / np.ptp(x)) if at.any() and np.ptp(x) > 0 else 0.0
+    return Rail(end, seconds[at], width)
 
 
 def facts_of_all[K: Hashable](
@@ -340,6 +342,7 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
     if piled and _comes_and_goes(finite == top):
         return x == top
     edge = _noisy_edge(finite)
+    edge = noisy_rail(finite) if edge is None else edge
     if edge is not None and _comes_and_goes(finite >= edge):
         return np.isfinite(x) & (x >= edge)
     return np.zeros(x.shape, bool)
