@@ -7,6 +7,18 @@ signal that moves hardly anywhere else is none of which that could be told.
 
 import numpy as np
 
+PILE = 5.0
+"""times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
+steps has 3 times as many at its turning points as at the three values before"""
+_BINS = 100
+"""of a signal's range: the outermost holds a rail with noise on it"""
+_NOISY_SHARE = 0.02
+"""part of the samples in that bin, for a rail"""
+_LEVEL = 3.0
+"""times as many samples beside a rail as elsewhere, at most: a motion that comes to rest by itself
+slows down before, and is seen there more often"""
+_FEWEST_IN_BIN = 3
+"""samples of a usual bin, by which a signal passes through all of its range"""
 _SMALLEST, _LARGEST = 0.002, 0.08
 """noise over the signal's range between which its tops are looked at: below, the counts of values
 tell; above, every motion is hidden in it"""
@@ -30,12 +42,35 @@ _REST, _MOSTLY = 0.2, 0.7
 """part of all windows that are at neither end, and part of these in which it moves, at least"""
 
 
-def noisy_rail(x: np.ndarray) -> float | None:
-    """Where the rail at the upper end of a signal begins; None where there is none.
+def rail_below_noise(x: np.ndarray) -> float | None:
+    """Where the rail at the upper end of a signal begins, that noise was added to; None where
+    there is none.
 
     Args:
         x: samples (N,) in their order, all finite.
     """
+    edge = _noisy_edge(x)
+    return _level_tops(x) if edge is None else edge
+
+
+def _noisy_edge(x: np.ndarray) -> float | None:
+    """Where the rail at the upper end begins, that has less noise than a hundredth of the range.
+
+    A converter behind what was cut off adds its own noise, and no two samples are equal then.
+    """
+    top, span = float(x.max()), float(np.ptp(x))
+    if not 0 < span < np.inf:
+        return None
+    counts = np.histogram((top - x) / span, bins=_BINS, range=(0.0, 1.0))[0]
+    usual = float(np.median(counts[1:-1]))
+    beside = float(counts[1:4].mean())
+    piled = counts[0] > PILE * max(beside, usual) and counts[0] >= _NOISY_SHARE * x.size
+    level = usual >= _FEWEST_IN_BIN and beside <= _LEVEL * usual
+    return top - span / _BINS if piled and level else None
+
+
+def _level_tops(x: np.ndarray) -> float | None:
+    """Where tops begin that are level but for noise of more than a hundredth of the range."""
     span = float(np.ptp(x))
     if x.size < 4 * _SAMPLES or not 0 < span < np.inf:
         return None

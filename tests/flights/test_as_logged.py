@@ -140,6 +140,12 @@ def test_marks_for_no_value_are_missing_and_not_spread(tmp_path):
     assert f.source is not None
     assert "10 samples of -9999 and 1 of 1e+10" in " ".join(f.source.notes)
     assert stuck([("one", f)])[0].severity == "doubt"
+    # Of a part of it those of that part count.
+    facts = [
+        h.source.facts["p", "output"] for h in (part(f, 0, 400), part(f, 400, 600)) if h.source
+    ]
+    assert [one.marks for one in facts] == [((-9999.0, 10),), ((1e10, 1),)]
+    assert stuck([("one", part(f, 0, 300))])[0].severity == "ok"
     with pytest.raises(InputError, match=r"'u'.*2 samples of 65535"):
         read(tmp_path, u=np.where((T > 3) & (T < 3.025), 65535.0, STICK), p=RATE)
     # However often: of a sensor at 5 Hz most rows hold nothing else.
