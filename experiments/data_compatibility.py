@@ -5,12 +5,15 @@
 A flight about hover, of known angles and accelerations, is logged by sensors with errors: gyro
 bias and scale, accelerometer bias and scale, a lever arm, an IMU that is early against the rest.
 The errors and all noise are drawn anew in each run. For each error: the share of runs whose 95 %
-interval holds it, the mean error in sds, and the rms of that error.
+interval holds it, the mean error in sds, and the rms of that error. With `--results FILE` each run
+is written down as it ends, and a later call of the same options goes on behind the last.
 """
 
 import argparse
 import contextlib
+import json
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -148,7 +151,7 @@ def compare(
         [sharpened(model, flight)],
         {**noise, **errors_of(model, flight.outputs)},
         Nuisance(bias=False, input_offset=False),
-        substeps=substeps_of((flight,)),
+        substeps=substeps_of(model, (flight,)),
         method=method,
     )
     found = fit(problem, starts=1)
@@ -180,17 +183,28 @@ def main() -> None:
     parser.add_argument("--gyro-noise", type=float, default=0.01, help="sd of a sample [rad/s]")
     parser.add_argument("--angles", action="store_true", help="rates against angles alone")
     parser.add_argument("--method", default="filter-error")
+    parser.add_argument("--results", type=Path, help="a line of JSON for each run, gone on with")
     options = parser.parse_args()
     table: dict[str, list[tuple[bool, float]]] = {}
+    results: Path | None = options.results
+    for line in results.read_text().splitlines() if results and results.exists() else ():
+        for name, row in json.loads(line).items():
+            table.setdefault(name, []).append(row)
+    done = max(map(len, table.values()), default=0)
     model = kinematics.attitude if options.angles else kinematics.position
     times, began = np.arange(0.0, options.duration, 1 / options.rate), time.perf_counter()
     # Interrupted, it shows what it has.
     with contextlib.suppress(KeyboardInterrupt):
-        for run in range(options.first, options.first + options.runs):
+        for run in range(options.first + done, options.first + options.runs):
             rng = np.random.default_rng(run)
             truth = draw_errors(rng, not options.angles)
             flight = logged(rng, truth, options.gyro_noise, times)
-            for name, row in compare(model, flight, truth, options.method).items():
+            rows = compare(model, flight, truth, options.method)
+            if results:
+                with results.open("a") as file:
+                    file.write(json.dumps({n: [bool(a), float(b)] for n, (a, b) in rows.items()}))
+                    file.write("\n")
+            for name, row in rows.items():
                 table.setdefault(name, []).append(row)
     print(
         f"{options.method}, {model.name}, gyro noise {options.gyro_noise:g} rad/s, "

@@ -139,10 +139,11 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
         yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
     if clock.guessed:
         yield f"the unit {clock.unit} is guessed; --time-unit says which it is"
-    for gap in clock.gaps[:_MOST_LINES]:
+    # The longest are those that a fit minds: a lost row is bridged.
+    for gap in sorted(clock.gaps, key=lambda gap: -gap.length)[:_MOST_LINES]:
         yield f"gap of {gap.length:.4g} s at {gap.start:.6g} s"
     if len(clock.gaps) > _MOST_LINES:
-        yield f"and {len(clock.gaps) - _MOST_LINES} more gaps"
+        yield f"and {len(clock.gaps) - _MOST_LINES} more gaps, none longer"
 
 
 def _gap_words(clock: TimeInfo) -> str:

@@ -201,6 +201,8 @@ def test_of_channels_without_names_the_one_that_the_output_follows_is_taken() ->
         ("GyroRoll_dps", "rad", ["phi", "roll"], False),
         ("GyroRoll", "rad", ["phi", "roll"], False),
         ("GyroRoll", "rad/s", ["p", "gyro roll"], True),
+        ("IMU.GyrX", "rad/s", ["p", "gyr x"], True),
+        ("IMU.AccX", "rad/s", ["p", "gyr x"], False),
         ("Roll_rpm", "rad", ["phi", "roll"], False),
     ],
 )

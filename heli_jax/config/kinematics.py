@@ -281,15 +281,18 @@ def _second_difference(u: np.ndarray) -> np.ndarray:
     return np.pad(np.diff(u, 2), 1, mode="edge") if u.size > 2 else np.zeros_like(u)
 
 
-_STEP = 0.005
-"""s; a filter's step holds the derivatives of the kinematics as they are at its begin, and misses
-r' theta' h^2/3 of a rate: at 20 ms as much as the noise of a gyro leaves unknown of its bias"""
+_STEP, _EXPLICIT = 0.005, 0.02
+"""s; a local linearisation holds the derivatives of the kinematics as they are at a step's begin,
+and misses r' theta' h^2/3 of a rate: at 20 ms as much as the noise of a gyro leaves unknown of its
+bias. Explicit steps follow them to the fourth order"""
 
 
-def substeps_of(flights: Sequence[Flight]) -> int:
+def substeps_of(model: Model, flights: Sequence[Flight]) -> int:
     """Steps in a sample for a kinematic model, which has no fast dynamics of its own.
 
     Args:
+        model: of `heli_jax.dynamics.kinematics`, bare or with devices around it.
         flights: read.
     """
-    return max(1, *(math.ceil(f.dt / _STEP - 1e-9) for f in flights))
+    step = _EXPLICIT if model.explicit else _STEP
+    return max(1, *(math.ceil(f.dt / step - 1e-9) for f in flights))

@@ -180,7 +180,7 @@ def with_chosen_windows(problem: Problem) -> Problem:
 
 def _substeps(model: Model, flights: Sequence[Flight]) -> int:
     if is_kinematic(model):
-        return substeps_of(flights)
+        return substeps_of(model, flights)
     return max(substeps_for(f.dt, model.fastest) for f in flights)
 
 

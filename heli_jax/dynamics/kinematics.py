@@ -288,6 +288,7 @@ attitude = Model(
     axes=(),
     delays=_GYRO,
     positive=("noise_gyro",),
+    explicit=True,
 )
 """Rates against angles."""
 
@@ -303,6 +304,7 @@ velocity = Model(
     axes=(),
     delays=_IMU,
     positive=("noise_gyro", "noise_accel", "g"),
+    explicit=True,
 )
 """Rates and specific forces against angles, velocities and airspeed."""
 
@@ -318,6 +320,7 @@ position = Model(
     axes=(),
     delays=_IMU,
     positive=("noise_gyro", "noise_accel", "g"),
+    explicit=True,
 )
 """The same against positions too."""
 

@@ -123,6 +123,9 @@ class Model(eqx.Module):
     fastest: float = eqx.field(static=True, default=0.0, kw_only=True)
     """of a model with filters of fixed constants the rate of the fastest [rad/s], which fixed steps
     have to follow"""
+    explicit: bool = eqx.field(static=True, default=False, kw_only=True)
+    """whether no mode of it is fast against the samples of a log, as of kinematics: a filter may
+    then go by explicit steps"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
     body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(

@@ -14,6 +14,7 @@ from heli_jax import units
 from heli_jax.flights.flight import Signal, Source
 from heli_jax.flights.marks import (
     Counts,
+    Marked,
     at_marks,
     counted,
     mark_words,
@@ -37,7 +38,7 @@ _NEARLY = 0.9
 """turns that an angle of no stated unit has to go over"""
 _TURN = 1.001
 """turns that a wrapped angle goes over, at most; its ends may be rounded"""
-_NONE: Mapping[Key, Mapping[str, Counts]] = MappingProxyType({})
+_NONE: Mapping[Key, Mapping[str, Marked]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class AsLogged:
 def as_logged(
     request: Request,
     signals: Mapping[Key, Timed],
-    of_sources: Mapping[Key, Mapping[str, Counts]] = _NONE,
+    of_sources: Mapping[Key, Mapping[str, Marked]] = _NONE,
 ) -> AsLogged:
     """The signals without marks and turns, and what they were.
 
@@ -79,14 +80,15 @@ def as_logged(
 def _as_logged(
     request: Request,
     signals: Mapping[Key, Timed],
-    of_sources: Mapping[Key, Mapping[str, Counts]],
+    of_sources: Mapping[Key, Mapping[str, Marked]],
 ) -> AsLogged:
     made, marks, odd, notes = {}, {}, {}, []
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = _in_log(signal, timed.values)
         at = at_marks(numbers)
-        marks[key] = _of_both(counted(numbers[at]), of_sources.get(key, {}))
+        sources = of_sources.get(key, {})
+        marks[key] = (Marked(timed.seconds[at], numbers[at]), *sources.values())
         if at.any():
             words = mark_words(counted(numbers[at]), int(np.sum(~np.isnan(numbers))))
             if key[1] == "input":
@@ -95,7 +97,7 @@ def _as_logged(
                 remedy = "expected an input that is known all the time; give a window without them"
                 raise wrong(request.path, f"{problem}; {remedy}", column(signal.name))
             notes.append(f"{name} has {words}: taken as missing")
-        notes += source_notes(name, of_sources.get(key, {}))
+        notes += source_notes(name, {n: marked.counts for n, marked in sources.items()})
         values = np.where(at, np.nan, timed.values)
         turn = _turn(signal)
         if turn is not None and is_wrapped(values, turn):
@@ -110,12 +112,12 @@ def _as_logged(
 
 def _facts(
     made: Mapping[Key, Timed],
-    marks: Mapping[Key, Counts],
+    marks: Mapping[Key, tuple[Marked, ...]],
     odd: Mapping[Key, tuple[Strays, ...]],
 ) -> dict[Key, SignalFacts]:
     outputs = frozenset(key for key in made if key[1] == "output")
     facts = facts_of_all({key: (t.seconds, t.values) for key, t in made.items()}, outputs)
-    return {key: replace(f, marks=marks[key], strays=odd[key]) for key, f in facts.items()}
+    return {key: replace(f, marked=marks[key], strays=odd[key]) for key, f in facts.items()}
 
 
 def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
@@ -134,14 +136,6 @@ def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
         f"{mark_words(counts)}: taken as missing"
         for counts, sources in alike.items()
     ]
-
-
-def _of_both(own: Counts, sources: Mapping[str, Counts]) -> Counts:
-    """A signal's own marks and those of its sources, each as often as where it is most often."""
-    most = dict(own)
-    for value, count in (pair for counts in sources.values() for pair in counts):
-        most[value] = max(most.get(value, 0), count)
-    return tuple(sorted(most.items()))
 
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:

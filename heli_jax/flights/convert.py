@@ -114,7 +114,7 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     for name in names:
         times = log.channel(name).times[clocks[log.topic_of(name).name].rows]
         marks = marks_of_sources(log, name, (times[0], times[-1]))
-        notes += source_notes(shown(name), marks)
+        notes += source_notes(shown(name), {n: m.counts for n, m in marks.items()})
     units = {name: log.topic_of(name).units.get(name, "") for name in names}
     if named is not None:
         taken = {n: s for n, s in named.signals.items() if s.name in columns}

@@ -4,13 +4,14 @@ Everything here answers None where anything is not plain: a row with other than 
 quotes, a cell that is no number. `csv_table` then looks at cells as text and finds out where.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from heli_jax.flights.csv_cells import MISSING
-from heli_jax.flights.csv_text import Body
+from heli_jax.flights.csv_text import Body, OnDisk
 
 # Imported again within the functions that need it: it takes a quarter of a second, which
 # flights made in Python need not wait for.
@@ -71,10 +72,10 @@ def likely_numbers(body: Body, width: int) -> list[int]:
     """
     import pyarrow as pa
 
-    end = len(body.data)
-    if end > _SAMPLE:
-        end = bytes(body.data[:_SAMPLE]).rfind(b"\n") + 1
-    sample = Body(body.path, body.data[:end], body.delimiter, body.first_line, body.has_quotes)
+    first = body.beginning(_SAMPLE)
+    if body.size > len(first):
+        first = first[: first.rfind(b"\n") + 1]
+    sample = dataclasses.replace(body, rows=memoryview(first))
     found: dict[int, Any] = {}
     for sign in (".",) if body.delimiter == "," else (".", ","):
         table = _table(sample, width, dict.fromkeys(range(width)), sign)
@@ -111,7 +112,7 @@ def _table(body: Body, width: int, kinds: dict[int, Any], sign: str) -> "pa.Tabl
 
     try:
         table = arrow_csv.read_csv(
-            pa.BufferReader(pa.py_buffer(body.data)),
+            _stream(body),
             read_options=arrow_csv.ReadOptions(column_names=names),
             parse_options=arrow_csv.ParseOptions(
                 delimiter=body.delimiter,
@@ -130,6 +131,17 @@ def _table(body: Body, width: int, kinds: dict[int, Any], sign: str) -> "pa.Tabl
     except pa.ArrowException:  # such as a line longer than a block, or a cell that is no number
         return None
     return None if ragged or not table.num_rows else table
+
+
+def _stream(body: Body) -> "pa.NativeFile":
+    """The rows, for pyarrow to read."""
+    import pyarrow as pa
+
+    if not isinstance(body.rows, OnDisk):
+        return pa.BufferReader(pa.py_buffer(body.rows))
+    file = pa.OSFile(str(body.rows.path))
+    file.seek(body.rows.begin)
+    return file
 
 
 def floats(numbers: "pa.ChunkedArray") -> np.ndarray:

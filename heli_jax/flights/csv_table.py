@@ -21,6 +21,7 @@ from heli_jax.flights.csv_cells import (
     seconds_of_dates,
 )
 from heli_jax.flights.csv_encoding import as_utf8
+from heli_jax.flights.csv_on_disk import plain_beginning
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
@@ -32,7 +33,6 @@ from heli_jax.flights.csv_text import (
     is_of_blanks,
     require_short_lines,
     tabs_for_blanks,
-    with_line_feeds,
 )
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.table import (
@@ -66,8 +66,10 @@ def open_csv(path: Path) -> "CsvTable":
         OSError: it cannot be read.
     """
     where = str(path)
-    data = read_regular(path, "a log in CSV", _LARGEST)
-    digest, size = Digest(data), len(data)
+    plain = plain_beginning(path, _LARGEST)
+    # Of a plain file the beginning stands for all of it in what follows.
+    data = plain.data if plain else read_regular(path, "a log in CSV", _LARGEST)
+    digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
     data, notes = as_utf8(where, data)
     check_text(where, data)
     head = find_header(data)
@@ -81,9 +83,9 @@ def open_csv(path: Path) -> "CsvTable":
         raise wrong(where, "is longer than a line of a log can be", line)
     require_short_lines(where, data, head.after, head.number + 1)
     delimiter = find_delimiter(header, first)
-    rows = memoryview(data)[head.after :]
+    rows = plain.rows(head.after) if plain else memoryview(data)[head.after :]
     if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
-        text = with_line_feeds(str(rows, "utf-8"))
+        text = Body(where, rows, delimiter, 1, False).text
         header, delimiter = tabs_for_blanks(header), "\t"
         rows = memoryview(tabs_for_blanks(text).encode())
     # Counted before the names are parsed, so that a line of commas makes no million names.
@@ -106,21 +108,21 @@ def open_csv(path: Path) -> "CsvTable":
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
     """The units in the first row of the body; None where it holds none."""
-    first = first_row(bytes(body.data[:LONGEST_HEADER]), 0) or ""
+    first = first_row(body.beginning(LONGEST_HEADER), 0) or ""
     cells = first.split(body.delimiter)
     return row_of_units(cells) if len(cells) == len(names) else None
 
 
 def _below(body: Body) -> tuple[Body, int]:
     """The body without its first row, and that row's line."""
-    data = bytes(body.data[:LONGEST_HEADER])
-    line, at = body.first_line, 0
+    data = body.beginning(LONGEST_HEADER)
+    lines, at = 0, 0
     while not data[at : (end := _end_of_line(data, at))].strip():
-        line, at = line + 1, end
-    rows = body.data[_end_of_line(data, at) :]
-    if not len(rows):
+        lines, at = lines + 1, end
+    end = _end_of_line(data, at)
+    if end >= body.size:
         raise wrong(body.path, "holds a header and units alone, expected rows of numbers")
-    return Body(body.path, rows, body.delimiter, line + 1, body.has_quotes), line
+    return body.below(end, lines + 1), body.first_line + lines
 
 
 def _end_of_line(data: bytes, at: int) -> int:
@@ -266,7 +268,7 @@ class CsvTable:
 
     def _texts(self, indices: Sequence[int]) -> list["pa.ChunkedArray"]:
         """The cells of some columns as pyarrow string arrays (N,)."""
-        size = len(self._body.data)
+        size = self._body.size
         if size > _LARGEST_TEXT:
             problem = (
                 "has quotes, a row of other than the header's number of cells, or a cell that is "

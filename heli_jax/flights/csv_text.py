@@ -5,10 +5,22 @@ import csv
 import functools
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 from heli_jax.flights.table import wrong
+
+
+class OnDisk(NamedTuple):
+    """Rows that were left in their file: plain text from a byte on to its end."""
+
+    path: Path
+    begin: int
+    end: int
+    """the size of the file [bytes]"""
+    first: bytes
+    """some of the lines, from the first on"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,11 +28,40 @@ class Body:
     """The bytes below the header; they are text in UTF-8."""
 
     path: str
-    data: memoryview
+    rows: memoryview | OnDisk
     delimiter: str
     first_line: int
     """its number in the file, from 1: comments and blank lines above count"""
     has_quotes: bool
+
+    @property
+    def size(self) -> int:
+        """In bytes."""
+        if isinstance(self.rows, OnDisk):
+            return self.rows.end - self.rows.begin
+        return len(self.rows)
+
+    @functools.cached_property
+    def data(self) -> memoryview:
+        """The bytes in memory, where those of a large file are not without need."""
+        if not isinstance(self.rows, OnDisk):
+            return self.rows
+        with self.rows.path.open("rb") as file:
+            file.seek(self.rows.begin)
+            return memoryview(file.read(self.size))
+
+    def beginning(self, size: int) -> bytes:
+        """The first `size` bytes, or fewer: of rows on the disk whole lines."""
+        return bytes((self.rows.first if isinstance(self.rows, OnDisk) else self.rows)[:size])
+
+    def below(self, size: int, lines: int) -> "Body":
+        """The body without its first `size` bytes, which are so many lines."""
+        rows = self.rows
+        if isinstance(rows, OnDisk):
+            rows = rows._replace(begin=rows.begin + size, first=rows.first[size:])
+        else:
+            rows = rows[size:]
+        return replace(self, rows=rows, first_line=self.first_line + lines)
 
     @functools.cached_property
     def text(self) -> str:

@@ -8,14 +8,13 @@ import dataclasses
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.errors import nearest
 from heli_jax.flights.ccpm import Swashplate, unmix
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
-from heli_jax.flights.marks import Counts, at_sure_or_suspected, counted, mark_words
+from heli_jax.flights.marks import Marked, at_sure_or_suspected, mark_words
 from heli_jax.flights.resample import longest_gap
 from heli_jax.flights.table import Survey, Table, shown, wrong
 
@@ -30,19 +29,6 @@ FORMS = (
 )
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\((.*)\)(?:\.(\w+))?\s*")
 _LONGEST_NAME = 400
-
-
-class Marked(NamedTuple):
-    """Samples (K,) of a channel that stand for no value, and their places: rows of a table, or
-    times [s] of a topic."""
-
-    places: np.ndarray
-    values: np.ndarray
-
-    def within(self, span: tuple[float, float] | None) -> Counts:
-        """How many there are from the first place to the last, both included."""
-        first, last = span or (-np.inf, np.inf)
-        return counted(self.values[(self.places >= first) & (self.places <= last)])
 
 
 @dataclass(frozen=True)
@@ -324,25 +310,26 @@ def _marked(channels: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, 
 
 def marks_of_sources(
     log: Table | ChannelLog, name: str, span: tuple[float, float] | None = None
-) -> dict[str, Counts]:
+) -> dict[str, Marked]:
     """The marks in the channels that a derived one is computed from, by channel.
 
     Args:
         log: where it is none of `with_derived`, nothing is derived.
         name: of any channel; of a table's derived one after it was read.
         span: first and last row of a table, first and last time of an autopilot's log [s], between
-            which they are counted; all of it by default.
+            which they are taken; all of it by default.
     """
     if not isinstance(log, DerivedTable | DerivedLog):
         return {}
-    inside = {n: marked.within(span) for n, marked in log.source_marks(name).items()}
-    return {n: counts for n, counts in inside.items() if counts}
+    first, last = span or (-np.inf, np.inf)
+    inside = {n: marked.within(first, last) for n, marked in log.source_marks(name).items()}
+    return {n: marked for n, marked in inside.items() if marked.places.size}
 
 
 def why_missing(log: Table | ChannelLog, name: str) -> str:
     """Why a derived input has missing samples, where its sources have marks: for a message."""
-    for source, counts in marks_of_sources(log, name).items():
-        return f"; {shown(source)} has {mark_words(counts)}; give a window without them"
+    for source, marked in marks_of_sources(log, name).items():
+        return f"; {shown(source)} has {mark_words(marked.counts)}; give a window without them"
     return ""
 
 

@@ -1,6 +1,7 @@
 """Numbers of a log that stand for no value, such as -9999."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -94,6 +95,24 @@ def _is_one_of(marks: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return at
 
 
+class Marked(NamedTuple):
+    """Samples (K,) of a channel that stand for no value, as the log has them, and their places:
+    times [s], or rows of a table."""
+
+    places: np.ndarray
+    values: np.ndarray
+
+    @property
+    def counts(self) -> "Counts":
+        """Each value once, and how often it is there."""
+        return counted(self.values)
+
+    def within(self, first: float, last: float) -> "Marked":
+        """Those from one place to another, both included."""
+        at = (self.places >= first) & (self.places <= last)
+        return Marked(self.places[at], self.values[at])
+
+
 def suspected(numbers: np.ndarray) -> np.ndarray:
     """Which of the numbers (N,) of a log may be marks and are not sure to be: repeated outside of
     all others, though not far, or beside so few values that each may mean something."""
@@ -142,8 +161,11 @@ def mark_notes(channels: Iterable[tuple[str, np.ndarray]]) -> list[str]:
     notes = []
     for name, numbers in channels:
         x = np.asarray(numbers)
+        # A damaged log may hold NaNs that signal when they are converted.
+        with np.errstate(invalid="ignore"):
+            x = x.astype(np.float64) if x.dtype.kind in "biuf" else x
         # Of what was never logged nothing else is there, and a switch may have any value.
-        if x.dtype.kind in "biuf" and (at := at_marks(x := x.astype(np.float64))).any():
+        if x.dtype.kind == "f" and (at := at_marks(x)).any():
             # What counts first: a terminal shows the beginning.
             stand = "stands" if np.count_nonzero(at) == 1 else "stand"
             words = f"{listed(counted(x[at]))} {stand} for no value in {shown(name)}"

@@ -12,7 +12,7 @@ from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.log import ChannelLog
-from heli_jax.flights.marks import Counts
+from heli_jax.flights.marks import Marked
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -60,7 +60,7 @@ class ClockedSignal:
 
     clock: TopicClock
     values: np.ndarray
-    of_sources: Mapping[str, Counts] = field(default_factory=dict)
+    of_sources: Mapping[str, Marked] = field(default_factory=dict)
 
     @property
     def timed(self) -> Timed:
@@ -151,7 +151,10 @@ def signals_of(log: ChannelLog, request: Request) -> dict[Key, ClockedSignal]:
             why = why_missing(log, signal.name)
             raise wrong(log.path, f"{problem}, expected a finite number{why}", at)
         span = tuple(times[clock.rows][[0, -1]])
-        marks = marks_of_sources(log, signal.name, span)
+        marks = {
+            n: marked._replace(places=marked.places - log.first_time)
+            for n, marked in marks_of_sources(log, signal.name, span).items()
+        }
         signals[key, kind] = ClockedSignal(clock, values, marks)
     return signals
 

@@ -25,7 +25,7 @@ from heli_jax.flights.grid import (
     without_overflow,
 )
 from heli_jax.flights.holds import Decision
-from heli_jax.flights.marks import Counts
+from heli_jax.flights.marks import Marked
 from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
@@ -107,7 +107,7 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     if isinstance(grid, Uneven) and options.rate is None:
         raise _uneven(stamps, grid)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
-    logged = as_logged(request, timed, _of_sources(table, request, rows))
+    logged = as_logged(request, timed, _of_sources(table, request, rows, stamps.seconds))
     signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
@@ -123,9 +123,19 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     return flight_of(request, samples, dt, t0, holds, source)
 
 
-def _of_sources(table: Table, request: Request, rows: slice) -> dict[Key, dict[str, Counts]]:
+def _of_sources(
+    table: Table, request: Request, rows: slice, seconds: np.ndarray
+) -> dict[Key, dict[str, Marked]]:
+    """By signal and source the marks in these rows, at the rows' times (N,) [s]."""
     span = (rows.start, rows.stop - 1)
-    return {key: marks_of_sources(table, s.name, span) for key, s in request.signals.items()}
+    found = {}
+    for key, signal in request.signals.items():
+        by_source = marks_of_sources(table, signal.name, span)
+        found[key] = {
+            n: marked._replace(places=seconds[marked.places - rows.start])
+            for n, marked in by_source.items()
+        }
+    return found
 
 
 def _other_units(table: Table, request: Request) -> list[str]:
@@ -162,7 +172,7 @@ def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSig
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     _check_step(stamps)
     topic = TopicClock(Path(table.path).name, stamps.seconds, rows)
-    marks = _of_sources(table, request, rows)
+    marks = _of_sources(table, request, rows, stamps.seconds)
     return {key: ClockedSignal(topic, x, marks[key]) for key, x in signals.items()}
 
 

@@ -9,29 +9,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from heli_jax.flights.marks import Counts
+from heli_jax.flights.marks import Counts, Marked
+from heli_jax.flights.noisy_rails import PILE, rail_below_noise
 from heli_jax.flights.strays import Strays
 
 FEW = 8
 """distinct values of a signal below which its extremes are no rails: steps between a few levels"""
-_PILE = 5.0
-"""times as many samples at an extreme as at the values beside it, for a rail. A sine logged in
-steps has 3 times as many at its turning points as at the three values before"""
 _RUN = 3
 """samples in a row at a rail, once at least"""
 _VISITS = 2
 """times at least that a signal comes to a rail"""
 RAIL_SHARE = 0.005
 """part of the samples at a rail from which on it is spoken of"""
-_BINS = 100
-"""of a signal's range: the outermost holds a rail with noise on it"""
-_NOISY_SHARE = 0.02
-"""part of the samples in that bin, for a rail"""
-_LEVEL = 3.0
-"""times as many samples beside a rail as elsewhere, at most: a motion that comes to rest by itself
-slows down before, and is seen there more often"""
-_FEWEST_IN_BIN = 3
-"""samples of a usual bin, by which a signal passes through all of its range"""
 _LATTICE = 1e-3
 """of a step, by which differences of values may miss a multiple of it: units are converted"""
 _STUCK, STUCK_SECONDS = 20.0, 0.5
@@ -59,12 +48,12 @@ _RUNS = 20
 
 @dataclass(frozen=True, eq=False)
 class Rail:
-    """An end of a signal's range: its value, and the times (K,) [s] of the samples there, none
-    where it is no rail; `exact` where they are all of one value."""
+    """An end of a signal's range: its value, the times (K,) [s] of the samples there, none where it
+    is no rail, and the part of the range within which they are of that value."""
 
     value: float
     times: np.ndarray
-    exact: bool = True
+    width: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,8 +87,8 @@ class SignalFacts:
         usual: the usual time between samples [s].
         stretches: times at one value, of an output while other signals move; the longest first.
         dropouts: where an output jumps to one value from anywhere.
-        marks: values that stand for none, such as -9999, as the log has them, and how many there
-            were; they are missing in the flight.
+        marked: samples that stand for no value, such as -9999, of the signal itself and of each
+            channel from which it is computed; they are missing in the flight.
         strays: samples that may stand for none, and are kept.
     """
 
@@ -112,13 +101,22 @@ class SignalFacts:
     usual: float
     stretches: tuple[Stuck, ...] = ()
     dropouts: Dropouts | None = None
-    marks: Counts = ()
+    marked: tuple[Marked, ...] = ()
     strays: tuple[Strays, ...] = ()
 
     @property
     def stuck(self) -> Stuck | None:
         """The longest time at one value."""
         return self.stretches[0] if self.stretches else None
+
+    @property
+    def marks(self) -> Counts:
+        """Values that stand for none, as the log has them, and how many there were: of several
+        channels as often as where it is most often."""
+        most: dict[float, int] = {}
+        for value, count in (pair for marked in self.marked for pair in marked.counts):
+            most[value] = max(most.get(value, 0), count)
+        return tuple(sorted(most.items()))
 
     @property
     def dropped(self) -> float:
@@ -132,8 +130,8 @@ class SignalFacts:
         return self.low.times.size / n, self.high.times.size / n
 
     def within(self, begin: float, end: float) -> "SignalFacts":
-        """Of the part from `begin` to `end` [s], whose times count from `begin`; levels, steps and
-        marks stay those of the whole."""
+        """Of the part from `begin` to `end` [s], whose times count from `begin`; levels and steps
+        stay those of the whole."""
 
         def cut(rail: Rail) -> Rail:
             times = rail.times[(rail.times >= begin) & (rail.times <= end)]
@@ -151,6 +149,7 @@ class SignalFacts:
             drops = replace(drops, times=times - begin) if times.size else None
         size = min(self.size, round((end - begin) / self.usual) + 1) if self.usual > 0 else 0
         strays = (s.within(begin, end) for s in self.strays)
+        marked = (m.within(begin, end) for m in self.marked)
         return replace(
             self,
             size=size,
@@ -158,6 +157,7 @@ class SignalFacts:
             high=cut(self.high),
             stretches=tuple(stretches),
             dropouts=drops,
+            marked=tuple(m._replace(places=m.places - begin) for m in marked),
             strays=tuple(s for s in strays if s.times.size),
         )
 
@@ -189,7 +189,8 @@ def signal_facts(seconds: np.ndarray, x: np.ndarray) -> SignalFacts:
 
 
 def _rail(seconds: np.ndarray, x: np.ndarray, at: np.ndarray, end: float) -> Rail:
-    return Rail(end, seconds[at], bool(np.all(x[at] == end)))
+    width = float(np.max(np.abs(x[at] - end)) / np.ptp(x)) if at.any() and np.ptp(x) > 0 else 0.0
+    return Rail(end, seconds[at], width)
 
 
 def facts_of_all[K: Hashable](
@@ -336,10 +337,10 @@ def _at_top(x: np.ndarray, finite: np.ndarray, counts: np.ndarray) -> np.ndarray
     top = finite.max()
     # Beside the values next to it also those of all the signal: random steps are held unequally.
     usual = max(float(counts[1:4].mean()), float(np.median(counts[1:])))
-    piled = counts[0] > _PILE * usual and counts[0] >= RAIL_SHARE * finite.size
+    piled = counts[0] > PILE * usual and counts[0] >= RAIL_SHARE * finite.size
     if piled and _comes_and_goes(finite == top):
         return x == top
-    edge = _noisy_edge(finite)
+    edge = rail_below_noise(finite)
     if edge is not None and _comes_and_goes(finite >= edge):
         return np.isfinite(x) & (x >= edge)
     return np.zeros(x.shape, bool)
@@ -352,22 +353,6 @@ def _comes_and_goes(at: np.ndarray) -> bool:
     edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     return bool(begins.size >= _VISITS and (ends - begins).max() >= _RUN)
-
-
-def _noisy_edge(x: np.ndarray) -> float | None:
-    """Where the rail at the upper end begins, that has less noise than a hundredth of the range.
-
-    A converter behind what was cut off adds its own noise, and no two samples are equal then.
-    """
-    top, span = float(x.max()), float(np.ptp(x))
-    if not 0 < span < np.inf:
-        return None
-    counts = np.histogram((top - x) / span, bins=_BINS, range=(0.0, 1.0))[0]
-    usual = float(np.median(counts[1:-1]))
-    beside = float(counts[1:4].mean())
-    piled = counts[0] > _PILE * max(beside, usual) and counts[0] >= _NOISY_SHARE * x.size
-    level = usual >= _FEWEST_IN_BIN and beside <= _LEVEL * usual
-    return top - span / _BINS if piled and level else None
 
 
 def quantum(x: np.ndarray) -> float:

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 import scipy.stats
 
 from heli_jax import models
+from heli_jax.dynamics import kinematics
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import innovations
@@ -164,3 +166,52 @@ def test_an_option_of_simulations_alone_is_refused(bench30, options, message):
     inputs = model.Inputs(x_roll=jnp.asarray(u))
     with pytest.raises(TypeError, match=message):
         innovations(model, params, inputs, y, SD, **options)
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero-order"])
+def test_explicit_steps_follow_the_moments_of_the_kinematics(hold):
+    model, noise, dt, count = kinematics.attitude, 0.02, 0.02, 31
+    t = np.arange(count) * dt
+    rates = np.array([1.5 * np.cos(5 * t), 1.2 * np.sin(7 * t), 0.8 * np.cos(3 * t)])
+    begin = np.array([0.4, -0.5, 1.0])
+    # Measured at the end alone: before it nothing is corrected.
+    measured = np.full(count, np.nan)
+    measured[-1] = 0.0
+    found = innovations(
+        model,
+        model.Params(noise_gyro=noise),
+        model.Inputs(*map(jnp.asarray, rates)),
+        dict.fromkeys(("phi", "theta"), jnp.asarray(measured)),
+        {"phi": 1e-9, "theta": 1.0},
+        dt=dt,
+        initial_state=model.State(*map(jnp.asarray, begin)),
+        hold=dict.fromkeys("pqr", hold),
+    )
+
+    def field(x, u):
+        (p, q, r), (phi, theta) = u, x[:2]
+        about = q * np.sin(phi) + r * np.cos(phi)
+        return np.array(
+            [p + about * np.tan(theta), q * np.cos(phi) - r * np.sin(phi), about / np.cos(theta)]
+        )
+
+    def slope(now, moments, k):
+        x, P = moments[:3], moments[3:].reshape(3, 3)
+        share = (now / dt - k) if hold == "linear" else 0.0
+        u = rates[:, k] + share * (rates[:, k + 1] - rates[:, k])
+        steps = 1e-6 * np.eye(3)
+        A = np.column_stack([(field(x + e, u) - field(x - e, u)) / 2e-6 for e in steps])
+        return np.concatenate([field(x, u), (A @ P + P @ A.T + noise**2 * np.eye(3)).ravel()])
+
+    moments = np.concatenate([begin, np.zeros(9)])
+    for k in range(count - 1):
+        moments = scipy.integrate.solve_ivp(
+            slope, (k * dt, (k + 1) * dt), moments, args=(k,), rtol=1e-10, atol=1e-13
+        ).y[:, -1]
+    x, P = moments[:3], moments[3:].reshape(3, 3)
+    assert np.asarray(found.error["phi"])[-1] == pytest.approx(-x[0], abs=1e-7)
+    assert np.asarray(found.variance["phi"])[-1] == pytest.approx(P[0, 0], rel=1e-6)
+    # The roll angle, without noise to speak of, is known now, and pitch as far as it goes with it.
+    assert np.asarray(found.variance["theta"])[-1] - 1.0 == pytest.approx(
+        P[1, 1] - P[0, 1] ** 2 / P[0, 0], rel=1e-6
+    )

@@ -1,15 +1,21 @@
 """Signs, units and clocks of signals that do not go together, and those that do."""
 
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.identification.validation.feedback import Feedback
+from heli_jax.identification.validation.late_angles import late_angles, lateness
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
-from tests.identification.test_enough import DT, problem, response, steps
+from heli_jax.models import with_filters
+from tests.identification.test_enough import DT, SWING, problem, response, steps
 
 N = 1000
 DEGREE = np.pi / 180.0
@@ -110,3 +116,67 @@ def test_an_output_before_its_stick_is_said_before_any_fit():
     assert "p moves 0.14 s or more before u does" in finding.sentence
     follows = Feedback("flight 1", "u", "p", 0.9, (0.1, 0.2), 1e-9)
     assert late_inputs([("flight 1", bad)], (follows,)) == []
+
+
+def swings(seed, late=0.0, n=1500):
+    """An angle in closed form, logged late, and its rate, with the noise of sensors."""
+    rng = np.random.default_rng(seed)
+    size, phase = rng.uniform(0.02, 0.1, (8, 1)), rng.uniform(0.0, 2 * np.pi, (8, 1))
+    omega, t = 2 * np.pi * rng.uniform(0.1, 1.5, (8, 1)), DT * np.arange(n)
+    phi = np.sum(size * np.sin(omega * (t - late) + phase), axis=0)
+    p = np.sum(size * omega * np.cos(omega * t + phase), axis=0)
+    return phi + 0.003 * rng.standard_normal(n), p + 0.02 * rng.standard_normal(n)
+
+
+def late_said(phi, p, model=None):
+    u = np.zeros(phi.size)
+    flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
+    found = late_angles(problem(flight) if model is None else replace(problem(flight), model=model))
+    assert all(f.severity == "doubt" for f in found)
+    return [f.sentence for f in found]
+
+
+@pytest.mark.parametrize("late", [0.05, 0.1, -0.05])
+def test_an_angle_that_is_logged_late_against_its_rate_is_said(late):
+    first, second = ("phi", "p") if late > 0 else ("p", "phi")
+    off = []
+    for seed in range(10):
+        phi, p = swings(seed, late)
+        [sentence] = late_said(phi, p)
+        assert f"{first} is logged " in sentence
+        assert f"s later than {second}" in sentence
+        found = lateness(phi, p, DT)
+        assert found is not None
+        off.append((found[0] - late) / found[1])
+        # Slower, as attitude mostly is, and off by a scale and a bias.
+        slow = np.where(np.arange(phi.size) % 5 == 0, phi, np.nan)
+        assert late_said(1.0 + slow, 0.9 * p - 0.2)
+    assert np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_an_angle_that_is_on_time_is_not_called_late():
+    for seed in range(10):
+        assert late_said(*swings(seed)) == []
+        assert late_said(*swings(seed, 0.008)) == []
+        assert late_said(*moved(seed)[1:]) == []
+        assert late_said(swings(seed, 0.1)[0], swings(seed + 50)[1]) == []
+
+
+def test_rotation_about_other_axes_is_no_delay():
+    path = Path(__file__).parents[2] / "experiments" / "data_compatibility.py"
+    Motion = runpy.run_path(str(path))["Motion"]
+    t = 0.04 * np.arange(700)
+    for seed in range(8):
+        motion, rng = Motion(np.random.default_rng(seed)), np.random.default_rng(seed + 100)
+        # Twice as large as there: angles up to 50 degrees.
+        motion.amplitude = 2.0 * motion.amplitude
+        for angle, rate in zip(motion.angles(t).T, motion.omega(t).T, strict=True):
+            found = lateness(angle + 0.006 * rng.standard_normal(t.size), rate, 0.04)
+            assert found is None or abs(found[0]) < max(0.04, 4.0 * found[1])
+
+
+def test_a_delay_that_the_model_has_is_not_said():
+    phi, p = swings(1, 0.1)
+    known = with_filters(SWING, {"phi": ()}, {"phi": 0.1})
+    assert late_said(phi, p)
+    assert late_said(phi, p, known) == []

@@ -183,6 +183,8 @@ class Device(abc.ABC):
             "State": self.State,
             "Outputs": self.Outputs,
             "linear": model.linear and self.parts.linear,
+            # A filter or a line of delays may be as fast as it likes.
+            "explicit": False,
             "start": self.start,
             "noise_intensity": None if model.noise_intensity is None else self.noise_intensity,
             "limits": None if model.limits is None else self.limits,

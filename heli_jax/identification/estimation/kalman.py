@@ -2,9 +2,10 @@
 
 Linear models get the exact discrete filter. Others get the extended one: the model is linearised
 anew in every step and the linearised one is followed exactly (Ozaki's local linearisation), so
-that on a linear model both are the same. The process noise is the exact discrete one, the
-measurement noise white and independent between outputs; outputs of one sample are taken one after
-another, so nothing is inverted. A measurement that is NaN is skipped.
+that on a linear model both are the same; models without fast modes go by explicit steps
+(`moments`). The process noise is the exact discrete one, the measurement noise white and
+independent between outputs; outputs of one sample are taken one after another, so nothing is
+inverted. A measurement that is NaN is skipped.
 """
 
 import functools
@@ -21,6 +22,7 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
+from heli_jax.identification.estimation.moments import moments_after
 from heli_jax.naming import Scalar
 from heli_jax.numerics.matrix_exponential import product, van_loan
 from heli_jax.simulation.delays import delays_of
@@ -267,6 +269,8 @@ class _Equations(NamedTuple):
     """(state (n,), Inputs) -> what is measured (p,)"""
     intensity: Float[Array, " n"]
     """of the process noise, see `Model.noise_intensity`"""
+    explicit: bool
+    """see `Model.explicit`"""
 
 
 def _equations(drive: _Drive) -> _Equations:
@@ -285,7 +289,7 @@ def _equations(drive: _Drive) -> _Equations:
         y = naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)
         return y[drive.rows]
 
-    return _Equations(rates, outputs, intensity)
+    return _Equations(rates, outputs, intensity, model.explicit)
 
 
 class _Intervals(NamedTuple):
@@ -364,6 +368,8 @@ def _along(equations: _Equations, estimate: _Estimate, part: Segment, substeps: 
 
 def _held_step(equations: _Equations, estimate: _Estimate, h: Array, u: Any) -> _Estimate:
     (x, P), rates = estimate, equations.rates
+    if equations.explicit:
+        return moments_after(rates, equations.intensity, estimate, Segment(h, u, None))
     # With J and f at x itself: shift is the whole step of the linearised equation from there.
     step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), equations.intensity, h)
     return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
@@ -372,6 +378,8 @@ def _held_step(equations: _Equations, estimate: _Estimate, h: Array, u: Any) -> 
 def _ramped_step(equations: _Equations, estimate: _Estimate, part: Segment) -> _Estimate:
     """`_held_step` where the inputs move."""
     (x, P), rates = estimate, equations.rates
+    if equations.explicit:
+        return moments_after(rates, equations.intensity, estimate, part)
     n, dtype = x.shape[0], x.dtype
     # Time is a state more, whose rate is 1: the column of derivatives by time then makes the step
     # of a linear model exact (local linearisation of an equation that depends on time).

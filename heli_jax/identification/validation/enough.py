@@ -18,6 +18,7 @@ from heli_jax.identification.validation.feedback import (
     why_untested,
 )
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.missing_outputs import missing_outputs
@@ -62,6 +63,7 @@ def is_it_enough(
         *strays(flights),
         *quantisation(flights, at.noise.sd),
         *rate_against_angle(problem),
+        *late_angles(problem),
         *against_start(flights, e.simulated),
         *late_inputs(flights, feedback),
     ]

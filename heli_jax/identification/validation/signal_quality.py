@@ -16,6 +16,7 @@ from heli_jax.flights.signal_facts import (
     DROP_SHARE,
     RAIL_SHARE,
     STUCK_SECONDS,
+    Rail,
     SignalFacts,
     at_rails,
     facts_of_all,
@@ -85,10 +86,17 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     return [_saturated(*f) for f in found[:_MOST_NAMED]]
 
 
+def _near(rail: Rail) -> str:
+    if not rail.width:
+        return "at"
+    if rail.width < 0.0101:
+        return "within a hundredth of its range of"
+    return f"level but for noise, within {100 * rail.width:.0f} % of its range of"
+
+
 def _saturated(total: float, label: str, kind: str, name: str, facts: SignalFacts) -> Finding:
     ends = [
-        f"{'at' if rail.exact else 'within a hundredth of its range of'} its {word} value "
-        f"{rail.value:.4g} in {100 * share:.2g} % of the samples"
+        f"{_near(rail)} its {word} value {rail.value:.4g} in {100 * share:.2g} % of the samples"
         for word, rail, share in zip(
             ("smallest", "largest"), (facts.low, facts.high), facts.shares, strict=True
         )

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from heli_jax.dynamics.model import axes_of
+from heli_jax.dynamics.model import Model, axes_of
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
@@ -18,9 +18,9 @@ from heli_jax.identification.validation.metrics import autocorrelation, cross_co
 
 _PAIRS = (("p", "phi"), ("q", "theta"), ("r", "psi"), ("r", "yaw"), ("p", "roll"), ("q", "pitch"))
 """rate and angle by the names that outputs have here, beside those of the model's axes"""
-_WITHIN = 0.5
+WITHIN = 0.5
 """[s] over which an angle and the integral of its rate are compared"""
-_INDEPENDENT = 10
+PARTS = 10
 """so many of these parts of a record at least"""
 _ALIKE = 0.8
 """correlation of the two from which on their sizes are compared"""
@@ -48,8 +48,7 @@ def rate_against_angle(problem: Problem) -> list[Finding]:
     Args:
         problem: the flights that are fitted, and the model, whose axes name rates and angles.
     """
-    axes = [(a.rate, a.angle) for a in axes_of(problem.model) if a.angle is not None]
-    pairs = list(dict.fromkeys([*axes, *_PAIRS]))
+    pairs = rates_and_angles(problem.model)
     flights = problem.training
     found = []
     for label, flight in zip(labels(flights), flights, strict=True):
@@ -57,6 +56,13 @@ def rate_against_angle(problem: Problem) -> list[Finding]:
             if rate in flight.outputs and angle in flight.outputs:
                 found += _of_pair(label, flight, rate, angle)
     return found
+
+
+def rates_and_angles(model: Model) -> list[tuple[str, str]]:
+    """The outputs that are a rate and its angle, by the model's axes and by the names that they
+    have here."""
+    axes = [(a.rate, a.angle) for a in axes_of(model) if a.angle is not None]
+    return list(dict.fromkeys([*axes, *_PAIRS]))
 
 
 def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
@@ -96,17 +102,13 @@ def angle_over_rate(
         rate: [rad/s], likewise.
         dt: [s].
     """
-    filled = [_filled(v, dt) for v in (angle, rate)]
-    steps = max(1, round(_WITHIN / dt))
-    if filled[0] is None or filled[1] is None or angle.size < (_INDEPENDENT + 1) * steps:
+    both = angle_and_integral(angle, rate, dt)
+    if both is None:
         return None
-    # Headings jump by a turn where they pass south.
-    turned = np.unwrap(filled[0])
-    halves = 0.5 * dt * (filled[1][1:] + filled[1][:-1])
-    integral = np.concatenate([np.zeros(1), np.cumsum(halves)])
+    steps = max(1, round(WITHIN / dt))
     # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
     # is not divided by a sample time.
-    changes = [v[steps:] - v[:-steps] for v in (turned, integral)]
+    changes = [v[steps:] - v[:-steps] for v in both]
     sds = [float(np.std(v)) for v in changes]
     if not min(sds) > 0:
         return None
@@ -115,6 +117,27 @@ def angle_over_rate(
         return None
     size = float(np.sign(alike)) * sds[0] / sds[1]
     return size * abs(alike), size / abs(alike)
+
+
+def angle_and_integral(
+    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """An angle without turns and the integral of its rate (N,), with straight lines over short
+    gaps; None where a gap is long or the record too short to compare the two.
+
+    Args:
+        angle: [rad], NaN where missing.
+        rate: [rad/s], likewise.
+        dt: [s].
+    """
+    filled = [_filled(v, dt) for v in (angle, rate)]
+    steps = max(1, round(WITHIN / dt))
+    if filled[0] is None or filled[1] is None or angle.size < (PARTS + 1) * steps:
+        return None
+    # Headings jump by a turn where they pass south.
+    turned = np.unwrap(filled[0])
+    halves = 0.5 * dt * (filled[1][1:] + filled[1][:-1])
+    return turned, np.concatenate([np.zeros(1), np.cumsum(halves)])
 
 
 def _filled(signal: np.ndarray, dt: float) -> np.ndarray | None:

@@ -1,0 +1,151 @@
+"""Angles that are logged later than their rates, or earlier.
+
+An angle is the integral of its rate. Where the two fit together once one of them is moved in time,
+it is logged late, and a fit of both takes the delay for the machine's.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax.dynamics.model import Model
+from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.signal_signs import (
+    PARTS,
+    WITHIN,
+    angle_and_integral,
+    rates_and_angles,
+)
+
+_MOST = 0.3
+"""[s] over which a delay is looked for, to either side"""
+_STEP = 0.01
+"""[s]; samples that come faster tell no more of a delay"""
+_LEAST = 0.02
+"""[s], or a sample, below which a delay is not spoken of"""
+_SURE = 4.0
+"""times its standard deviation, for a delay"""
+_ALIKE = 0.9
+"""correlation of angle and integral, once moved, from which on they are one motion"""
+_EXPLAINED = 0.25
+"""part of what the two differ by that the delay has to explain: rotation about other axes makes
+differences too, and no delay takes them away"""
+_BLOCKS = 20
+"""parts of a record by whose spread the standard deviation of a delay is told"""
+
+
+def late_angles(problem: Problem) -> list[Finding]:
+    """A doubt for each angle that moves later or earlier than the integral of its rate, where the
+    model has no filter and no delay behind either.
+
+    Args:
+        problem: the flights that are fitted, and the model, whose axes name rates and angles.
+    """
+    known = _behind_devices(problem.model)
+    pairs = [(r, a) for r, a in rates_and_angles(problem.model) if not known & {r, a}]
+    found = []
+    for label, flight in zip(labels(problem.training), problem.training, strict=True):
+        for rate, angle in pairs:
+            if rate in flight.outputs and angle in flight.outputs:
+                late = lateness(flight.outputs[angle], flight.outputs[rate], flight.dt)
+                if late is not None and _matters(*late, flight.dt):
+                    found.append(_finding(label, rate, angle, *late))
+    return found
+
+
+def _behind_devices(model: Model) -> set[str]:
+    """The outputs behind a filter or a delay that the model knows."""
+    behind = {n.rsplit("_filter", 1)[0].rsplit("_late", 1)[0] for n in states_behind(model)}
+    return behind | dict(model.delay_lines).keys()
+
+
+def _matters(late: float, sd: float, dt: float) -> bool:
+    return abs(late) > max(_LEAST, dt, _SURE * sd)
+
+
+def _finding(label: str, rate: str, angle: str, late: float, sd: float) -> Finding:
+    first, second = (angle, rate) if late > 0 else (rate, angle)
+    words = (
+        f"{label}: {first} is logged {abs(late):.2g} s later than {second}, with which it goes "
+        f"together then (sd {sd:.1g} s): a fit of both takes that for the machine's; state it "
+        f"({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
+    )
+    criterion = f"delay of the angle against its integrated rate [s], {_LEAST:g}"
+    return Finding("late output", "doubt", words, late, criterion)
+
+
+def lateness(
+    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
+) -> tuple[float, float] | None:
+    """By how much an angle is later than its rate, and the standard deviation of it [s]; None where
+    the two do not fit together once moved, or hardly better than before.
+
+    Args:
+        angle: [rad], NaN where missing.
+        rate: [rad/s], likewise.
+        dt: [s].
+    """
+    both = angle_and_integral(angle, rate, dt)
+    if both is None:
+        return None
+    every = max(1, int(_STEP / dt))
+    turned, integral = both[0][::every], both[1][::every]
+    dt *= every
+    steps, most = max(1, round(WITHIN / dt)), int(np.ceil(_MOST / dt))
+    # Samples whose integral is there whatever the delay.
+    begin, end = most + 1, turned.size - steps - most - 1
+    if end - begin < PARTS * steps:
+        return None
+    rows = np.arange(begin, end)
+    changes = turned[rows + steps] - turned[rows]
+
+    def moved(late: float) -> np.ndarray:
+        """The integral's changes and their slope (K, 2), so much later."""
+        at = rows - late / dt
+        ends = [np.interp(at + k, np.arange(integral.size), integral) for k in (0.0, steps)]
+        slopes = np.gradient(integral, dt)
+        rising = [np.interp(at + k, np.arange(integral.size), slopes) for k in (0.0, steps)]
+        return np.stack([ends[1] - ends[0], rising[1] - rising[0]], axis=1)
+
+    def left(late: float) -> float:
+        return _unexplained(changes, moved(late)[:, 0])
+
+    grid = np.arange(-most, most + 1) * dt
+    late = float(grid[int(np.argmin([left(t) for t in grid]))])
+    # Gauss and Newton's steps from there, as far as the next sample.
+    for _ in range(3):
+        step = _step(changes, moved(late))
+        if step is None or not abs(step) < dt:
+            break
+        late += step
+    after, before = left(late), left(0.0)
+    if abs(late) >= _MOST or after > 1.0 - _ALIKE**2 or after > (1.0 - _EXPLAINED) * before:
+        return None
+    return late, _spread(changes, moved(late))
+
+
+def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
+    """Part of the variance of y (K,) that x (K,) leaves."""
+    if not (np.std(y) > 0 and np.std(x) > 0):
+        return 1.0
+    return 1.0 - float(np.corrcoef(y, x)[0, 1]) ** 2
+
+
+def _step(y: np.ndarray, X: np.ndarray) -> float | None:
+    """How much later x has to be for y = size x(t - step), of x and its slope (K, 2)."""
+    A = np.column_stack([X, np.ones(y.size)])
+    size, slope, _ = np.linalg.lstsq(A, y, rcond=None)[0]
+    return -float(slope / size) if size > 0 else None
+
+
+def _spread(y: np.ndarray, X: np.ndarray) -> float:
+    """Standard deviation of the delay by leaving out parts of the record one by one (jackknife):
+    what angle and integral differ by is no white noise."""
+    parts = np.array_split(np.arange(y.size), _BLOCKS)
+    steps = [_step(np.delete(y, part), np.delete(X, part, axis=0)) for part in parts]
+    known = np.array([s for s in steps if s is not None])
+    if known.size < _BLOCKS:
+        return float("inf")
+    return float(np.sqrt((_BLOCKS - 1) * np.mean((known - known.mean()) ** 2)))
