@@ -1,8 +1,12 @@
 """The command heli-jax from its first moment, in which Ctrl-C finds nothing imported yet."""
 
+import gc
 import os
 import signal
 from types import FrameType
+
+_COLLECT_AFTER = 100_000
+"""new objects between two searches for garbage"""
 
 
 def main() -> int:
@@ -11,6 +15,9 @@ def main() -> int:
     ours = before is signal.default_int_handler
     if ours:
         signal.signal(signal.SIGINT, _end)
+    # Imports and what JAX traces make millions of objects that stay: to look through them for
+    # garbage as often as Python does by itself takes a tenth of a command.
+    gc.set_threshold(_COLLECT_AFTER)
     from heli_jax import cli
 
     # From here on the command line listens itself.

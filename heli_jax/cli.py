@@ -153,6 +153,10 @@ def _prepare_jax() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    # Where in the source each operation was traced: that is for who looks into what JAX compiles,
+    # and takes a twentieth of `check`.
+    jax.config.update("jax_include_full_tracebacks_in_locations", False)
+    jax.config.update("jax_traceback_in_locations_limit", 0)
     # JAX keeps only programs that took a second to compile. A fit has dozens of small ones, which
     # add up to seconds.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -309,9 +313,10 @@ def _sweep(options: argparse.Namespace) -> int:
     # their number stays as it is.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", options.devices or cores())
-    from heli_jax import simulation_output, sweep_workflow, workflow
+    from heli_jax import config as configuration
+    from heli_jax import simulation_output, sweep_workflow
 
-    experiment = workflow.load_config(config, options.set)
+    experiment = configuration.load(config, options.set)
 
     def interrupted() -> str:
         kept = f"what is finished is kept: --out {out} --resume goes on"

@@ -1,5 +1,6 @@
 """A whole sweep as a function, for a script, a notebook and the command line alike."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +8,6 @@ from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.config import Experiment
 from heli_jax.errors import InputError
-from heli_jax.workflow import Say, load_config
 from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def run_sweep(
     from heli_jax.sweeps.run import Options
     from heli_jax.sweeps.run import run_sweep as run_job
 
-    config = config if isinstance(config, Experiment) else load_config(config)
+    config = config if isinstance(config, Experiment) else configuration.load(config)
     job = _sweep_job(config)
     design = config.config.sweep
     assert design is not None  # `_sweep_job` refuses a configuration without
@@ -91,7 +91,7 @@ def _sweep_job(config: Experiment) -> "Job":
     return sweep_job(*generate.drive(config)) if simulates(config) else sweep_job(config)
 
 
-def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Say) -> None:
+def _draw_sweep(out: Path, dataset: "xr.Dataset", job: "Job", say: Callable[[str], None]) -> None:
     """The figures of a sweep; what they leave out is said.
 
     Raises:

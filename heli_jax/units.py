@@ -135,6 +135,28 @@ def _unknown(unit: str, text: str) -> str:
     return f"unknown unit {(wrong if place else unit[:60])!r}{place}{near}"
 
 
+# The units of nearly every file, which need not wait for pint: it takes a third of a second to load
+# and to read its definitions.
+_COMMON = {
+    *("1", "m", "m^2", "m/s", "m/s^2", "s", "rad", "rad/s", "rad/s^2", "1/s", "1/s^2", "1/rad"),
+    *("s/rad", "kg", "kg m^2", "kg/m^3", "N m", "N m/rad"),
+}
+"""in which a unit is what it is wanted in"""
+_COMMON_IN_SI = {
+    ("%", "1"): 0.01,
+    ("mm", "m"): 0.001,
+    ("um", "m"): 1e-6,
+    ("mrad", "rad"): 0.001,
+    ("ms", "s"): 0.001,
+    ("us", "s"): 1e-6,
+    ("deg", "rad"): 0.017453292519943295,
+    ("deg/s", "rad/s"): 0.017453292519943295,
+    ("rpm", "rad/s"): 0.10471975511965977,
+    ("Hz", "rad/s"): 6.283185307179586,
+}
+"""by unit and the SI unit it is wanted in"""
+
+
 def factor(unit: str, si: str) -> float:
     """The number that turns a value in `unit` into the SI unit `si`.
 
@@ -143,6 +165,10 @@ def factor(unit: str, si: str) -> float:
     Raises:
         ValueError: the unit is unknown, or of another kind than `si`.
     """
+    if unit == si and unit in _COMMON:
+        return 1.0
+    if (unit, si) in _COMMON_IN_SI:
+        return _COMMON_IN_SI[unit, si]
     have, want = _parse(unit), _parse(si)
     if have.dimensionality == want.dimensionality:
         return float((have / want).to_base_units().magnitude)

@@ -18,7 +18,7 @@ from heli_jax.config.frequency import asked_handling, missing_handling
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.errors import InputError
 from heli_jax.identification.equation_error.baseline import Baseline, baseline
-from heli_jax.identification.fit import check, findings, fit, rates
+from heli_jax.identification.fit import check, findings, first_guess, fit, rates
 from heli_jax.identification.method_comparison import MethodComparison, compare_methods
 from heli_jax.identification.model_selection import Choice, choose
 from heli_jax.identification.problem import Problem
@@ -158,7 +158,8 @@ def _fit_run(
         _require_rates(problem)
         # Part of the report, which a script that asks for none need not wait for.
         with stage("whether the log is enough", name="findings"):
-            enough = findings(problem) if with_findings else ()
+            guess = first_guess(problem) if with_findings else None
+            enough = findings(problem, guess) if with_findings else ()
         with stage("fit"):
             fitted = fit(
                 problem,
@@ -166,6 +167,7 @@ def _fit_run(
                 seed=options.seed,
                 max_steps=options.max_steps,
                 progress=progress,
+                guess=guess,
             )
     except ValueError as e:  # `fit` knows no file, and its sentence needs one
         raise InputError(f"{config.path}: fit: {e}") from e

@@ -232,3 +232,11 @@ def test_si_of_refuses_what_does_not_occur():
 )
 def test_is_plain(unit, plain):
     assert units.is_plain(unit) is plain
+
+
+def test_the_units_that_are_known_without_pint_are_those_of_pint(monkeypatch):
+    common, in_si = units._COMMON, units._COMMON_IN_SI
+    monkeypatch.setattr(units, "_COMMON", set())
+    monkeypatch.setattr(units, "_COMMON_IN_SI", {})
+    assert {u: units.factor(u, u) for u in common} == dict.fromkeys(common, 1.0)
+    assert {pair: units.factor(*pair) for pair in in_si} == in_si

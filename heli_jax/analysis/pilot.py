@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from heli_jax import naming
@@ -97,6 +96,8 @@ def _least_energy(
 
     Only those modes z = W x matter: P is W^T X^-1 W with X from Lyapunov's equation.
     """
+    import scipy.linalg  # here: a simulation without a pilot need not wait for it
+
     # Decay faster than `pace` is stability of what is shifted by it.
     shifted = A + pace * np.eye(A.shape[0])
     # By Schur vectors, which are orthogonal: eigenvectors of equal modes nearly coincide.

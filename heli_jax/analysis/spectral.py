@@ -132,9 +132,9 @@ def cross_spectra(
     total, averages = np.zeros(1), 0.0
     for record, count in zip(records, counts, strict=True):
         if count:
-            mean = _products(jnp.asarray(record), window, dt, omega, step)
+            mean = _products(np.asarray(record, np.float64), window, dt, omega, step)
             total, averages = (
-                total + count * np.asarray(mean),
+                total + count * mean,
                 averages + _independent(window, step, count),
             )
     # One-sided: each frequency stands for its negative twin as well.
@@ -158,14 +158,14 @@ def _require(records: Sequence[np.ndarray], dt: float, omega: np.ndarray, length
         )
 
 
-@partial(jax.jit, static_argnames="step")
+# In NumPy: there is a program to compile for each length of the windows, and it is called once.
 def _products(
-    record: Float[Array, "c N"],
-    window: Float[Array, " n"],
+    record: Float[np.ndarray, "c N"],
+    window: Float[np.ndarray, " n"],
     dt: float,
-    omega: Float[Array, " k"],
+    omega: Float[np.ndarray, " k"],
     step: int,
-) -> Complex[Array, "k c c"]:
+) -> Complex[np.ndarray, "k c c"]:
     """Mean over the segments of conj(X_a) X_b."""
     c, n = record.shape[0], window.shape[0]
     count = 1 + (record.shape[1] - n) // step
@@ -176,18 +176,17 @@ def _products(
     # transforms of twice the length, and they may lie anywhere.
     basis = window[:, None] * _turns(n, omega * dt)
     X = segments @ basis - segments.mean(axis=1)[:, None] * basis.sum(axis=0)[None]
-    X = jax.lax.complex(X[:, : omega.size], X[:, omega.size :])
-    X = X.reshape(c, count, -1)
-    return jnp.einsum("ask,bsk->kab", jnp.conj(X), X) / count
+    X = (X[:, : omega.size] + 1j * X[:, omega.size :]).reshape(c, count, -1)
+    return np.conj(X).transpose(2, 0, 1) @ X.transpose(2, 1, 0) / count
 
 
-def _turns(n: int, angle: Float[Array, " k"]) -> Float[Array, "n 2*k"]:
+def _turns(n: int, angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 2*k"]:
     """exp(-i m angle) of m from 0 to n - 1, real parts beside imaginary ones, by products of few
     sines: so many would take as long as the transform."""
-    coarse = jnp.outer(_FINE * jnp.arange(-(-n // _FINE), dtype=angle.dtype), angle)[:, None]
-    fine = jnp.outer(jnp.arange(_FINE, dtype=angle.dtype), angle)[None]
-    (c, s), (C, S) = ((jnp.cos(v), jnp.sin(v)) for v in (fine, coarse))
-    turns = jnp.concatenate([C * c - S * s, -(S * c + C * s)], axis=2)
+    coarse = np.outer(_FINE * np.arange(-(-n // _FINE)), angle)[:, None]
+    fine = np.outer(np.arange(_FINE), angle)[None]
+    (c, s), (C, S) = ((np.cos(v), np.sin(v)) for v in (fine, coarse))
+    turns = np.concatenate([C * c - S * s, -(S * c + C * s)], axis=2)
     return turns.reshape(-1, 2 * angle.shape[0])[:n]
 
 

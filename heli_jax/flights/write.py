@@ -17,7 +17,7 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     """
     import pyarrow as pa  # here, so that a fit without files does not wait for it
 
-    table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    table = pa.table({name: _column(values) for name, values in columns.items()})
     if isinstance(target, Path) and target.suffix.lower() == ".parquet":
         import pyarrow.parquet
 
@@ -29,6 +29,19 @@ def write_table(target: Path | IO[bytes], columns: Mapping[str, Any]) -> None:
     pyarrow.csv.write_csv(
         table, target if isinstance(target, Path) else pa.PythonFile(target, mode="w")
     )
+
+
+def _column(values: Any) -> Any:
+    """A column as pyarrow has it."""
+    import pyarrow as pa
+
+    numbers = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "iuf"
+    if not (numbers and values.dtype.isnative):
+        return pa.array(values)
+    # `pa.array` looks whether it was given something of pandas, which it loads for that.
+    whole = np.ascontiguousarray(values)
+    kind = pa.from_numpy_dtype(whole.dtype)
+    return pa.Array.from_buffers(kind, whole.size, [None, pa.py_buffer(whole)])
 
 
 def stacked(parts: list[dict[str, Any]], names: list[str]) -> dict[str, Any]:

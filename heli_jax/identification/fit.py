@@ -70,7 +70,7 @@ _FIRST_STEPS = 40
 """of filter error, until it is known that there is a disturbance to find"""
 
 
-class _FirstGuess(NamedTuple):
+class FirstGuess(NamedTuple):
     """A problem at its first guess."""
 
     layout: Layout
@@ -80,7 +80,12 @@ class _FirstGuess(NamedTuple):
     e: Evaluation
 
 
-def _first_guess(problem: Problem) -> _FirstGuess:
+def first_guess(problem: Problem) -> FirstGuess:
+    """The problem at its start values, with a first guess of the noise.
+
+    Args:
+        problem: model, vehicle, flights and what is free.
+    """
     # In this order: the layout says which numbers there are, the noise weighs the outputs, and only
     # with both can a coarse search compare starts.
     layout = layout_of(problem, problem.training)
@@ -93,7 +98,7 @@ def _first_guess(problem: Problem) -> _FirstGuess:
     if level is not noise:
         noise = level
         e = evaluate(layout, data, noise, z)
-    return _FirstGuess(layout, data, noise, z, e)
+    return FirstGuess(layout, data, noise, z, e)
 
 
 def _require_problem(problem: Any) -> None:
@@ -110,7 +115,7 @@ def check(problem: Problem) -> Check:
     The noise is as stated, or guessed from the third differences of the measured signals.
     """
     _require_problem(problem)
-    guess = _first_guess(problem)
+    guess = first_guess(problem)
     noise = guess.layout.estimator.as_it_ends(guess.data, guess.noise)
     if noise is not guess.noise:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
@@ -137,7 +142,7 @@ def check(problem: Problem) -> Check:
     return Check(verdict, sds, tuple(notes), guessed, findings)
 
 
-def findings(problem: Problem) -> tuple[Finding, ...]:
+def findings(problem: Problem, guess: FirstGuess | None = None) -> tuple[Finding, ...]:
     """Whether the flights are enough for what is asked, at the start values: as `check` says it.
 
     What missing outputs would tell and what to fly next is compared for output error of linear
@@ -145,8 +150,9 @@ def findings(problem: Problem) -> tuple[Finding, ...]:
 
     Args:
         problem: model, vehicle, flights and what is free.
+        guess: of `first_guess`, where it is at hand already.
     """
-    guess = _first_guess(problem)
+    guess = guess or first_guess(problem)
     at, feedback = Solution(*guess[:4]), feedback_of(problem)
     quick = problem.model.linear and at.layout.estimator.rows_are_samples
     return is_it_enough(problem, at, guess.e, feedback, compare=quick)
@@ -176,7 +182,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     if not estimator_of(problem.method).rows_by_flight:
         # Which part says most is asked of the simulation, whatever the fit goes by.
         problem = dataclasses.replace(problem, method="output-error", instrument=None)
-    guess = _first_guess(problem)
+    guess = first_guess(problem)
     ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
@@ -184,7 +190,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
 
 
 def _starts(
-    guess: _FirstGuess, problem: Problem, starts: int | None, seed: int
+    guess: FirstGuess, problem: Problem, starts: int | None, seed: int
 ) -> Float[Array, "s q"]:
     """Where the optimiser begins, as `fit` says of its argument."""
     if starts is None:
@@ -199,6 +205,7 @@ def fit(
     seed: int = 0,
     max_steps: int = 200,
     progress: starting.Progress | None = None,
+    guess: FirstGuess | None = None,
 ) -> Fit:
     """Estimate the free parameters by the problem's method: one of `methods.METHODS`.
 
@@ -210,6 +217,7 @@ def fit(
         seed: of that draw.
         max_steps: of the optimiser, in each of its runs.
         progress: called with a line of text before each longer part of the work.
+        guess: of `first_guess`, where it is at hand already.
 
     Returns:
         A Fit whose `status` says whether it converged and whether the data determine what was
@@ -223,7 +231,7 @@ def fit(
     _require_problem(problem)
     report = progress or (lambda _: None)
     with stage("first guess"):
-        guess = _first_guess(problem)
+        guess = guess or first_guess(problem)
     # Where the optimiser does not arrive, this is all that can be said of what is identifiable.
     before = verdict_of(problem, guess.layout, guess.e)
     words = f"fitting {', '.join(guess.layout.of_interest)}"
@@ -241,7 +249,7 @@ def fit(
 
 def _search(
     problem: Problem,
-    guess: _FirstGuess,
+    guess: FirstGuess,
     points: Float[Array, "s q"],
     max_steps: int,
     report: starting.Progress,

@@ -90,7 +90,7 @@ def _small(png: bytes) -> str:
     """With a palette of few colours: lines on white need no more, and it is a third as large."""
     small = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
-        image.convert("RGB").quantize(_COLOURS).save(small, format="png", optimize=True)
+        image.convert("RGB").quantize(_COLOURS).save(small, format="png")
     return _address("png", small.getvalue())
 
 

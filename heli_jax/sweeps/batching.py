@@ -23,6 +23,8 @@ _CPU, _GPU = 64, 1 << 17
 _CANDIDATES = {"cpu": (32, 64, 128, 256), "gpu": (1 << 13, 1 << 15, 1 << 17)}
 # [s] A sweep that takes less is not worth measuring for: every candidate is compiled.
 _WORTH_S = 60.0
+# What an element takes may be so many times the guess: with less there is nothing to time.
+_OFF_BY = 10.0
 # [s] What a chunk should take, about: a kill costs as much, and writing is to be little of it.
 _CHUNK_S = 2.0
 # [bytes] Results of a chunk: two chunks are held at once, one computed and one written.
@@ -170,6 +172,9 @@ def _measured(
     known = _remembered(memory)
     if isinstance(known.get(key), int) and known[key] >= 1:
         return known[key]
+    # To time it is to compile it at a size of its own, which takes longer than most sweeps do.
+    if _OFF_BY * _guess(job) * job.design.size < _WORTH_S * len(devices):
+        return default
     first = _time(job, devices, default)
     if first * job.design.size < _WORTH_S:
         return default

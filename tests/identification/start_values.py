@@ -5,5 +5,5 @@ from heli_jax.identification.unknowns.layout import Solution
 
 
 def at_start(problem):
-    guess = fit._first_guess(problem)
+    guess = fit.first_guess(problem)
     return Solution(*guess[:4]), guess.e

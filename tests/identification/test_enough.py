@@ -11,7 +11,7 @@ import scipy.signal
 from heli_jax import Flight, Free, Model, Nuisance, Problem
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.identification.fit import check
-from heli_jax.identification.validation import excited_band, signal_quality
+from heli_jax.identification.validation import excited_band, next_flight, signal_quality
 from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
 from heli_jax.identification.validation.missing_outputs import look_at_missing
 from heli_jax.identification.validation.next_flight import plan_next_flight
@@ -286,3 +286,14 @@ def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
     asked = Problem(filtered, TRUTH, (moved,), FREE, Nuisance(bias=False))
     (finding,) = logging_rate(asked, [("flight", moved)], [sd])
     assert finding.severity == "ok", finding.sentence
+
+
+def test_candidates_one_by_one_are_those_side_by_side(monkeypatch):
+    asked = problem(flight(0, 1500))
+    both = []
+    for short in (next_flight._SHORT, 0):
+        monkeypatch.setattr(next_flight, "_SHORT", short)
+        both.append(plan_next_flight(asked, *at_start(asked)))
+    one_by_one, side_by_side = both
+    assert one_by_one.best.words == side_by_side.best.words
+    assert one_by_one.after == pytest.approx(side_by_side.after, rel=1e-9)

@@ -330,6 +330,9 @@ def test_how_a_sweep_is_cut(bench30, record, tmp_path, monkeypatch):
     assert cut(1_000_000).chunk <= 1 << 16
     assert cut(1000, chunk=77, lanes=5) == (77, 5, "xla")
     assert cut(1000, chunk=77, lanes=5, backend="auto") == (77, 5, "fused")
+    # What is over in seconds is not timed, for which a program of its own would be compiled.
+    monkeypatch.setattr(lanes, "_time", lambda *_: pytest.fail("timed"))
+    assert cut(100_000).lanes == 64
     # Measured where it pays, once, and remembered.
     calls = []
     monkeypatch.setattr(lanes, "_WORTH_S", 0.0)

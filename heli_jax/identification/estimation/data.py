@@ -6,7 +6,12 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.simulated_flights import simulated_at, with_biases
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.estimation.simulated_flights import (
+    SimulatedOutputs,
+    simulated_at,
+    with_biases,
+)
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms as coordinates
@@ -15,6 +20,7 @@ from heli_jax.identification.unknowns.layout import (
     Data,
     FlightData,
     Layout,
+    Noise,
     layout_of,
 )
 
@@ -106,7 +112,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     """
     # Initial states are zero in it whatever their scales are, which may be the ones still.
     z = start_vector(layout, data, problem)
-    at_start = jax.device_get(simulated_at(layout, data, z))
+    at_start = jax.device_get(_simulated(layout, data, z))
     simulated = with_biases(layout, at_start)
     scaled, names = [], naming.names(layout.model.State)
     for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
@@ -117,3 +123,15 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
         scale = {n: np.asarray(ratio * _size(v), z.dtype) for n, v in zip(names, rms, strict=True)}
         scaled.append(flight._replace(state_scale=jax.device_put(scale)))
     return data._replace(flights=tuple(scaled))
+
+
+def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
+    """What is simulated at z."""
+    # By the program that is to be compiled anyway, where that simulates on its way: one more for
+    # the simulation alone would take longer than the derivatives that nobody asks for here.
+    if layout.estimator.rows_are_samples:
+        ones = tuple({n: np.ones((), z.dtype) for n in names} for names in layout.outputs)
+        at = residual_and_jacobian(layout, data, Noise(ones, np.zeros((), z.dtype)), z)
+        if at.simulated is not None:
+            return at.simulated
+    return simulated_at(layout, data, z)

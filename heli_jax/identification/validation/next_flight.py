@@ -46,6 +46,8 @@ _LONGEST = 20.0
 """duration of a candidate at most [s]: of a longer record several in a row"""
 _BAND = (0.1, 5.0)
 """of the chirp [Hz]"""
+_SHORT = 20_000
+"""samples of a record up to which its own program serves for the candidates"""
 _FREE = 1e-3
 """weight of weak priors where they are all that holds a parameter up"""
 _WORTH = 0.98
@@ -152,20 +154,22 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
     candidates = _candidates(flight, m)
     if not candidates:
         return None
-    s, layout, data = _sensitivity(problem, at, i, candidates, m)
+    each = _each_by_itself(problem, at, candidates, m)
+    if each is None:
+        s, layout, data = _sensitivity(problem, at, i, candidates, m)
+        each = _by_flight(s, layout, data)
     now = sensitivity_at(problem, at.layout, e)
     verdict = verdict_of(problem, at.layout, e)
     lacking = {*verdict.undetermined, *verdict.without_effect}
     if lacking:
         # What only weak priors of biases and offsets hold up is not known: neither now nor then.
-        s, now = (v._replace(own=v.own / _FREE) for v in (s, now))
-    triangles = _by_flight(s, layout, data)
+        each, now = [_loosened(s) for s in each], _loosened(now)
     R = triangle(now)
     before = expected_sd(now.unknowns, R)
     absent = np.array([u.name in lacking for u in now.unknowns])
     widest = int(np.argmax(np.where(absent, before, 0.0) if lacking else before))
     times = flight.n_samples / m
-    sds = [_widest_sd(now, widest, together(R, repeated(T, times)), absent) for T in triangles]
+    sds = [_widest_sd(now, widest, together(R, repeated(triangle(s), times)), absent) for s in each]
     best = int(np.argmin(sds))
     return Plan(
         now.unknowns[widest].name,
@@ -181,7 +185,7 @@ def plan_next_flight(problem: Problem, at: Solution, e: Evaluation) -> Plan | No
 
 def _again(now: Sensitivity, at: Solution, i: int, widest: int) -> float:
     """The widest sd with the i-th flight flown once more."""
-    T = _by_flight(now, at.layout, at.data)[i]
+    T = triangle(_by_flight(now, at.layout, at.data)[i])
     return float(expected_sd(now.unknowns, together(triangle(now), T))[widest])
 
 
@@ -192,8 +196,13 @@ def _widest_sd(now: Sensitivity, widest: int, R: np.ndarray, absent: np.ndarray)
     return np.inf if np.any(sds[absent] >= DETERMINES) else float(sds[widest])
 
 
-def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[np.ndarray]:
-    """What each flight says by itself."""
+def _loosened(s: Sensitivity) -> Sensitivity:
+    """The same with weak priors that hold nothing up."""
+    return s._replace(own=s.own / _FREE)
+
+
+def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[Sensitivity]:
+    """The rows of each flight by itself."""
     flight = np.repeat(np.arange(len(layout.outputs)), [len(names) for names in layout.outputs])
     rows = flight[signal_numbers(layout, data)]
     samples = rows.size
@@ -207,7 +216,8 @@ def _by_flight(s: Sensitivity, layout: Layout, data: Data) -> list[np.ndarray]:
             [(count - 1) * len(layout.states) for count, _ in layout.windows],
         )
     rows = np.concatenate([rows, extra])
-    return [triangle(s, np.flatnonzero(rows == i)) for i in range(len(layout.outputs))]
+    each = [np.flatnonzero(rows == i) for i in range(len(layout.outputs))]
+    return [s._replace(shared=s.shared[at], own=s.own[at]) for at in each]
 
 
 def _candidates(flight: Flight, m: int) -> list[Candidate]:
@@ -244,6 +254,36 @@ def _of_length(
 ) -> Flight:
     """The flight with other signals; what else was logged is not as long as these."""
     return replace(flight, inputs=inputs, outputs=outputs, instruments={}, hold={}, hold_reason={})
+
+
+def _each_by_itself(
+    problem: Problem, at: Solution, candidates: list[Candidate], m: int
+) -> list[Sensitivity] | None:
+    """The rows of each candidate in the program of the record, which is compiled already; None
+    where the record has another one, or is so long that a program of their own is done sooner."""
+    flight, numbers = problem.training[0], at.data.flights[0]
+    n, model, dtype = flight.n_samples, problem.model, at.z.dtype
+    if len(problem.training) > 1 or n > _SHORT or not model.linear or numbers.by_instrument:
+        return None
+    rest = {name: np.zeros(n) for name in flight.inputs}
+    # Alike but for what is logged: held inputs, one window.
+    like = _of_length(flight, rest, {name: np.zeros(n) for name in flight.outputs})
+    if layout_of(problem, (like,)) != at.layout or at.layout.windows != ((1, n),):
+        return None
+    # Behind the end of a candidate nothing is measured, and rows of that are zero.
+    measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
+    z = jnp.concatenate([at.z[: at.layout.first_nuisance], _begins_as(at, 0, linear=True)])
+    found = []
+    for candidate in candidates:
+        inputs = {**rest, candidate.input: np.pad(candidate.values, (0, n - m))}
+        part = numbers._replace(
+            inputs=model.Inputs(**{k: jnp.asarray(v, dtype) for k, v in inputs.items()}),
+            outputs=dict.fromkeys(numbers.outputs, measured),
+        )
+        data = at.data._replace(flights=(part,))
+        s = sensitivity_at(problem, at.layout, evaluate(at.layout, data, at.noise, z))
+        found += _by_flight(s, at.layout, data)
+    return found
 
 
 def _sensitivity(
