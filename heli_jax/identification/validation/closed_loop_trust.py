@@ -31,12 +31,12 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.frequency_gusts import machine_of
 from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.feedback import Feedback
 
@@ -139,7 +139,8 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
     k, r = np.asarray(noise.whitening.whitening).shape[:2]
     q = len(layout.of_interest)
     # Real parts, then imaginary ones.
-    J = np.asarray(evaluate(layout, data, noise, z).J)[: 2 * k * r, :q].reshape(2, k, r, q)
+    J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)
+    J = J[: 2 * k * r, :q].reshape(2, k, r, q)
     return np.einsum("ckra,ckrb->kab", J, J)
 
 
@@ -297,7 +298,7 @@ def information(
     )
     # The program of the fit, with other weights; the priors' rows are no information of these.
     q = len(layout.of_interest)
-    J = np.asarray(evaluate(layout, data, weighed, z).J)[:q, :q]
+    J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)[:q, :q]
     return J.T @ J
 
 
