@@ -193,15 +193,17 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
 def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
     """T and V with Ad = V T V^H, V unitary."""
 
+    def triangle(Ad: Array) -> tuple[Array, Array]:
+        T, V = jax.scipy.linalg.schur(Ad, output="complex")
+        return T, V
+
     def whole(Ad: Array) -> tuple[Array, Array]:
         T = Ad.astype(np.result_type(Ad.dtype, np.complex64))
         return T, jnp.eye(Ad.shape[0], dtype=T.dtype)
 
     # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved. JAX
     # has it for the CPU alone: elsewhere `_solved` takes the matrix as it is.
-    return jax.lax.platform_dependent(
-        Ad, cpu=lambda Ad: tuple(jax.scipy.linalg.schur(Ad, output="complex")), default=whole
-    )
+    return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
 
 
 def _span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
