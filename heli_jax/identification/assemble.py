@@ -161,7 +161,7 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    moved = moved_by_feedback(solution) if bool(best.converged) else {}
+    moved = moved_by_feedback(solution, e.J) if bool(best.converged) else {}
     stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
     weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()

@@ -66,12 +66,13 @@ class Moved(NamedTuple):
     """part of the input that feedback may have brought in, 0 to 1"""
 
 
-def moved_by_feedback(at: Solution) -> dict[str, Moved]:
+def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
     """By unknown of interest; empty where the method knows no frequencies, or every input that
     moves is taken by instrument.
 
     Args:
         at: where the fit ended.
+        J: the whitened rows' derivative there.
     """
     layout = at.layout
     if layout.estimator.fits_responses:
@@ -83,7 +84,8 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         return {}
     shares, chances, n = _coherent_with_residual(lines)
     n = n if all(lines.direct) else 0.0
-    mean = mean_share(information(at, [np.ones(len(v)) for v in shares]))
+    q = len(layout.of_interest)
+    mean = mean_share(J[:q, :q].T @ J[:q, :q])
     by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
     may_be = mean(information(at, _room_for_feedback(lines)))
     return {

@@ -74,8 +74,9 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
     # By output and input over all flights, so that one missing servo is one sentence.
     found: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
-        one = explained_by(flight.residuals[output], flight.inputs[name], flight.dt)
-        if one is None or one.p_value * len(pairs) > _BY_CHANCE or one.share < _WORTH_IT:
+        signals = (flight.residuals[output], flight.inputs[name])
+        one = explained_by(*signals, flight.dt, by_chance=_BY_CHANCE / len(pairs))
+        if one is None or one.share < _WORTH_IT:
             continue
         known = found.get((output, name))
         if known is None or one.share > known.share:
@@ -111,7 +112,9 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
     return begun + f"{one.lag:.2g} s after it moved: {remedy}"
 
 
-def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:
+def explained_by(
+    residual: np.ndarray, u: np.ndarray, dt: float, *, by_chance: float = 1.0
+) -> Explained | None:
     """What the last samples of an input explain of a residual; None where nothing can be told.
 
     Both pass the filter that whitens the residual, so that a slow residual does not pass for an
@@ -121,6 +124,7 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
         residual: (N,), NaN where nothing is measured.
         u: the input (N,), any unit.
         dt: [s].
+        by_chance: p value above which nothing is told either, in half of the time.
     """
     lags = _lags(dt)
     seen = np.isfinite(residual)
@@ -150,6 +154,8 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
     F = (share / rank) / max((1.0 - share) / freedom, 1e-300)
     # The upper tail itself, not one less the lower: beyond 1e-16 that difference is zero.
     p_value = float(scipy.special.fdtrc(rank, freedom, F))
+    if p_value > by_chance:
+        return None
     # Less what as many numbers explain of noise.
     share = max(0.0, 1.0 - (1.0 - share) * (n - 1) / freedom)
     # By each lag alone, since the coefficients of a regression on neighbouring lags swing against
