@@ -1,11 +1,10 @@
 """Is the lag between two logs as sure as its standard deviation says?
 
-    .venv/bin/python experiments/alignment.py [--runs N]
+    .venv/bin/python experiments/alignment.py [RUNS]
 
-The same random motion on two clocks with jitter, of several rates, bands and noise; 100 runs each.
+The same random motion on two clocks with jitter, of several rates, bands and noise; RUNS (100) of
+each.
 """
-
-import argparse
 
 import numpy as np
 
@@ -60,10 +59,7 @@ def row(case, runs: int) -> str:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=100)
-    runs = parser.parse_args().runs
+def main(runs: int) -> None:
     print("| rates | motion up to | noise | real sd | reported sd | mean error | 95 % | refused |")
     print("|---|---|---|---|---|---|---|---|")
     for case in CASES:
@@ -71,4 +67,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from script import Size, asked
+
+    main(asked(__doc__, "two minutes", Size("runs", 100, 3, "of each case")).runs)

@@ -1,6 +1,7 @@
 """Do the 95 % intervals cover, and are the reported standard deviations the real ones?
 
-    .venv/bin/python experiments/coverage.py [--runs N] [--only WORDS] [--out FOLDER]
+    .venv/bin/python experiments/coverage.py [--runs N | --quick] [--only WORDS]
+        [--out FOLDER]
 
 Many records of each case in experiments/coverage_cases are fitted one by one; each case runs at its
 full size unless N is given. FOLDER (runs/coverage) keeps one line a run, so that what was stopped
@@ -23,6 +24,8 @@ import numpy as np
 from coverage_cases import Case, Interval, Run
 
 jax.config.update("jax_enable_x64", True)
+QUICK = 2
+"""runs of each case with --quick"""
 
 
 def all_cases() -> list[Case]:
@@ -84,16 +87,24 @@ def rows(case: Case, runs: list[Run]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Do the 95 % intervals cover?")
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="At full size: an hour on two cores.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--runs", type=int, help="runs of each case, instead of its full size")
+    parser.add_argument(
+        "--quick", action="store_true", help=f"{QUICK} runs of each case, to see that it runs"
+    )
     parser.add_argument("--only", default="", help="cases whose name has these words in it")
     parser.add_argument("--out", type=Path, default=Path("runs/coverage"))
     options = parser.parse_args()
+    runs = options.runs or (QUICK if options.quick else None)
     options.out.mkdir(parents=True, exist_ok=True)
     lines = [HEAD, "|" + "---|" * 7]
     for case in all_cases():
         if options.only in case.name:
-            lines += rows(case, run_case(case, options.runs or case.runs, options.out))
+            lines += rows(case, run_case(case, runs or case.runs, options.out))
     text = "\n".join(lines) + "\n"
     (options.out / "table.md").write_text(text, encoding="utf-8")
     print(text, end="")

@@ -1,6 +1,6 @@
 """How often the intervals of a compatibility analysis hold: sensors with injected errors.
 
-    python experiments/data_compatibility.py --runs 100
+    .venv/bin/python experiments/data_compatibility.py [--runs N | --quick]
 
 A flight about hover, of known angles and accelerations, is logged by sensors with errors: gyro
 bias and scale, accelerometer bias and scale, a lever arm, an IMU that is early against the rest.
@@ -175,8 +175,11 @@ def show(table: dict[str, list[tuple[bool, float]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=100)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, help="(100)")
+    parser.add_argument("--quick", action="store_true", help="3 runs, to see that it runs")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--duration", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=100.0, help="of the log [Hz]")
@@ -185,6 +188,7 @@ def main() -> None:
     parser.add_argument("--method", default="filter-error")
     parser.add_argument("--results", type=Path, help="a line of JSON for each run, gone on with")
     options = parser.parse_args()
+    runs = options.runs or (3 if options.quick else 100)
     table: dict[str, list[tuple[bool, float]]] = {}
     results: Path | None = options.results
     for line in results.read_text().splitlines() if results and results.exists() else ():
@@ -195,7 +199,7 @@ def main() -> None:
     times, began = np.arange(0.0, options.duration, 1 / options.rate), time.perf_counter()
     # Interrupted, it shows what it has.
     with contextlib.suppress(KeyboardInterrupt):
-        for run in range(options.first + done, options.first + options.runs):
+        for run in range(options.first + done, options.first + runs):
             rng = np.random.default_rng(run)
             truth = draw_errors(rng, not options.angles)
             flight = logged(rng, truth, options.gyro_noise, times)

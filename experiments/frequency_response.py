@@ -9,7 +9,6 @@ estimator that knows the gusts' spectrum and the noise: the sensitivities of the
 the Kalman filter that makes them white.
 """
 
-import sys
 import time
 from collections.abc import Callable
 
@@ -131,5 +130,12 @@ def main(runs: int, window: float) -> None:
 
 
 if __name__ == "__main__":
-    arguments = dict(enumerate(sys.argv[1:]))
-    main(int(arguments.get(0, 60)), float(arguments.get(1, 10.0)))
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "five minutes",
+        Size("runs", 60, 2, "records of each stick, with gusts and without"),
+        Size("window", 10.0, 10.0, "of frequency-response [s]"),
+    )
+    main(options.runs, options.window)

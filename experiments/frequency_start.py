@@ -57,4 +57,6 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    from script import Size, asked
+
+    main(asked(__doc__, "three minutes", Size("runs", 20, 1, "starts of each factor")).runs)

@@ -2,7 +2,7 @@
 
 Every attempt has to end in a flight or in one sentence, within ten seconds. Run it on any logs:
 
-    python experiments/fuzz_logs.py ../shared/data/ulog/sample_log_small.ulg --count 500
+    .venv/bin/python experiments/fuzz_logs.py LOG --count 500
 
 It prints how many ended how, the slowest, and the process's largest memory; exit code 1 where one
 ended in a traceback or hung, or the memory went beyond 1 GB. A long run is made of pieces by
@@ -101,12 +101,16 @@ def outcome(path: Path, converts: bool = True) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Damage logs and read them.")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("logs", nargs="+", type=Path)
-    parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--count", type=int, help="truncations, and as many flips, of each (500)")
+    parser.add_argument("--quick", action="store_true", help="10 of them, to see that it runs")
     parser.add_argument("--seed", type=int, default=0, help="of where the damage is")
     parser.add_argument("--seconds", type=float, default=1e9, help="no attempt begins later")
     options = parser.parse_args()
+    count = options.count or (10 if options.quick else 500)
     failed, began_all = False, time.monotonic()
     for log in options.logs:
         counts, slowest = collections.Counter(), (0.0, "")
@@ -114,7 +118,7 @@ def main() -> int:
             path = Path(folder) / log.name
             path.write_bytes(log.read_bytes())
             outcome(path)  # whole, so that what is imported meanwhile is no attempt's time
-            attempts = damaged(log.read_bytes(), options.count, options.seed)
+            attempts = damaged(log.read_bytes(), count, options.seed)
             for number, (words, data) in enumerate(attempts):
                 if time.monotonic() - began_all > options.seconds:
                     break

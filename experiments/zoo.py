@@ -1,6 +1,6 @@
 """A hundred identification problems with known answers: no silent success, no false alarm.
 
-    .venv/bin/python experiments/zoo.py [--small] [--only WORDS]
+    .venv/bin/python experiments/zoo.py [--quick] [--only WORDS]
 
 Half of them are sound: a fit must converge, give every parameter with an interval that holds the
 truth, and call the model adequate. The other half are not: terms that can be exchanged, a gain
@@ -460,12 +460,14 @@ def _off(puzzle: Puzzle, result: Fit) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="A hundred problems with known answers.")
-    parser.add_argument("--small", action="store_true", help="one of each kind")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="one of each kind")
     parser.add_argument("--only", default="", help="kinds whose name has these words in it")
     options = parser.parse_args()
     begin, count, wrong = time.monotonic(), 0, 0
-    for puzzle in zoo(options.small):
+    for puzzle in zoo(options.quick):
         if options.only not in puzzle.name:
             continue
         result = fit(puzzle.problem)

@@ -205,9 +205,9 @@ def _fit(options: argparse.Namespace) -> int:
 def _fit_code(fitted: "Fit") -> int:
     """The exit code of a fit."""
     code = {"converged": DONE, "not-identifiable": NOT_DETERMINED}.get(fitted.status, NOT_CONVERGED)
-    # Converged onto a model worse than a constant: a script that looks at the code alone must not
-    # take these numbers.
-    if code == DONE and fitted.adequacy.less_than_mean:
+    # Converged onto a model worse than a constant, or one that foretells no better: a script that
+    # looks at the code alone must not take these numbers.
+    if code == DONE and (fitted.adequacy.less_than_mean or fitted.held_out_worse):
         return NOT_CONVERGED
     return code
 

@@ -121,7 +121,9 @@ def test_too_few_steps_end_with_exit_code_4(bench):
     out = bench.parent / "run"
     arguments = ["fit", str(bench), "--set", "fit.max_steps=2", "--out", str(out)]
     assert main(arguments) == 4
-    assert json.loads((out / "fit.json").read_text())["status"] == "not-converged"
+    written = json.loads((out / "fit.json").read_text())
+    assert written["status"] == "not-converged"
+    assert written["adequacy"]["summary"] != "yes"
 
 
 def test_filter_error_by_configuration(bench, capsys):

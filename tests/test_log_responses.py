@@ -11,10 +11,12 @@ import xarray as xr
 
 from heli_jax.analysis.attitude_responses import handling_gaps
 from heli_jax.analysis.flight_responses import Settings, Wanted, flight_responses
+from heli_jax.analysis.transfer_fit import Measured, fit_transfer
 from heli_jax.cli import main
 from heli_jax.flights import Flight
 from heli_jax.linear_models.read import linear_model
 from heli_jax.report.figures.responses import branch_of
+from heli_jax.report.responses import _content
 
 DT = 0.02
 ROLL = scipy.signal.cont2discrete(([12.0], [1.0, 3.0]), DT)
@@ -108,6 +110,18 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     assert "lat to p" in page
     assert "Handling qualities" in page
     assert (out / "figures/p-lat.png").exists()
+
+
+def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():
+    s = 1j * np.geomspace(0.5, 30.0, 60)
+    H = 12.0 / (s + 3.0)
+    at = Measured(s.imag, H, 0.02 * np.abs(H), 1e3, np.full(60, 0.95))
+    wanted = [Wanted("lat", "p", 0, poles) for poles in (1, 3)]
+    enough, more = (_content(w, fit_transfer(at, w.zeros, w.poles)) for w in wanted)
+    assert (enough["status"], enough["converged"]) == ("converged", True)
+    assert {} in more["denominator"]
+    assert more["status"] != "converged"
+    assert not more["converged"]
 
 
 @pytest.mark.parametrize(

@@ -91,4 +91,6 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
+    from script import Size, asked
+
+    main(asked(__doc__, "two minutes", Size("runs", 5, 1, "fits of each")).runs)

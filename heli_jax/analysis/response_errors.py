@@ -23,9 +23,16 @@ from heli_jax.analysis.response_options import PairOptions, ResponseOptions
 from heli_jax.analysis.spectral import inverse
 from heli_jax.analysis.windowed import PER_AVERAGE, Windowed, hann
 
-_LEAST, _PART = 2.0, 0.08
-"""sd of the Gaussian that smooths the noise's spectrum over frequency: lines of the window at
-least, and as a part of the frequency"""
+_WIDEST = 2.0
+"""sd of the Gaussian that smooths the noise's spectrum over frequency, in lines of the window: half
+of it where averages are many enough"""
+_PART = 0.04
+"""the same as a part of the frequency, of each line"""
+_ENOUGH = 30.0
+"""independent averages for each output that a spectral matrix is taken from. A wider mean takes a
+mode of gusts for a wide one: with twice the width errors were by 20 % larger"""
+_LINES = 2.0 * np.pi**0.5 / 1.95
+"""independent lines in a Gaussian of one line, of Hann windows"""
 _NEIGHBOURS = 3
 """lines to either side with which a line is correlated in Hann windows"""
 _ROUNDING = 1e-14
@@ -193,7 +200,9 @@ def _left(w: Windowed, E: np.ndarray, seen: np.ndarray) -> np.ndarray:
     freedom = np.maximum(np.sum(seen, axis=0) - PER_AVERAGE * len(w.inputs), 0.5)
     S = np.einsum("wki,wkj->kij", D, np.conj(D), optimize=True)
     S = S / np.sqrt(freedom[:, None] * freedom[None, :])
-    width = np.maximum(_LEAST, _PART * w.lines)
+    averages = float(np.min(freedom)) / PER_AVERAGE
+    least = _ENOUGH * E.shape[2] / (_LINES * averages)
+    width = np.clip(least, 0.5 * _WIDEST, _WIDEST) * np.maximum(1.0, _PART * w.lines)
     kernel = np.exp(-0.5 * ((w.lines[:, None] - w.lines[None, :]) / width[:, None]) ** 2)
     return np.einsum("kl,lij->kij", kernel / np.sum(kernel, axis=1, keepdims=True), S)
 

@@ -161,7 +161,7 @@ def assemble(
     params = _params(problem, estimates)
     against = _against_expected(search, optimum, e, absent)
     found, closed_loop = _feedback(problem, white, numbers if bool(best.converged) else None)
-    moved = moved_by_feedback(solution) if bool(best.converged) else {}
+    moved = moved_by_feedback(solution, e.J) if bool(best.converged) else {}
     stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
     weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()
@@ -176,11 +176,12 @@ def assemble(
     )
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
+    status = _status(best, e, numbers, errors.verdict)
     missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(
         model=problem.model.name,
         method=problem.method,
-        status=_status(best, e, numbers, errors.verdict),
+        status=status,
         n_samples=measured_count(data),
         estimates=estimates,
         nuisance=numbers.nuisance,
@@ -197,7 +198,9 @@ def assemble(
         one_step=pooled_metrics(signals, one_step=True),
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=white,
-        adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined]),
+        adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined])._replace(
+            at_optimum=status != "not-converged"
+        ),
         coloured=errors.coloured,
         responses=responses,
         starts=table(layout, data, run.points, run.optima),

@@ -13,7 +13,7 @@ from heli_jax.identification.estimation.multistart import StartRow
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import UNJUDGED, Adequacy
+from heli_jax.identification.validation.adequacy import UNJUDGED, WORSE, Adequacy
 from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, untrusted
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
@@ -195,6 +195,16 @@ class Fit:
     def adequate(self) -> bool:
         """Whether the model explains what was measured (`adequacy` says why not)."""
         return self.adequacy.adequate
+
+    @property
+    def held_out_worse(self) -> tuple[str, ...]:
+        """Output error: the outputs that flights held out show worse than their mean, by more than
+        chance makes of one that does not respond."""
+        # With gusts in the model, or no simulation in the fit, such a simulation says little.
+        estimator = estimator_of(self.method)
+        if estimator.process_noise or estimator.noise_spectrum:
+            return ()
+        return tuple(n for n, m in self.validation.items() if not m.vaf >= WORSE)
 
     @property
     def disturbable(self) -> bool:

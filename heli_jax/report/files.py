@@ -62,7 +62,7 @@ def fit_json(
             "instruments": list(fit.instruments),
             "n_samples": fit.n_samples,
             "identifiable": fit.verdict.identifiable,
-            "adequate": None if content.adequate_unjudged(fit) else fit.adequate,
+            "adequate": None if fit.adequacy.unjudged else fit.adequate,
             "adequacy": content.adequacy(fit.adequacy),
             "null_directions": list(fit.verdict.null_directions),
             "determined_combinations": content.combinations(fit.verdict),

@@ -18,11 +18,6 @@ from heli_jax.identification.validation.feedback import LEVEL
 from heli_jax.numbers import percent
 
 
-def adequate_unjudged(fit: Fit) -> bool:
-    """Whether an adequate look means nothing, since no optimum was reached."""
-    return fit.status == "not-converged" and fit.adequate
-
-
 def whiteness_note(fit: Fit) -> str:
     """Why the intervals cannot be taken at their word; empty where the residuals are white."""
     not_white = [name for name, w in fit.whiteness.items() if not w.white]
@@ -129,6 +124,7 @@ def adequacy(adequacy: Adequacy) -> dict[str, Any]:
         # With the limits that it was judged against, so that a file can be read without the version
         # that wrote it.
         **adequacy._asdict(),
+        "adequate": None if adequacy.unjudged else adequacy.adequate,
         "summary": adequacy.summary,
         "judged": [output._asdict() for output in adequacy.judged],
         # The limits of this version: a later one may have others.

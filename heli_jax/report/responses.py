@@ -183,6 +183,10 @@ def _write_netcdf(path: Path, found: FlightResponses, units: Mapping[str, str]) 
 def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
     poles_known = all(c.determined for c in fit.denominator)
     zeros_known = all(c.determined for c in fit.numerator)
+    delay_known = fit.delay is None or fit.delay.determined
+    # In the words of fit.json: a search that arrived is no result where a number is not determined.
+    status = "converged" if poles_known and zeros_known and delay_known else "not-identifiable"
+    status = status if fit.converged else "not-converged"
     return {
         "input": wanted.input,
         "output": wanted.output,
@@ -194,7 +198,8 @@ def _content(wanted: Wanted, fit: TransferFit) -> dict[str, Any]:
         "zeros": [[z.real, z.imag] for z in fit.zeros] if zeros_known else None,
         "chi_squared_per_degree": fit.chi_squared,
         "J": fit.J,
-        "converged": fit.converged,
+        "status": status,
+        "converged": status == "converged",
         "determined": fit.determined,
     }
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from heli_jax import Flight
 from heli_jax.analysis.response_errors import (
@@ -121,3 +122,22 @@ def test_noise_and_its_correlation_are_found_whatever_the_inputs_explain():
 def test_what_does_not_fit_the_flights_is_refused(options, said):
     with pytest.raises(ValueError, match=said):
         windowed(flights(np.zeros((2, 2, N))), options)
+
+
+def test_a_narrow_mode_is_not_smeared_where_averages_are_many():
+    """Noise of a mode at 0.3 Hz in windows of 10 s: its spectrum against the mean of many records,
+    each without any smoothing."""
+    rng, n = np.random.default_rng(2), 2400
+    b, a = scipy.signal.bilinear([1.0], [1.0, 0.2, (0.6 * np.pi) ** 2], 1.0 / DT)
+
+    def record() -> Flight:
+        y = scipy.signal.lfilter(b, a, rng.standard_normal(n + 1000))[1000:]
+        return Flight(dt=DT, inputs={"a": rng.standard_normal(n)}, outputs={"p": np.asarray(y)})
+
+    many = [windowed([record()], ResponseOptions(window=10.0)) for _ in range(60)]
+    true = np.mean([np.mean(np.abs(w.Y[:, :, 0]) ** 2, axis=0) for w in many], axis=0)
+    found = [np.real(noise_density(w, averages(w), w.Y))[:, 0, 0] for w in many[:20]]
+    # Three lines above the mode, where there is little: twice the width makes it 20 times as much.
+    above = 5
+    assert many[0].hz[above] == pytest.approx(0.6)
+    assert np.mean(found, axis=0)[above] < 8.0 * true[above]

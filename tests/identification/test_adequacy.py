@@ -2,16 +2,17 @@
 exists. Records are made in NumPy."""
 
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight, Free, Model, Nuisance, Problem, cli, fit, models
-from heli_jax.identification.validation.adequacy import Evidence, assess
+from heli_jax import Fit, Flight, Free, Model, Nuisance, Problem, cli, fit, models
+from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.metrics import metrics, whiteness
+from heli_jax.report import fit_content
 from tests.identification.bench import BENCH, vehicle
 from tests.identification.test_filter_error import FREE, made
 
@@ -150,12 +151,37 @@ def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
 
 
 @pytest.mark.parametrize(
-    ("status", "less", "code"),
+    ("status", "less", "held_out", "code"),
     [
-        ("converged", False, 0), ("converged", True, 4),
-        ("not-identifiable", True, 3), ("not-converged", True, 4),
+        ("converged", False, (), 0), ("converged", True, (), 4), ("converged", False, ("p",), 4),
+        ("not-identifiable", True, ("p",), 3), ("not-converged", True, (), 4),
     ],
 )  # fmt: skip
-def test_exit_codes(status, less, code):
+def test_exit_codes(status, less, held_out, code):
     adequacy = SimpleNamespace(reasons=("VAF of p is -586",) if less else (), less_than_mean=less)
-    assert cli._fit_code(SimpleNamespace(status=status, adequacy=adequacy)) == code
+    fitted = SimpleNamespace(status=status, adequacy=adequacy, held_out_worse=held_out)
+    assert cli._fit_code(fitted) == code
+
+
+@pytest.mark.parametrize(
+    ("method", "vaf", "worse"),
+    [
+        ("output-error", -0.3, ("p",)), ("output-error", np.nan, ("p",)),
+        ("output-error", -0.05, ()), ("output-error", 0.4, ()),
+        ("filter-error", -0.3, ()), ("frequency-error", -0.3, ()),
+    ],
+)  # fmt: skip
+def test_flights_held_out_are_held_against_their_mean_by_output_error_alone(method, vaf, worse):
+    """Gusts and an unstable machine make a simulation in time what it is with the others."""
+    fitted: Any = SimpleNamespace(method=method, validation={"p": SimpleNamespace(vaf=vaf)})
+    assert Fit.held_out_worse.fget(fitted) == worse  # pyright: ignore[reportOptionalCall]
+
+
+def test_what_stopped_before_an_optimum_and_looks_adequate_was_not_judged():
+    stopped = Adequacy(True, False, (), limited="some of it", at_optimum=False)
+    assert stopped.summary == "not judged"
+    written = fit_content.adequacy(stopped)
+    assert written["adequate"] is None
+    assert written["summary"] == "not judged"
+    # What is wrong where it stopped is said.
+    assert stopped.doubted(["p is off"]).summary == "no (p is off)"

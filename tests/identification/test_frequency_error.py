@@ -12,8 +12,13 @@ import scipy.linalg
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model, models, naming, simulate
 from heli_jax.dynamics.linearised import point
 from heli_jax.identification.estimation.data import data_of
-from heli_jax.identification.estimation.frequency_lines import errors_of_lines
-from heli_jax.identification.estimation.frequency_records import cut_notes
+from heli_jax.identification.estimation.frequency_lines import (
+    Matrices,
+    errors_of_lines,
+    resolved,
+    states,
+)
+from heli_jax.identification.estimation.frequency_records import Record, cut_notes
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
 from heli_jax.identification.estimation.linearised_flights import linear_drive
 from heli_jax.identification.estimation.noise_covariance import first_noise
@@ -74,6 +79,25 @@ def test_the_identity_holds_for_stable_and_unstable_machines(growth, hold):
 
 
 FREE = {"Ixx": Free(0.035), "If": Free(1.2e-4), "kappa": Free(7.0)}
+
+
+def lines_of_a_machine(A: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whitened responses at the lines of a record, and the states."""
+    n = A.shape[0]
+    record = Record(0, 0, 40)
+    m = Matrices(A, jnp.ones((n, 1)), jnp.eye(n)[:2], jnp.zeros((2, 1)))
+    at = resolved(m, record, jnp.broadcast_to(jnp.eye(2, dtype=complex), (record.lines, 2, 2)))
+    return at.H, states(at, jnp.ones((record.lines, n), complex))
+
+
+def test_lines_without_a_triangle_are_the_same(monkeypatch):
+    """Schur's triangle is for the CPU alone: the program is lowered for others without one."""
+    A = jnp.array([[0.9, 0.2, 0.0], [-0.3, 0.8, 0.1], [0.0, 0.4, 0.7]])
+    jax.jit(lines_of_a_machine).trace(A).lower(lowering_platforms=("cuda",))
+    found = lines_of_a_machine(A)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, default: default(*args))
+    for one, other in zip(found, lines_of_a_machine(A), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

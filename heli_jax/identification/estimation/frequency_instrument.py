@@ -17,8 +17,9 @@ from heli_jax import naming
 from heli_jax.errors import nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.instruments import own_instruments, own_said
-from heli_jax.identification.estimation.evaluation import deviations, evaluate
+from heli_jax.identification.estimation.evaluation import deviations
 from heli_jax.identification.estimation.frequency_spectrum import AVERAGES, smoothed
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Solution
 
@@ -151,7 +152,8 @@ def strengths(at: Solution) -> dict[str, Strength]:
 
     def sds(by: float) -> np.ndarray:
         # The same program either way, and the same weights.
-        J = evaluate(layout, data, noise._replace(by_instrument=np.asarray(by)), z).J
+        weighed = noise._replace(by_instrument=np.asarray(by))
+        J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)
         return deviations(J)[: len(layout.of_interest)]
 
     with np.errstate(all="ignore"):

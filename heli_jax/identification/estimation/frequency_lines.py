@@ -183,12 +183,27 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     """
     z = np.exp(2j * np.pi * np.arange(1, record.lines + 1) / record.samples)
     z = z.astype(np.result_type(m.Ad.dtype, np.complex64))
-    # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved.
-    T, V = jax.scipy.linalg.schur(m.Ad, output="complex")
+    T, V = _triangle(m.Ad)
     H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
     # What the ends of the record explain is found by linear least squares.
     Q, solution = _span(stacked(jnp.asarray(z)[:, None, None] * H).reshape(-1, H.shape[2]))
     return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
+
+
+def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
+    """T and V with Ad = V T V^H, V unitary."""
+
+    def triangle(Ad: Array) -> tuple[Array, Array]:
+        T, V = jax.scipy.linalg.schur(Ad, output="complex")
+        return T, V
+
+    def whole(Ad: Array) -> tuple[Array, Array]:
+        T = Ad.astype(np.result_type(Ad.dtype, np.complex64))
+        return T, jnp.eye(Ad.shape[0], dtype=T.dtype)
+
+    # Schur's triangle makes of an inverse for each line a substitution, and is as well-behaved. JAX
+    # has it for the CPU alone: elsewhere `_solved` takes the matrix as it is.
+    return jax.lax.platform_dependent(Ad, cpu=triangle, default=whole)
 
 
 def _span(basis: Float[Array, "s n"]) -> tuple[Float[Array, "s n"], Float[Array, "n n"]]:
@@ -262,10 +277,20 @@ def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"
 
 
 def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> Array:
-    """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with a triangle T."""
+    """(zI - T)^-1 b at each line (K, ...), or b (zI - T)^-1, with T of `_triangle`."""
     M = z[:, None, None] * jnp.eye(T.shape[0], dtype=z.dtype)[None] - T[None]
     b = jnp.broadcast_to(b, (len(z), *b.shape[-2:]))
-    return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
+
+    def whole(M: Array, b: Array) -> Array:
+        if left:
+            return jnp.linalg.solve(M, b)
+        turned = jnp.linalg.solve(jnp.swapaxes(M, 1, 2), jnp.swapaxes(b, 1, 2))
+        return jnp.swapaxes(turned, 1, 2)
+
+    def triangle(M: Array, b: Array) -> Array:
+        return jax.lax.linalg.triangular_solve(M, b, left_side=left, lower=False)
+
+    return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
 
 def _times(M: Float[Array, "K a 2b"], v: Complex[Array, "K b"]) -> Float[Array, "K a"]:

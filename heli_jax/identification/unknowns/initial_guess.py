@@ -33,18 +33,19 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
         )
         for i, (f, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
     ]
-    one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
+    one, zero = np.ones((), dtype), np.zeros((), dtype)
     z += [one] * len(layout.gains) + [zero] * layout.shift
-    z += [jnp.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
+    z += [np.asarray(np.log(problem.noise[n].start), dtype) for n in layout.disturbance]
     # Zero is the mean of the weak priors, and for the noise's factors the guess as it is.
-    z = jnp.stack([*z, *[zero] * (layout.size - len(z))])
+    whole = np.zeros(layout.size, dtype)
+    whole[: len(z)] = jax.device_get(z)
     if layout.initial_state:
-        z = _initial_states(layout, data, problem, z)
-    return z
+        _initial_states(layout, data, problem, whole)
+    return jnp.asarray(whole)
 
 
-def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> Array:
-    """The model's own initial state (of a whole helicopter its hover), or for one that is not
+def _initial_states(layout: Layout, data: Data, problem: Problem, z: np.ndarray) -> None:
+    """Enter the model's own initial state (of a whole helicopter its hover), or for one that is not
     linear the nearest that shows the measured outputs at the first sample of the window."""
     at, names = layout.first_nuisance, naming.names(layout.model.State)
     values = {n: jnp.asarray(f.start, z.dtype) for n, f in problem.free.items()}
@@ -64,10 +65,9 @@ def _initial_states(layout: Layout, data: Data, problem: Problem, z: Array) -> A
                 value = x0[names.index(name)]
                 # Coordinates of states are in units of their weak priors' sds.
                 scale = float(flight.state_scale[name])
-                z = z.at[at + j].set(jnp.asarray(value / scale, z.dtype))
+                z[at + j] = value / scale
             at += len(layout.states)
         at += layout.constants(layout.outputs[i])
-    return z
 
 
 def own_start(model: Model, params: Any) -> dict[str, float]:

@@ -73,10 +73,17 @@ class Adequacy(NamedTuple):
     """what forbids to call it adequate, however well it fits"""
     limited: str = ""
     """what keeps an adequate model from a plain yes, where no residual in time is judged"""
+    at_optimum: bool = True
+    """whether the optimiser arrived: what looks adequate where it stopped before says nothing"""
 
     def doubted(self, doubts: Sequence[str]) -> "Adequacy":
         """The same, not adequate where there is such a doubt, each in a few words."""
         return self._replace(adequate=False, doubts=tuple(doubts)) if doubts else self
+
+    @property
+    def unjudged(self) -> bool:
+        """Whether it looks adequate at a point that is no optimum."""
+        return self.adequate and not self.at_optimum
 
     @property
     def doubtful(self) -> bool:
@@ -90,8 +97,10 @@ class Adequacy(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """`yes`, `in size only (the residuals of p are not white)`, or
+        """`yes`, `in size only (the residuals of p are not white)`, `not judged`, or
         `no (VAF of p is -586, less than its mean)`."""
+        if self.unjudged:
+            return "not judged"
         if self.adequate:
             left = "; ".join(self._left_over) if self.coloured else self.limited
             words = f"in size only ({left})" if left else "yes"

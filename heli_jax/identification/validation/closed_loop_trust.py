@@ -31,12 +31,12 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
-from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.frequency_gusts import machine_of
 from heli_jax.identification.estimation.frequency_instrument import inputs_by_instrument
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
+from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.feedback import Feedback
 
@@ -66,12 +66,13 @@ class Moved(NamedTuple):
     """part of the input that feedback may have brought in, 0 to 1"""
 
 
-def moved_by_feedback(at: Solution) -> dict[str, Moved]:
+def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
     """By unknown of interest; empty where the method knows no frequencies, or every input that
     moves is taken by instrument.
 
     Args:
         at: where the fit ended.
+        J: the whitened rows' derivative there.
     """
     layout = at.layout
     if layout.estimator.fits_responses:
@@ -83,7 +84,8 @@ def moved_by_feedback(at: Solution) -> dict[str, Moved]:
         return {}
     shares, chances, n = _coherent_with_residual(lines)
     n = n if all(lines.direct) else 0.0
-    mean = mean_share(information(at, [np.ones(len(v)) for v in shares]))
+    q = len(layout.of_interest)
+    mean = mean_share(J[:q, :q].T @ J[:q, :q])
     by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
     may_be = mean(information(at, _room_for_feedback(lines)))
     return {
@@ -139,7 +141,8 @@ def information_by_line(at: Solution) -> Float[np.ndarray, "k q q"]:
     k, r = np.asarray(noise.whitening.whitening).shape[:2]
     q = len(layout.of_interest)
     # Real parts, then imaginary ones.
-    J = np.asarray(evaluate(layout, data, noise, z).J)[: 2 * k * r, :q].reshape(2, k, r, q)
+    J = np.asarray(residual_and_jacobian(layout, data, noise, z).J)
+    J = J[: 2 * k * r, :q].reshape(2, k, r, q)
     return np.einsum("ckra,ckrb->kab", J, J)
 
 
@@ -297,7 +300,7 @@ def information(
     )
     # The program of the fit, with other weights; the priors' rows are no information of these.
     q = len(layout.of_interest)
-    J = np.asarray(evaluate(layout, data, weighed, z).J)[:q, :q]
+    J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)[:q, :q]
     return J.T @ J
 
 

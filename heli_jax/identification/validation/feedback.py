@@ -28,7 +28,7 @@ from heli_jax.identification.estimation.frequency_instrument import instruments_
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
-from heli_jax.identification.validation.lag_blocks import correlation_with_sums, lag_blocks
+from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
 
 STEPS = "inputs stay where they are between jumps"
 """the reason why nothing is tested where no input moves freely"""
@@ -102,9 +102,11 @@ def feedback(
     found = []
     for name, values in free.items():
         p, correlation, output, (first, last) = min(
-            (*correlation_with_sums(values, innovations[:, k], block), output, block)
+            (*one, output, block)
             for k, output in enumerate(outputs)
-            for block in blocks
+            for one, block in zip(
+                correlations_with_sums(values, innovations[:, k], blocks), blocks, strict=True
+            )
         )
         lag, label = (first * dt, last * dt), flight.name or "flight 1"
         late = steps.get(name, 0) * flight.dt

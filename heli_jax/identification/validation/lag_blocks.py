@@ -4,7 +4,10 @@ The variance of such a correlation between two autocorrelated signals is Bartlet
 all lags of the product of both autocorrelations (L. D. Haugh, J. Am. Stat. Assoc. 71, 1976).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+import scipy.fft
 import scipy.special
 from jaxtyping import Float
 
@@ -24,35 +27,40 @@ def lag_blocks(longest: int) -> list[tuple[int, int]]:
     return blocks
 
 
-def correlation_with_sums(
-    u: Float[np.ndarray, " N"], e: Float[np.ndarray, " N"], block: tuple[int, int]
-) -> tuple[float, float]:
-    """p value and correlation of u with the sum of e over the lags of a block.
+def correlations_with_sums(
+    u: Float[np.ndarray, " N"], e: Float[np.ndarray, " N"], blocks: Sequence[tuple[int, int]]
+) -> list[tuple[float, float]]:
+    """By block of lags p value and correlation of u with the sum of e over them.
 
     Args:
         u: NaN where it is missing, as of e.
         e: as long.
-        block: first and last lag, in samples.
+        blocks: first and last lag of each, in samples.
     """
-    first, last = block
     seen = np.isfinite(u) & np.isfinite(e)
     u, e = np.where(seen, u, 0.0), np.where(seen, e, 0.0)
-    sums = np.concatenate([np.zeros(last), np.convolve(e, np.ones(last - first + 1), "valid")])
-    past = sums[: u.size]  # at t the sum over t - last ... t - first
-    n = int(seen.sum())
-    size = float(np.sqrt(np.sum(u**2) * np.sum(past**2)))
-    if size == 0:
-        return 1.0, 0.0
-    correlation = float(u @ past) / size
+    n, power = int(seen.sum()), float(np.sum(u**2))
     # Bartlett: autocorrelations beyond a few blocks are noise, and only add to the variance's own.
-    lags = min(4 * (last - first + 1) + 20, u.size - 1)
-    a, b = _autocorrelation(u, lags), _autocorrelation(past, lags)
-    variance = max(float(1.0 + 2.0 * (a[1:] @ b[1:])), 0.1) / n
-    p = 2.0 * scipy.special.ndtr(-abs(correlation) / np.sqrt(variance))
-    return float(p), correlation
+    lags = [min(4 * (last - first + 1) + 20, u.size - 1) for first, last in blocks]
+    a = _autocorrelation(u, max(lags)) if power > 0 else u
+    found = []
+    for (first, last), most in zip(blocks, lags, strict=True):
+        sums = np.concatenate([np.zeros(last), np.convolve(e, np.ones(last - first + 1), "valid")])
+        past = sums[: u.size]  # at t the sum over t - last ... t - first
+        size = float(np.sqrt(power * np.sum(past**2)))
+        if size == 0:
+            found.append((1.0, 0.0))
+            continue
+        correlation = float(u @ past) / size
+        b = _autocorrelation(past, most)
+        variance = max(float(1.0 + 2.0 * (a[1 : most + 1] @ b[1:])), 0.1) / n
+        p = 2.0 * scipy.special.ndtr(-abs(correlation) / np.sqrt(variance))
+        found.append((float(p), correlation))
+    return found
 
 
 def _autocorrelation(x: np.ndarray, lags: int) -> np.ndarray:
-    size = 1 << (2 * x.size - 1).bit_length()
+    # Padded by the lags alone: beyond them the end of the record may wrap round.
+    size = scipy.fft.next_fast_len(x.size + lags, real=True)
     c = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: lags + 1]
     return c / c[0]

@@ -74,8 +74,9 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
     # By output and input over all flights, so that one missing servo is one sentence.
     found: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
-        one = explained_by(flight.residuals[output], flight.inputs[name], flight.dt)
-        if one is None or one.p_value * len(pairs) > _BY_CHANCE or one.share < _WORTH_IT:
+        signals = (flight.residuals[output], flight.inputs[name])
+        one = explained_by(*signals, flight.dt, by_chance=_BY_CHANCE / len(pairs))
+        if one is None or one.share < _WORTH_IT:
             continue
         known = found.get((output, name))
         if known is None or one.share > known.share:
@@ -111,7 +112,9 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
     return begun + f"{one.lag:.2g} s after it moved: {remedy}"
 
 
-def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | None:
+def explained_by(
+    residual: np.ndarray, u: np.ndarray, dt: float, *, by_chance: float = 1.0
+) -> Explained | None:
     """What the last samples of an input explain of a residual; None where nothing can be told.
 
     Both pass the filter that whitens the residual, so that a slow residual does not pass for an
@@ -121,6 +124,7 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
         residual: (N,), NaN where nothing is measured.
         u: the input (N,), any unit.
         dt: [s].
+        by_chance: p value above which nothing is told either, in half of the time.
     """
     lags = _lags(dt)
     seen = np.isfinite(residual)
@@ -140,14 +144,18 @@ def explained_by(residual: np.ndarray, u: np.ndarray, dt: float) -> Explained | 
     y = e[first:] - e[first:].mean()
     X = X - X.mean(axis=0)
     # An input held for several samples has columns that are the same: only their rank counts.
-    U, values, _ = np.linalg.svd(X, full_matrices=False)
-    U = U[:, values > 1e-6 * values[0]]
-    rank, n = U.shape[1], y.size
-    share = float(np.sum((U.T @ y) ** 2) / np.sum(y**2))
+    # Of its triangle, whose singular values are those of X, in a third of the time.
+    _, values, Vt = np.linalg.svd(np.linalg.qr(X, mode="r"))
+    kept = values > 1e-6 * values[0]
+    followed = (Vt[kept] @ (X.T @ y)) / values[kept]
+    rank, n = int(kept.sum()), y.size
+    share = float(np.sum(followed**2) / np.sum(y**2))
     freedom = n - rank - 1
     F = (share / rank) / max((1.0 - share) / freedom, 1e-300)
     # The upper tail itself, not one less the lower: beyond 1e-16 that difference is zero.
     p_value = float(scipy.special.fdtrc(rank, freedom, F))
+    if p_value > by_chance:
+        return None
     # Less what as many numbers explain of noise.
     share = max(0.0, 1.0 - (1.0 - share) * (n - 1) / freedom)
     # By each lag alone, since the coefficients of a regression on neighbouring lags swing against

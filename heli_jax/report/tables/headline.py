@@ -9,7 +9,7 @@ from heli_jax.identification.identifiability.sentences import listed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
-from heli_jax.report.fit_content import adequate_unjudged, whiteness_note
+from heli_jax.report.fit_content import whiteness_note
 from heli_jax.vehicle import of_helicopter
 
 
@@ -52,7 +52,7 @@ def further_sentences(fit: Fit) -> list[str]:
 def adequate(fit: Fit) -> str:
     """`yes`, `in size only (...)`, `no (...)`; what stopped before an optimum and looks adequate
     was not judged."""
-    return "not judged" if adequate_unjudged(fit) else fit.adequacy.summary
+    return fit.adequacy.summary
 
 
 def _determined(fit: Fit) -> Headline:

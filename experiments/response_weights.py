@@ -1,0 +1,103 @@
+"""What the estimate of the noise's spectrum costs fits of responses, over the Cramér-Rao bound.
+
+    .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW]
+
+The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
+told the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
+estimates it; and estimates it by a mean over two lines of the window whatever the averages.
+"""
+
+from unittest import mock
+
+import jax
+import numpy as np
+from coverage_cases.disturbed import response
+from frequency_error import DT, NAMES, NOISE, SAMPLES, TAU, VEHICLE, steps
+from frequency_response import Z95, bound
+
+from heli_jax import Flight, Free, Problem, fit, models
+from heli_jax.analysis import response_errors
+from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.analysis.windowed import windowed
+from heli_jax.identification.estimation import frequency_response, response_weights
+
+jax.config.update("jax_enable_x64", True)
+SIGMA, RECORDS = 1.04, 150
+MODULES = (frequency_response, response_weights)
+
+
+def record(rng: np.random.Generator, u: np.ndarray) -> Flight:
+    """Roll of a stick u in gusts."""
+    roll = response(VEHICLE, u, DT, SIGMA, TAU, rng)[:, 0]
+    roll = roll + NOISE * rng.standard_normal(SAMPLES)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
+
+
+def density(window: float) -> np.ndarray:
+    """(k, 1, 1) of gusts and noise in windows."""
+    rng, power = np.random.default_rng(12345), np.zeros((1, 1))
+    for _ in range(RECORDS):
+        still = record(rng, np.zeros(SAMPLES))
+        # Windows of a stick that moves: it moves nothing here.
+        moved = Flight(dt=DT, inputs={"x_roll": np.arange(SAMPLES) % 7.0}, outputs=still.outputs)
+        Y = windowed([moved], ResponseOptions(window=window)).Y
+        power = power + np.mean(np.abs(Y) ** 2, axis=0)
+    return (power / RECORDS)[:, :, None].astype(complex)
+
+
+def one_fit(flight: Flight, window: float) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors, and errors over the stated sd."""
+    truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
+    free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
+    options = ResponseOptions(window=window)
+    method = "frequency-response"
+    problem = Problem(
+        models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
+    )
+    found = fit(problem)
+    error = np.array([found.estimates[n].value for n in NAMES]) - truth
+    return error / truth, error / np.array([found.estimates[n].sd or np.nan for n in NAMES])
+
+
+def main(runs: int, window: float) -> None:
+    known = density(window)
+
+    def told(w, at, E) -> np.ndarray:
+        return known / at.power[:, None, None]
+
+    cases = {
+        "known": [mock.patch.object(m, "noise_density", told) for m in MODULES],
+        "estimated": [],
+        "estimated over two lines": [mock.patch.object(response_errors, "_ENOUGH", np.inf)],
+    }
+    print("| spectrum | " + " | ".join(NAMES) + " |\n|---|" + "---|" * len(NAMES))
+    for name, patches in cases.items():
+        rows = []
+        for seed in range(runs):
+            rng = np.random.default_rng(seed)
+            u = steps(rng)
+            flight = record(rng, u)
+            for patch in patches:
+                patch.start()
+            try:
+                error, z = one_fit(flight, window)
+            finally:
+                for patch in patches:
+                    patch.stop()
+            rows.append((error / bound(u, SIGMA), z))
+        ratio, z = (np.array(v) for v in zip(*rows, strict=True))
+        rmse, covered = np.sqrt(np.mean(ratio**2, axis=0)), np.mean(np.abs(z) < Z95, axis=0)
+        cells = [f"{a:.2f}, {100 * c:.0f} %" for a, c in zip(rmse, covered, strict=True)]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    from script import Size, asked
+
+    options = asked(
+        __doc__,
+        "three minutes",
+        Size("runs", 40, 2, "records"),
+        Size("window", 10.0, 10.0, "[s]"),
+    )
+    main(options.runs, options.window)

@@ -1,0 +1,39 @@
+"""Correlations with sums over past samples: against sums written out, and under no correlation."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from heli_jax.identification.validation.lag_blocks import correlations_with_sums, lag_blocks
+
+
+def autocorrelation(x: np.ndarray, lags: int) -> np.ndarray:
+    c = np.correlate(x, x, "full")[x.size - 1 :]
+    return c[: lags + 1] / c[0]
+
+
+def test_every_block_is_as_by_hand():
+    rng = np.random.default_rng(0)
+    e, u = rng.standard_normal((2, 700))
+    u = u + 0.3 * np.roll(e, 5)
+    u[100:110] = np.nan
+    blocks = lag_blocks(60)
+    found = correlations_with_sums(u, e, blocks)
+    seen = np.isfinite(u)
+    v, w = np.where(seen, u, 0.0), np.where(seen, e, 0.0)
+    for (first, last), (p, correlation) in zip(blocks, found, strict=True):
+        past = np.array(
+            [sum(w[t - k] for k in range(first, last + 1) if t >= k) for t in range(700)]
+        )
+        # The sum begins with the first whole block of lags.
+        past[:last] = 0.0
+        expected = v @ past / np.sqrt(v @ v * (past @ past))
+        lags = 4 * (last - first + 1) + 20
+        a, b = autocorrelation(v, lags), autocorrelation(past, lags)
+        sd = np.sqrt((1.0 + 2.0 * (a[1:] @ b[1:])) / seen.sum())
+        assert correlation == pytest.approx(expected, rel=1e-10)
+        assert p == pytest.approx(2.0 * scipy.stats.norm.sf(abs(expected) / sd), rel=1e-8)
+
+
+def test_a_signal_that_is_zero_follows_nothing():
+    assert correlations_with_sums(np.zeros(50), np.ones(50), [(1, 1)]) == [(1.0, 0.0)]
