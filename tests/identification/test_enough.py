@@ -177,7 +177,8 @@ def test_the_band_that_a_stick_excites():
     assert 0.2 < float(low) < 0.6
     assert 1.8 < float(high) < 3.0
     noise = replace(f, outputs={"phi": rng.standard_normal(n)})
-    assert excited_band.bands([noise])[1].severity == "doubt"
+    # Of an input that nothing follows alone there is no tick beside the doubt.
+    assert [f.severity for f in excited_band.bands([noise])] == ["note", "doubt"]
 
 
 def test_the_rate_of_an_input_that_moved_between_its_samples():
@@ -269,7 +270,7 @@ def test_findings_stand_once():
     result = check(problem(flight(0, 1000, still=False)))
     topics = {f.topic for f in result.findings}
     assert {"excited band", "inputs together", "saturation", "quantisation"} <= topics
-    assert all(f.severity == "ok" for f in result.findings)
+    assert not any(f.bad for f in result.findings)
     assert not {f.sentence for f in result.findings} & set(result.further_notes)
     for a, b in itertools.pairwise(result.findings):
         assert (a.severity, b.severity) != ("ok", "doubt")
