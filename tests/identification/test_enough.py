@@ -12,6 +12,7 @@ from heli_jax import Flight, Free, Model, Nuisance, Problem
 from heli_jax.dynamics.onboard.filters import Filter
 from heli_jax.identification.fit import check
 from heli_jax.identification.validation import excited_band, signal_quality
+from heli_jax.identification.validation.expected_accuracy import too_good
 from heli_jax.identification.validation.logging_rate import input_rate, logging_rate
 from heli_jax.identification.validation.missing_outputs import look_at_missing
 from heli_jax.identification.validation.next_flight import plan_next_flight
@@ -287,3 +288,11 @@ def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
     asked = Problem(filtered, TRUTH, (moved,), FREE, Nuisance(bias=False))
     (finding,) = logging_rate(asked, [("flight", moved)], [sd])
     assert finding.severity == "ok", finding.sentence
+
+
+def test_expected_sds_are_no_promise_where_no_output_follows_an_input():
+    assert too_good([0.0015, 0.003], True) == ""
+    said = too_good([0.0015, 0.003], False, nothing_follows=True)
+    assert said.startswith("An expected sd of 0.15 % is no promise")
+    assert "no output follows any input" in said
+    assert too_good([0.7], True, nothing_follows=True) == ""
