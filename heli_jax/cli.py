@@ -47,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
     0 done; 2 wrong input; 3 the data cannot determine what was asked; 4 the optimiser did not
-    converge, or the model explains less than the mean of what was measured; 130 interrupted.
+    converge, or the model is not adequate and explains less than the mean of what was measured;
+    130 interrupted.
     """
     # With arguments of their own tests and programs call it, which an interrupt must not end.
     with interrupts.as_program() if arguments is None else interrupts.as_function() as seen:
@@ -174,7 +175,8 @@ def _new_directory(options: argparse.Namespace) -> Path:
     """Where a run's files go, known to be free."""
     config = Path(options.config)
     out = Path(options.out) if options.out else run_directory.default_directory(config)
-    run_directory.require_free(out)  # at once, before the seconds of the imports
+    resume = ", or --resume" if getattr(options, "over", None) else ""
+    run_directory.require_free(out, resume)  # at once, before the seconds of the imports
     return out
 
 

@@ -14,6 +14,7 @@ from heli_jax.identification.equation_error.first_guess import EquationErrorStar
 from heli_jax.identification.fit import Check, Estimate, Fit
 from heli_jax.identification.frequency_start import FrequencyErrorStart
 from heli_jax.identification.identifiability.verdict import Combination, Verdict
+from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
@@ -96,7 +97,8 @@ def _print_outcome(fit: Fit) -> None:
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
     why = bool(fit.adequacy.reasons) and not fit.adequacy.doubts
-    adequate = "no (why: below)" if why and not fit.adequate else report_tables.adequate(fit)
+    below = why and not fit.adequate and not fit.adequacy.unjudged
+    adequate = "no (why: below)" if below else report_tables.adequate(fit)
     print(f"{arrived}: {text} adequate: {adequate}{held}")
     note = files.whiteness_note(fit)
     for line in ([note] if note else []) + list(fit.notes):
@@ -222,7 +224,9 @@ def print_check(check: Check) -> None:
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
         print(f"noise of {name}: {sd:.3g}{guess}")
-    if sentence := too_good(np.sqrt(np.diag(verdict.covariance)), bool(check.guessed)):
+    follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
+    sds = np.sqrt(np.diag(verdict.covariance))
+    if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
         print(f"! {sentence}")
     for note in check.further_notes:
         print(f"! {note}")
@@ -238,7 +242,7 @@ def _print_findings(findings: Sequence[Finding]) -> None:
         print(f"{_MARKS[f.severity]} {f.topic}: {f.sentence}")
 
 
-_MARKS = {"ok": " ", "doubt": "!", "refuse": "x"}
+_MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
 
 
 def _print_verdict(verdict: Verdict) -> None:

@@ -43,7 +43,8 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
             content = json.loads(path.read_text(encoding="utf-8"))
             adequate = {True: "yes", False: "no", None: "not judged"}[content["adequate"]]
             summary = str(content.get("adequacy", {}).get("summary", ""))
-            adequate = "in size only" if summary.startswith("in size only") else adequate
+            limited = (w for w in ("in size only", "one step ahead only") if summary.startswith(w))
+            adequate = next(limited, adequate)
             row = {k: content[k] for k in ("model", "method", "status")}
         # Any file may be called so: what no fit wrote is no run.
         except (OSError, ValueError, KeyError, TypeError):

@@ -73,7 +73,8 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     assert "rest on the prior of a" in shown.out
     first = shown.out.splitlines()[0]
     assert first.startswith("converged: The data alone determine only a/Ixx and a/If")
-    assert first.endswith("adequate: yes")
+    # The gusts of this short record are larger than the response.
+    assert "adequate: one step ahead only (VAF of roll, simulated, is -" in first
     assert "determined: a/Ixx = " in shown.out
     assert "report:" in shown.out
     assert "Ixx" in shown.out

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heli_jax import cli, yaml_file
+from heli_jax import cli, load_config, yaml_file
+from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
 from heli_jax.new_config.guess import Series, by_motion, by_name, may_be, scaled, words_of
+from heli_jax.new_config.rate import channels_of_preset, common_rate
 
 T = np.arange(0.0, 20.0, 0.02)
 STICK = np.where(T < 1.0, 0.0, 0.4 * np.sign(np.sin(1.3 * T)))
@@ -39,6 +41,9 @@ def test_a_stick_in_pulse_widths_beside_a_rate_becomes_a_configuration_that_read
     said = capsys.readouterr().err
     assert "heli-jax check" in said
     assert "are yours to give" not in said
+    # A stand or a flybar moves the same signals: the other models are named, in file and terminal.
+    assert "--model roll-on-stand or linear:roll" in said
+    assert "#   roll-on-stand: " in out.read_text()
     made = Config.model_validate(yaml_file.read_mapping(out))
     signals = made.flights[0].signals
     assert made.flights[0].log == "run.csv"
@@ -76,9 +81,16 @@ def test_what_only_the_user_knows_is_refused_until_it_is_given(
     for name, unset in (("kappa", "does not spring"), ("zeta", "does not damp")):
         [line] = [v for v in words.splitlines() if v.startswith(f"{name}: {{value: 0,")]
         assert f"GUESS: a stand that {unset}" in line
+    # The inertias are asked for once, in the vehicle file, where the search begins too.
+    assert yaml_file.read_mapping(out)["fit"]["free"] == {"Ixx": {}, "If": {}}
+    assert "GUESS: the model" not in out.read_text()
     assert cli.main(["check", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert "is still EDIT, expected" in said
+    assert "is still EDIT, expected" in capsys.readouterr().err
+    bench = Path("configs/vehicles/bench-30.yaml").read_text()
+    (tmp_path / "mine-vehicle.yaml").write_text(bench)
+    out.write_text(out.read_text().replace("scale: EDIT", "scale: 6.0e-9"))
+    free = problem(load_config(out)).free
+    assert (free["Ixx"].start, free["If"].start) == (0.024, 1.7e-4)
 
 
 def test_a_scale_that_only_the_user_knows_is_asked_for_in_words(
@@ -120,6 +132,20 @@ def test_a_vehicle_file_below_or_beside_is_named_relative_to_the_configuration(
         "home/vehicles/mine.yaml",
         str(vehicle.resolve()),
     ]
+
+
+def test_topics_with_clocks_of_their_own_get_a_rate() -> None:
+    fast, slow = np.arange(0.0, 5.0, 0.0024), np.arange(0.0, 5.0, 0.0402)
+    gps = np.arange(0.0, 5.0, 0.2)
+    series = {"gyro": Series(fast, fast), "stick": Series(slow, slow), "gps": Series(gps, gps)}
+    assert common_rate(series, ["gyro"]) == 100.0
+    assert common_rate(series, ["gyro", "stick"]) == 25.0
+    # A slow sensor keeps its own samples; alone it sets the rate.
+    assert common_rate(series, ["gyro", "stick", "gps"]) == 25.0
+    assert common_rate(series, ["gps"]) == 5.0
+    assert common_rate(series, []) is None
+    px4 = ["vehicle_angular_velocity.xyz[0]", "actuator_controls_0.control[0]", "other.x"]
+    assert channels_of_preset("px4-helicopter", px4, ["p", "phi", "lat"]) == px4[:2]
 
 
 @pytest.mark.parametrize("log", ["none.csv", "text.csv"], ids=["missing", "nothing of a model"])

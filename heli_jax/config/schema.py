@@ -177,7 +177,7 @@ class PriorConfig(_Strict):
 class FreeConfig(_Strict):
     # NaN and not None, as `Free` has it; a default is not validated, what a file says is.
     start: Finite = math.nan
-    """may be left out where `fit.start` finds it"""
+    """may be left out where the vehicle file has a value, or `fit.start` finds it"""
     lower: Finite | None = None
     """bound, in SI"""
     upper: Finite | None = None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from heli_jax import naming
 from heli_jax.config.experiment import Experiment
-from heli_jax.config.schema import FitConfig
+from heli_jax.config.schema import FitConfig, LinearConfig
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free
@@ -44,11 +44,13 @@ def first_guesses(
     # NaN stands for a start that was left out, and no optimiser gets anywhere from it.
     # In frequency a fit begins where it is told to; what it finds takes the place of that later.
     if config.start.method != "equation-error":
+        free = _from_vehicle(experiment, free)
         missing = [n for n, f in free.items() if math.isnan(f.start)]
         if missing:
             raise InputError(
                 f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with, "
-                "or fit.start: equation-error, which finds one for linear models"
+                "a value in the vehicle file, or fit.start: equation-error, which finds one for "
+                "linear models"
             )
         return dict(free), None
     # Not before it is needed: it takes a second to import.
@@ -68,6 +70,18 @@ def first_guesses(
     # A start and nothing more: noise and gusts bias a regression, so that bounds and priors stay as
     # they were stated.
     return {n: f._replace(start=guess.values[n].value) for n, f in free.items()}, guess
+
+
+def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:
+    """Starts that are left out, from the vehicle file."""
+    # The numbers of a linear model's own file are those of some other machine.
+    if isinstance(experiment.config.model, LinearConfig):
+        return free
+    stated = experiment.vehicle.constants
+    return {
+        n: f._replace(start=stated[n].value) if math.isnan(f.start) and n in stated else f
+        for n, f in free.items()
+    }
 
 
 def instrument_for(config: FitConfig, method: str) -> tuple[str, ...] | None:

@@ -50,11 +50,13 @@ def whiteness_of(signals: tuple[Signals, ...], e: Evaluation) -> dict[str, White
     if e.innovations:
         # Their variance falls while the filter learns the initial state: only over it are they one
         # sequence of equal variance.
-        errors = {
-            f"{s.flight}/{n}": np.asarray(error) / np.sqrt(np.asarray(innovations.variance[n]))
-            for s, innovations in zip(signals, e.innovations, strict=True)
-            for n, error in innovations.error.items()
-        }
+        # A filter that is ill-conditioned may have variances below zero: NaN there, and said by it.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            errors = {
+                f"{s.flight}/{n}": np.asarray(error) / np.sqrt(np.asarray(innovations.variance[n]))
+                for s, innovations in zip(signals, e.innovations, strict=True)
+                for n, error in innovations.error.items()
+            }
     else:
         errors = {f"{s.flight}/{n}": s.residual(n) for s in signals for n in s.measured}
     # Of many signals one looks coloured by chance: the level is shared by all.

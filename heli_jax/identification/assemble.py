@@ -53,6 +53,7 @@ from heli_jax.identification.validation.feedback import (
     untested,
 )
 from heli_jax.identification.validation.held_out import validate
+from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
 from heli_jax.identification.validation.metrics import Whiteness
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
@@ -155,6 +156,9 @@ def assemble(
     fast = fast_modes(problem, values, measurement_noise(problem, noise.sd))
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
     errors = standard_errors(problem, solution, e, run.before, white=all_white, aliased=aliased)
+    if bool(best.converged):
+        verdict = unless_inputs_explain_nothing(solution, e, errors.verdict)
+        errors = errors._replace(verdict=verdict)
     numbers = _numbers(problem, solution, e, errors, absent)
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
@@ -320,5 +324,6 @@ def _adequacy(
         Record(s.flight, flight.dt, s.measured, s.simulated)
         for s, flight in zip(signals, problem.training, strict=True)
     )
-    evidence = Evidence(records, pooled_metrics(signals), white, against, unknowns)
+    ahead = tuple(None if s.innovations is None else dict(s.innovations) for s in signals)
+    evidence = Evidence(records, pooled_metrics(signals), white, against, unknowns, ahead)
     return assess(problem, params, evidence)

@@ -186,7 +186,7 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    return dataclasses.replace(ranking, record=tuple(f for f in found if f.severity != "ok"))
+    return dataclasses.replace(ranking, record=tuple(f for f in found if f.bad))
 
 
 def _starts(

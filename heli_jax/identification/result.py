@@ -91,7 +91,7 @@ class Check:
     def further_notes(self) -> tuple[str, ...]:
         """The notes without those that a finding says too."""
         said = {f.sentence for f in self.findings}
-        slow = any(f.topic == "logging rate" and f.severity != "ok" for f in self.findings)
+        slow = any(f.topic == "logging rate" and f.bad for f in self.findings)
         return tuple(n for n in self.notes if n not in said and not (slow and ALIASED in n))
 
 

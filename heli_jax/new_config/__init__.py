@@ -18,6 +18,7 @@ from heli_jax.flights.table import Table, shown, wrong
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess, Series
+from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.run_directory import require_place
 from heli_jax.vehicle import read_vehicle
 from heli_jax.yaml_file import EDIT, parse_mapping
@@ -88,6 +89,8 @@ def write_config(
     if paths and signals is not None:
         # The vehicle file has them.
         signals = signals._replace(known={})
+    used = _used(preset, chosen.model, read, signals)
+    others = () if model is not None else _also(chosen.name)
     content = text.configuration(
         chosen=chosen,
         log=_relative(Path(log), out),
@@ -96,16 +99,41 @@ def write_config(
         preset=preset,
         signals=signals,
         vehicle=place,
-        free=_free(chosen, constants),
+        free=_free(chosen, constants, paths),
+        rate=None if read.time is not None else common_rate(read.series, used),
+        others=[f"{name}: {meaning}" for name, meaning in others],
     )
     for path, words in {out: content, **paths}.items():
         path.write_text(words, encoding="utf-8")
     todo = sum(words.count(EDIT) for words in (content, *paths.values()))
     notes = [f"wrote {', '.join(map(str, (out, *paths)))}"]
     if todo:
-        notes.append(f"{todo} numbers are yours to give, where {EDIT} stands")
+        words = "1 number is" if todo == 1 else f"{todo} numbers are"
+        notes.append(f"{words} yours to give, where {EDIT} stands")
+    if others:
+        assert isinstance(chosen.name, dict)
+        notes.append(
+            f"the model {chosen.name['linear']} is a guess by the stick that moves; a stand or a "
+            f"flybar no log tells: --model {' or '.join(name for name, _ in others)}"
+        )
     notes.append(f"look over what is marked GUESS; next: heli-jax check {out}")
     return Written((out, *paths), tuple(notes))
+
+
+def _used(preset: str | None, model: Any, log: _Log, signals: text.Signals | None) -> Sequence[str]:
+    """The log's channels that the configuration takes."""
+    if signals is not None:
+        found = (*signals.inputs.values(), *signals.outputs.values())
+        return [g.channel for g in found if g is not None]
+    assert preset is not None
+    wanted = (*naming.names(model.Inputs), *naming.names(model.Outputs))
+    return channels_of_preset(preset, tuple(log.series), wanted)
+
+
+def _also(name: str | dict[str, str]) -> tuple[tuple[str, str], ...]:
+    """Other models of the axis of a linear one, with what each is for."""
+    assert isinstance(name, dict)
+    return tuple(_file("models.yaml")["also"].get(name["linear"], {}).items())
 
 
 def _relative(log: Path, out: Path) -> str:
@@ -336,13 +364,15 @@ def _vehicle(
     return {place: text.vehicle(chosen.model, found)}, {}, place.name
 
 
-def _free(chosen: text.Chosen, constants: Mapping[str, float]) -> dict[str, float | str]:
-    """What is free and where it begins."""
+def _free(
+    chosen: text.Chosen, constants: Mapping[str, float], written: Mapping[Path, str]
+) -> dict[str, float | str | None]:
+    """What is free and where it begins; None at the value of the vehicle file that is written."""
     listed = _file("models.yaml")
     known = naming.names(chosen.model.Params)
     if not chosen.linear:
         names = [n for n in listed["of the paper"] if n in known] or list(known)
-        return {n: constants.get(n, EDIT) for n in names}
+        return {n: None if written else constants.get(n, EDIT) for n in names}
     assert isinstance(chosen.name, dict)
     file = chosen.name["linear"]
     own = linear_models.linear_model(file).vehicle().constants

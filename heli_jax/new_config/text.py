@@ -11,6 +11,7 @@ from heli_jax.dynamics.model import axes_of, needed_but_missing, reads
 from heli_jax.errors import InputError
 from heli_jax.flights.describe import TimeInfo
 from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.rate import two_digits
 from heli_jax.yaml_file import EDIT
 
 _MOST_LISTED = 12
@@ -49,7 +50,9 @@ def configuration(
     preset: str | None,
     signals: Signals | None,
     vehicle: str | None,
-    free: Mapping[str, float | str],
+    free: Mapping[str, float | str | None],
+    rate: float | None = None,
+    others: Sequence[str] = (),
 ) -> str:
     """The configuration as text.
 
@@ -61,7 +64,9 @@ def configuration(
         preset: the table of the autopilot, in place of signals.
         signals: by the model's names.
         vehicle: the vehicle file, as the configuration names it.
-        free: starts by parameter.
+        free: starts by parameter; None at the vehicle's value.
+        rate: [Hz] onto which topics with clocks of their own are brought.
+        others: models that fit the signals too, each with what it is for.
 
     Raises:
         InputError: the log holds no output of the model.
@@ -69,6 +74,7 @@ def configuration(
     lines = [
         f"# Made from {_comment(log)}. What is marked GUESS was guessed: look it over.",
         "# heli-jax keys TEXT explains keys; heli-jax check says whether the log is enough.",
+        *_models(others),
         f"model: {_value(chosen.name)}",
         *([] if vehicle is None else [f"vehicle: {_value(vehicle)}"]),
     ]
@@ -76,9 +82,10 @@ def configuration(
     if flight is not None:
         lines.append(f"    flight: {flight}")
     lines += _clock(time)
+    if rate is not None:
+        lines.append(f"    rate: {rate:g}".ljust(33) + "# Hz; the grid of all signals")
     if preset is not None:
         lines += [
-            "    # rate: 100                  # Hz; of the fastest channel unless given",
             "    # window: auto               # or [first, last] s: the parts that say most",
             f"    signals: {{preset: {preset}}}   # heli-jax info shows the channels",
         ]
@@ -93,13 +100,19 @@ def configuration(
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
-    lines += [f"    {name}: {{start: {_number(start)}}}" for name, start in free.items()]
+    lines += [_free(name, start) for name, start in free.items()]
     lines += [
         "  # nuisance: {time_shift: true} # where the stick was logged late or early",
         *([f"disturbance: {{on: [{', '.join(axes)}]}}"] if axes else []),
         "rls: null",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _free(name: str, start: float | str | None) -> str:
+    if start is None:
+        return f"    {name}: {{}}".ljust(33) + "# begins at the vehicle file's value"
+    return f"    {name}: {{start: {_number(start)}}}"
 
 
 def vehicle(model: Any, found: Mapping[str, tuple[str, float]]) -> str:
@@ -146,14 +159,19 @@ def _clock(time: TimeInfo | None) -> list[str]:
         words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s"
         lines += [
             f"    gaps: split                  # {words}; fail refuses long ones",
-            f"    rate: {_round(time.rate):g}                    # Hz; the log has no even steps",
+            f"    rate: {two_digits(time.rate):g}".ljust(33) + "# Hz; the log has no even steps",
         ]
     return lines
 
 
-def _round(rate: float) -> float:
-    """Two digits: a rate of 99.98 Hz is one of 100."""
-    return float(f"{rate:.2g}")
+def _models(others: Sequence[str]) -> list[str]:
+    if not others:
+        return []
+    return [
+        "# GUESS: the model, by the stick that moves; no log tells a stand or a flybar, and a",
+        "# wrong model fits with confident numbers. As --model NAME these go with the signals too:",
+        *(f"#   {words}" for words in others),
+    ]
 
 
 def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -> list[str]:

@@ -96,7 +96,7 @@ class ComparedRuns(NamedTuple):
                 method_of(run),
                 run.status,
                 # What the data determine is a property of an optimum.
-                "no optimum was reached" if run.status == "not-converged" else run.verdict,
+                "No optimum was reached." if run.status == "not-converged" else run.verdict,
                 {True: "yes", False: "no", None: "not judged"}[run.adequate],
             )
             for label, run in zip(self.labels, self.runs, strict=True)

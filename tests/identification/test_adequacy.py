@@ -12,6 +12,7 @@ from heli_jax import Fit, Flight, Free, Model, Nuisance, Problem, cli, fit, mode
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess
 from heli_jax.identification.validation.advice import Record
 from heli_jax.identification.validation.metrics import metrics, whiteness
+from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from heli_jax.report import fit_content
 from tests.identification.bench import BENCH, vehicle
 from tests.identification.test_filter_error import FREE, made
@@ -51,7 +52,7 @@ SLOW = scipy.signal.lfilter([1.0], [1.0, -0.98], rng.standard_normal(N))
 SLOW /= SLOW.std()
 
 
-def judged(measured, simulated, *, model=own, against=None, **how):
+def judged(measured, simulated, *, model=own, against=None, ahead=None, **how):
     if model is own:
         params, free, inputs, name = Params(-2.0, 5.0), {"Lp": Free(-2.0)}, {"d": D}, "p"
     else:
@@ -67,7 +68,9 @@ def judged(measured, simulated, *, model=own, against=None, **how):
     white = {f"flight 1/{name}": whiteness(measured - simulated)}
     against = None if against is None else {name: against}
     agreement = {name: metrics(measured, simulated)}
-    return assess(problem, params, Evidence((record,), agreement, white, against))
+    ahead = () if ahead is None else ({name: ahead},)
+    evidence = Evidence((record,), agreement, white, against, innovations=ahead)
+    return assess(problem, params, evidence)
 
 
 def test_white_residuals_are_adequate_whatever_is_explained():
@@ -136,6 +139,33 @@ def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
     assert not judged(P + 3.0 * P.std() * SLOW, P, against=1.2).adequate
 
 
+def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_one_step_ahead_only():
+    # A simulation that has nothing of the measured output in it, with a difference that is white.
+    other = np.random.default_rng(9).standard_normal(N)
+    found = judged(WHITE, 0.9 * other, against=1.2, ahead=WHITE)
+    assert found.adequate
+    assert not found.less_than_mean
+    assert found.summary.startswith("one step ahead only (VAF of p, simulated, is -")
+    assert "less than its mean" in found.summary
+
+
+@pytest.mark.parametrize(("left", "named"), [(1.0, True), (0.95, True), (0.5, False)])
+def test_a_filter_that_predicts_no_better_than_the_mean_explains_nothing(left, named):
+    # `left`: the error of the prediction over white noise, of which nothing can be foretold.
+    measured = WHITE - WHITE.mean()
+    found = judged(measured, 0.01 * np.roll(measured, 7), against=1.2, ahead=left * measured)
+    assert found.adequate
+    assert ("but nothing of p is explained" in found.summary) == named
+
+
+def test_a_filter_that_only_repeats_the_sample_before_explains_nothing():
+    walk = np.cumsum(WHITE)
+    for ahead, named in ((np.diff(walk, prepend=0.0), True), (0.3 * WHITE, False)):
+        found = judged(walk, np.zeros(N), against=1.2, ahead=ahead)
+        assert ("nothing of p" in " ".join(found.sentences)) == (found.adequate and named)
+        assert predicts_nothing([(walk, ahead)]) == named
+
+
 @pytest.mark.slow
 def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     model, _, start, flight = made(bench30, 3)
@@ -177,11 +207,11 @@ def test_flights_held_out_are_held_against_their_mean_by_output_error_alone(meth
     assert Fit.held_out_worse.fget(fitted) == worse  # pyright: ignore[reportOptionalCall]
 
 
-def test_what_stopped_before_an_optimum_and_looks_adequate_was_not_judged():
+def test_what_stopped_before_an_optimum_was_not_judged():
     stopped = Adequacy(True, False, (), limited="some of it", at_optimum=False)
     assert stopped.summary == "not judged"
     written = fit_content.adequacy(stopped)
     assert written["adequate"] is None
     assert written["summary"] == "not judged"
-    # What is wrong where it stopped is said.
-    assert stopped.doubted(["p is off"]).summary == "no (p is off)"
+    # Nor is it where it looks bad: the numbers there are those of no model.
+    assert stopped.doubted(["p is off"]).summary == "not judged"

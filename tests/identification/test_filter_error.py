@@ -10,10 +10,15 @@ import pytest
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.filter_error import _disturbed
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Solution, layout_of, unpack
+from heli_jax.identification.validation.inputs_explain import (
+    gain_of_inputs,
+    unless_inputs_explain_nothing,
+)
 from heli_jax.identification.validation.metrics import whiteness
 from heli_jax.naming import asdict, replace
 from heli_jax.simulation.inputs import random_steps
@@ -24,12 +29,12 @@ TRUTH = {"kappa": 4.0, "zeta": 0.2, "sigma_w": 1.04, "tau_w": 1.0}
 FREE = {"Ixx": Free(0.03), "If": Free(2.5e-4), "kappa": Free(3.0)}
 
 
-def made(bench30, seed, *, sigma_w=1.04, poles=1):
+def made(bench30, seed, *, sigma_w=1.04, poles=1, amplitude=3e-6):
     model = with_disturbance(models.roll_on_stand, "roll", poles)
     values = {**TRUTH, "sigma_w": sigma_w}
     params = model.Params(**{**asdict(bench30), **{n: jnp.asarray(v) for n, v in values.items()}})
     rng = np.random.default_rng(seed)
-    u = 3e-6 * random_steps(N, DT, rng, (0.2, 1.5))
+    u = amplitude * random_steps(N, DT, rng, (0.2, 1.5))
     run = simulate(
         model, params, model.Inputs(x_roll=jnp.asarray(u)), dt=DT, key=jax.random.key(seed)
     )
@@ -45,6 +50,33 @@ def disturbed(bench30):
     model, params, start, flight = made(bench30, 1)
     problem = Problem(model, start, [flight], FREE, method="filter-error")
     return params, problem, fit(problem)
+
+
+def test_inputs_that_explain_nothing_determine_nothing(bench30, disturbed):
+    # A record of gusts alone: what follows of it for the machine stands and falls with the noise.
+    _, problem, first = disturbed
+    record = made(bench30, 1, amplitude=1e-10)[3]
+    found = fit(dataclasses.replace(problem, flights=[record]))
+    assert found.status == "not-identifiable"
+    said = unless_inputs_explain_nothing(*point(found), first.verdict)
+    assert not said.identifiable
+    assert said.undetermined == ("Ixx", "If", "kappa")
+    assert "do not determine Ixx, If or kappa: x_roll explains nothing" in said.text
+    # With the stick as it was the verdict stands, and where none moves, as in a free decay.
+    assert gain_of_inputs(*point(first)) > 100.0
+    assert first.verdict.identifiable
+    at, e = point(first)
+    assert unless_inputs_explain_nothing(at, e, first.verdict) is first.verdict
+    one = at.data.flights[0]
+    rest = one._replace(inputs=replace(one.inputs, x_roll=jnp.zeros_like(one.inputs.x_roll)))
+    at = at._replace(data=at.data._replace(flights=(rest,)))
+    assert np.isnan(gain_of_inputs(at, e))
+    assert unless_inputs_explain_nothing(at, e, first.verdict) is first.verdict
+
+
+def point(found):
+    at = found.reached
+    return at, evaluate(at.layout, at.data, at.noise, at.z)
 
 
 def errors(found, params):

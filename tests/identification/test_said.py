@@ -164,3 +164,10 @@ def test_what_is_determined_in_a_wide_interval_is_so_only_roughly():
     verdict = analyse(sensitivity, (first, second._replace(symmetric=True)))
     assert "only roughly B (its 95 % interval holds zero)." in verdict.text
     assert verdict.through_zero == ("B",)
+    # So it is where the value is small beside the start, in whose units the coordinate is then.
+    near = second._replace(symmetric=True, logarithmic=False, distance=0.002)
+    for sd, zero in ((0.0009, ()), (0.0011, ("B",))):
+        verdict = analyse(np.diag([100.0, 1.0 / sd]), (first, near))
+        assert verdict.identifiable
+        assert verdict.through_zero == zero
+        assert ("B (its 95 % interval holds zero)" in verdict.text) == bool(zero)

@@ -261,10 +261,7 @@ def _through_zero(a: _Analysis) -> tuple[str, ...]:
     return tuple(
         u.name
         for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
-        if u.symmetric
-        and u.logarithmic
-        and Z95 * float(sd) * u.per_log >= 1.0
-        and u.name not in lacking
+        if u.symmetric and Z95 * float(sd) >= u.distance and u.name not in lacking
     )
 
 

@@ -47,7 +47,10 @@ def _unknown(problem: Problem, name: str, value: float) -> Unknown:
     symmetric = _through_zero(problem, name)
     # A coordinate in units of the reference becomes log |value| by the reference over the value.
     per_log = reference / abs(value) if symmetric and log else 1.0
-    return Unknown(name, value, log, scale, prior, per_log=per_log, symmetric=symmetric)
+    distance = abs(value) / reference if symmetric else 1.0
+    return Unknown(
+        name, value, log, scale, prior, per_log=per_log, symmetric=symmetric, distance=distance
+    )
 
 
 def _interval(lower: float | None, upper: float | None, log: bool) -> float:

@@ -33,6 +33,9 @@ class Unknown(NamedTuple):
     symmetric: bool = False
     """whether it may have either sign: its interval is then symmetric about the value, and
     determines nothing where it reaches further than log 10 times its size to either side"""
+    distance: float = 1.0
+    """of zero from the value in its relative coordinate, where it may have either sign; 1 where
+    that coordinate is log |value|"""
     aliased: bool = False
     """whether it moves a mode that the samples do not tell from its aliases"""
 

@@ -30,11 +30,9 @@ from heli_jax.identification.validation.advice import (
     advice_for,
     is_unstable,
 )
-from heli_jax.identification.validation.metrics import (
-    Metrics,
-    Whiteness,
-    autocorrelation,
-)
+from heli_jax.identification.validation.metrics import Metrics, Whiteness
+from heli_jax.identification.validation.moves_against import moves_against
+from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -48,10 +46,6 @@ chance makes it a few hundredths negative"""
 EXPECTED = 9.0
 """power of the simulation's error over that which the disturbance lets expect: its square root is
 three standard deviations where the disturbance is so slow that the record holds one swing of it"""
-_TURNED = -3.0
-"""slope of the measured on the simulated output that no disturbance makes"""
-_FIVE_PERCENT = -1.645
-"""of a standard normal distribution, to one side"""
 
 
 class Adequacy(NamedTuple):
@@ -74,7 +68,7 @@ class Adequacy(NamedTuple):
     limited: str = ""
     """what keeps an adequate model from a plain yes, where no residual in time is judged"""
     at_optimum: bool = True
-    """whether the optimiser arrived: what looks adequate where it stopped before says nothing"""
+    """whether the optimiser arrived"""
 
     def doubted(self, doubts: Sequence[str]) -> "Adequacy":
         """The same, not adequate where there is such a doubt, each in a few words."""
@@ -82,8 +76,8 @@ class Adequacy(NamedTuple):
 
     @property
     def unjudged(self) -> bool:
-        """Whether it looks adequate at a point that is no optimum."""
-        return self.adequate and not self.at_optimum
+        """Whether the optimiser stopped before an optimum: how a model looks there says nothing."""
+        return not self.at_optimum
 
     @property
     def doubtful(self) -> bool:
@@ -104,6 +98,9 @@ class Adequacy(NamedTuple):
         if self.adequate:
             left = "; ".join(self._left_over) if self.coloured else self.limited
             words = f"in size only ({left})" if left else "yes"
+            if self.one_step_only:
+                left = "; ".join([*self._left_over, *self._simulated_worse])
+                words = f"one step ahead only ({left})"
             if self.unexplained:
                 words += f", but nothing of {' and '.join(self.unexplained)} is explained"
             return words
@@ -116,11 +113,26 @@ class Adequacy(NamedTuple):
         return f"no ({'; '.join(words)})" if words else "no"
 
     @property
+    def one_step_only(self) -> tuple[str, ...]:
+        """The outputs that an adequate model predicts one step ahead (filter error), though driven
+        by the inputs alone it follows them worse than their mean does."""
+        return tuple(o.output for o in self.judged if o.disturbed_below_mean)
+
+    @property
+    def _simulated_worse(self) -> list[str]:
+        return [
+            f"VAF of {o.output}, simulated, is {o.vaf:.3g}, less than its mean"
+            for o in self.judged
+            if o.disturbed_below_mean
+        ]
+
+    @property
     def _left_over(self) -> list[str]:
         """What keeps an adequate model from a plain yes."""
         filtered = any(output.against_disturbance is not None for output in self.judged)
         what = "innovations" if filtered else "residuals"
-        words = [f"the {what} of {', '.join(self.coloured)} are not white"]
+        coloured = [f"the {what} of {', '.join(self.coloured)} are not white"]
+        words = coloured if self.coloured else []
         # Between what is adequate and what the acceptance card asks for.
         return words + [
             f"VAF of {output.output} is {output.vaf:.3g}"
@@ -152,6 +164,8 @@ class Evidence(NamedTuple):
     unknowns: int = 0
     """how many were estimated; a response that explains no more than as many unknowns explain of
     noise by chance shows nothing"""
+    innovations: tuple[Mapping[str, np.ndarray] | None, ...] = ()
+    """by flight and output (N,), SI: the errors of the prediction one step ahead"""
 
 
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
@@ -173,7 +187,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     bad = [output for output in outputs if not output.adequate]
     if outputs and not bad and not disturbed and not _stands_out(outputs, evidence):
         return _nothing_shown(outputs)
-    unexplained = [o for o in outputs if not disturbed and o.adequate and _of_noise(o, evidence)]
+    unexplained = [o for o in outputs if o.adequate and _nothing_explained(o, evidence)]
     doubted = [*bad, *(output for output in outputs if output.doubtful)]
     unstable = unstable or (bool(bad) and is_unstable(problem, params))
     apart = len(doubted) < len(outputs)
@@ -221,7 +235,7 @@ def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:
         f"(VAF {output.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
         "columns, signs and units the right ones?"
         for output in outputs
-        if output.adequate and output.against_disturbance is not None and output.vaf < 0
+        if output.disturbed_below_mean
     ]
 
 
@@ -233,6 +247,21 @@ def _stands_out(outputs: tuple[OutputAdequacy, ...], evidence: Evidence) -> bool
     """Whether the response of some output stands out of the noise."""
     # One output that stands out is enough: the others may be ones that these inputs do not move.
     return not outputs or not all(_of_noise(output, evidence) for output in outputs)
+
+
+def _nothing_explained(output: OutputAdequacy, evidence: Evidence) -> bool:
+    """Whether of an output nothing is explained, simulated or one step ahead."""
+    if evidence.error_ratio is None:
+        return _of_noise(output, evidence)
+    if not output.explained < 1.0 - EXPLAINED:
+        return False
+    return predicts_nothing(
+        [
+            (r.measured[output.output], ahead[output.output])
+            for r, ahead in zip(evidence.records, evidence.innovations, strict=False)
+            if ahead is not None and output.output in r.measured
+        ]
+    )
 
 
 def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
@@ -249,6 +278,12 @@ def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
 
 
 def _unexplained(output: OutputAdequacy) -> str:
+    if output.against_disturbance is not None:
+        return (
+            f"The model explains nothing of {output.output}: simulated VAF {output.vaf:.2g}, and "
+            "one step ahead the filter predicts it hardly better than its mean or the sample "
+            "before. Either nothing moves it, or what the log has there is noise or vibration."
+        )
     return (
         f"The model explains nothing of {output.output} (VAF {output.vaf:.2g}), no more than as "
         "many unknowns explain of noise alone; the other outputs carry the fit. Its residuals are "
@@ -300,48 +335,9 @@ def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> Out
     # Of an unstable model the filter expects any error of a simulation: then its innovations are
     # all there is to judge by.
     expected = ratio <= EXPECTED and (white or (abs(lag1) < FAR_FROM_WHITE and not unstable))
-    expected = expected and not _moves_against(name, evidence.records)
+    expected = expected and not moves_against(name, evidence.records)
     adequate = bool(enough or expected)
     return OutputAdequacy(name, adequate, m.vaf, explained, white, lag1, ratio)
-
-
-def _moves_against(name: str, records: tuple[Record, ...]) -> bool:
-    """Whether the measured output goes against a simulated one that has shrunk, not by chance.
-
-    A disturbance knows nothing of the inputs. So the slope of the measured on the simulated output
-    is 1 but for what chance makes of the two, whose autocorrelations say how much that is
-    (Bartlett, 1935).
-    """
-    # Where an input has the wrong sign and the parameters keep theirs, the filter takes the
-    # response for disturbance and the simulation shrinks: the slope is then several times below
-    # -1. A slope that is merely negative tells nothing in a record of a few swings.
-    product, power, variance = 0.0, 0.0, 0.0
-    for r in records:
-        if name not in r.measured or not np.isfinite(r.simulated[name]).all():
-            continue
-        covariance, own_power, chance = _covariance_by_chance(r.measured[name], r.simulated[name])
-        product, power, variance = product + covariance, power + own_power, variance + chance
-    if not (power > 0 and variance > 0):
-        return False
-    return 1.0 + product / power < _TURNED and product / variance**0.5 < _FIVE_PERCENT
-
-
-def _covariance_by_chance(y: np.ndarray, m: np.ndarray) -> tuple[float, float, float]:
-    """Of the disturbance's part d = y - m of an output: d'm, m'm, and the variance that d'm has
-    where the two are independent."""
-    # The slope of y on m is 1 + d'm / m'm.
-    # Only where something was measured, for both: a slope over all of the simulation and a few
-    # samples of the output would be none.
-    seen = ~np.isnan(y)
-    y, m = y[seen], m[seen]
-    d, m = y - m - np.mean(y - m), m - m.mean()
-    lags = max(1, y.size // 5)
-    # Bartlett's window: without it the sum over the lags can be negative, and no variance.
-    window = 1.0 - np.arange(lags + 1) / (lags + 1)
-    both = window * autocorrelation(d, lags) * autocorrelation(m, lags)
-    power = float(m @ m)
-    chance = float(d @ d) * power * (both[0] + 2.0 * both[1:].sum()) / y.size
-    return float(d @ m), power, chance
 
 
 def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, float]:

@@ -53,6 +53,12 @@ class OutputAdequacy(NamedTuple):
         simulated = self.against_disturbance is None
         return self.adequate and simulated and not self.white and self.vaf < GATE
 
+    @property
+    def disturbed_below_mean(self) -> bool:
+        """Adequate beside the estimated disturbance, though the simulation by the inputs alone
+        follows worse than the mean does."""
+        return self.adequate and self.against_disturbance is not None and self.vaf < 0
+
 
 class Record(NamedTuple):
     """What is compared, by flight: SI, NaN where nothing is measured."""

@@ -33,7 +33,7 @@ from heli_jax.identification.validation.signal_signs import against_start, rate_
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
-_ORDER = {"refuse": 0, "doubt": 1, "ok": 2}
+_ORDER = {"refuse": 0, "doubt": 1, "ok": 2, "note": 2}
 
 
 def is_it_enough(
@@ -71,7 +71,7 @@ def is_it_enough(
         found += [*missing_outputs(problem, at), *next_flight(problem, at, e)]
     else:
         words = "what further outputs and manoeuvres would do is compared by heli-jax check."
-        found.append(Finding("next flight", "ok", words))
+        found.append(Finding("next flight", "note", words))
     return tuple(sorted(found, key=lambda f: _ORDER[f.severity]))
 
 
@@ -94,11 +94,11 @@ def judged_again(
 
 def _of_feedback(problem: Problem, feedback: Sequence[Feedback]) -> list[Finding]:
     # What is not tested is said: "no input follows" would be taken for all outputs.
-    aside = [Finding("feedback", "ok", words) for words in untested(problem)]
+    aside = [Finding("feedback", "note", words) for words in untested(problem)]
     if not feedback:
         why = why_untested(problem)
         # Steps that somebody commanded follow nothing; of the rest nothing is known.
-        severity = "ok" if why == STEPS else "doubt"
+        severity = "note" if why == STEPS else "doubt"
         words = f"whether an input follows the response was not tested: {why}."
         return [Finding("feedback", severity, words)] if why else aside
     least = min(feedback, key=lambda f: f.p_value)

@@ -35,6 +35,10 @@ _POWER = (0.05, 0.95)
 """the band of an input holds its power between these parts"""
 _LEAST_POWER = 1e-3
 """of an input's largest power at one frequency: below that it does not excite"""
+NOTHING_FOLLOWS = (
+    "no output follows any input coherently over a band of frequencies: noise, disturbances or "
+    "something else moves the machine more than the sticks do."
+)
 
 
 class _Pooled(NamedTuple):
@@ -140,17 +144,14 @@ def _coherent_bands(pooled: _Pooled, moving: list[str], seen: SeenParts) -> list
                 f"no output follows it alone over a quarter of an octave with a coherence of "
                 f"{limit:.2f}.{left}"
             )
-            findings.append(Finding("excited band", "ok", words, None, criterion))
+            # No pass: this input alone moves nothing, though several together may.
+            findings.append(Finding("excited band", "note", words, None, criterion))
             continue
         followed = True
         words += f"{best.output} follows it from {best.low:.2g} to {best.high:.2g} Hz.{left}"
         findings.append(Finding("excited band", "ok", words, best.peak, criterion))
     if not followed and not _follow_together(pooled):
-        words = (
-            "no output follows any input coherently over a band of frequencies: noise, "
-            "disturbances or something else moves the machine more than the sticks do."
-        )
-        findings.append(Finding("excited band", "doubt", words, None, criterion))
+        findings.append(Finding("excited band", "doubt", NOTHING_FOLLOWS, None, criterion))
     return findings
 
 

@@ -2,8 +2,9 @@
 
 from typing import Literal, NamedTuple
 
-Severity = Literal["ok", "doubt", "refuse"]
-"""refuse: a fit of this record says nothing of what is asked"""
+Severity = Literal["ok", "note", "doubt", "refuse"]
+"""note: what was not tested, or is advice and no test; refuse: a fit of this record says nothing of
+what is asked"""
 
 
 class Finding(NamedTuple):
@@ -15,3 +16,8 @@ class Finding(NamedTuple):
     value: float | None = None
     criterion: str = ""
     """what `value` is, and the limit that it is held against"""
+
+    @property
+    def bad(self) -> bool:
+        """Whether it is a doubt, or worse."""
+        return self.severity in ("doubt", "refuse")

@@ -120,7 +120,7 @@ def next_flight(problem: Problem, at: Solution, e: Evaluation) -> list[Finding]:
         )
     if plan.left_out:
         words += f" Not compared: {', '.join(plan.left_out)}, which the record does not move."
-    return [Finding("next flight", "ok", words, ratio, criterion)]
+    return [Finding("next flight", "note", words, ratio, criterion)]
 
 
 def _sd(relative: float) -> str:

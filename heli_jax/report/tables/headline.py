@@ -28,13 +28,16 @@ def headline(fit: Fit) -> Headline:
     if not fit.adequate:
         worst = fit.adequacy.less_than_mean or level == "bad"
         level = "bad" if worst else "warning"
-    if fit.adequacy.coloured and level == "good":
+    if (fit.adequacy.coloured or fit.adequacy.one_step_only) and level == "good":
         level = "warning"
     return Headline(level, word, f"{text}; adequate: {adequate(fit)}")
 
 
 def further_sentences(fit: Fit) -> list[str]:
     """The sentences of the verdict without what the headline has said already."""
+    # What the data determine is a property of an optimum.
+    if fit.status == "not-converged":
+        return []
     said, lines = _determined(fit).text, []
     for sentence in fit.verdict.sentences:
         # Both begin with "the data": one of them as a sentence, the other after a colon.
@@ -50,8 +53,7 @@ def further_sentences(fit: Fit) -> list[str]:
 
 
 def adequate(fit: Fit) -> str:
-    """`yes`, `in size only (...)`, `no (...)`; what stopped before an optimum and looks adequate
-    was not judged."""
+    """`yes`, `in size only (...)`, `no (...)`; what stopped before an optimum was not judged."""
     return fit.adequacy.summary
 
 

@@ -37,7 +37,8 @@ def _adequate(fit: Fit) -> str:
             f"has at most {EXPECTED:g} times the power that the estimated disturbance makes; in "
             "size only where innovations are not white but have an autocorrelation below "
             f"{FAR_FROM_WHITE:g} at one sample, or the simulation explains "
-            f"{percent(EXPLAINED, 0)} of what is not white noise; no otherwise."
+            f"{percent(EXPLAINED, 0)} of what is not white noise; one step ahead only where that "
+            "holds, but the simulation by the inputs alone is worse than the mean; no otherwise."
         )
     return (
         "yes where the residuals of all outputs are white (Ljung-Box at 1 %); in size only where "
