@@ -143,7 +143,7 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit:
         style.line(ax, signals.log_times, simulated, color=color, ls=dashes, lw=0.9, label=label)
     ax.set_title(f"{output}, {name}: simulated", loc="left")
     ax.set_xlabel(time_label(first.log_start))
-    ax.get_figure(root=True).set_label(name)
+    ax.figure.set_label(name)
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size))
     ax.set_ylabel(f"{output} [{unit}]" if unit not in ("", "1") else output)

@@ -96,7 +96,7 @@ def as_logged(signal: Signal) -> Logged | None:
         factor = from_si(signal)
         return None if factor == 1.0 else Logged(signal.unit, factor)
     # The configuration's unit is not the log's, as metres of a pulse width: the column says which.
-    zero, one = (float(signal.from_si(np.float64(v))) for v in (0.0, 1.0))
+    zero, one = map(float, signal.from_si(np.array([0.0, 1.0])))
     return Logged(signal.name, one - zero, zero)
 
 

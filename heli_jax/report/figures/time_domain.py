@@ -48,7 +48,7 @@ def response(
         ax.set_ylabel(label(name, naming.unit(model.Inputs, name)))
     axes[-1].set_xlabel(time_label(signals.log_start))
     # Only panels of one flight share cursor and zoom: those of two have no moment in common.
-    axes[0].get_figure(root=True).set_label(signals.flight)
+    axes[0].figure.set_label(signals.flight)
     # A record of one sample has no duration, and matplotlib warns of an axis without length.
     top.set_xlim(t[0], t[-1] if t.size > 1 else t[0] + 1.0)
     return axes
@@ -96,7 +96,7 @@ def rls_history(
     # b_i is output over input in SI, and each has the same unit; the a's are plain numbers.
     axes[1].set_ylabel("b (SI)")
     axes[1].set_xlabel(time_label(log_start))
-    axes[0].get_figure(root=True).set_label(baseline.flight)
+    axes[0].figure.set_label(baseline.flight)
     axes[0].set_xlim(begin, max(t[-1], begin + baseline.dt))
     return axes
 
