@@ -3,6 +3,8 @@
 import math
 
 NOTHING = "–"
+_LONG = 1e5
+"""per cent from which a power of ten is taken out, as `number` takes it"""
 _UP = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -26,7 +28,11 @@ def percent(value: float | None, digits: int = 2) -> str:
     """A share (1 is 100 %) as a percentage."""
     if value is None or not math.isfinite(value):
         return NOTHING
-    return f"{_signed(f'{100 * value:.{digits}f}')} %"
+    share = 100 * value
+    # Of a simulation that diverges the digits would fill lines, and mean nothing.
+    if abs(share) >= _LONG:
+        return f"{number(share, 3)} %"
+    return f"{_signed(f'{share:.{digits}f}')} %"
 
 
 def relative(sd: float | None, value: float) -> str:
@@ -36,7 +42,7 @@ def relative(sd: float | None, value: float) -> str:
     share = 100 * abs(sd / value)
     # Past 100 % the digits say nothing, and '1.2e+02 %' is what two of them would look like.
     if share >= 100:
-        return f"{share:.0f} %"
+        return f"{number(share, 3) if share >= _LONG else f'{share:.0f}'} %"
     # '#' keeps the zero of 1.0 %: two digits are promised, and 1 % could be 0.6 to 1.4.
     return f"{share:#.2g}".rstrip(".") + " %" if share >= 1e-4 else f"{number(share, 2)} %"
 

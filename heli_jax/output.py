@@ -200,7 +200,7 @@ def _print_baseline(b: Baseline) -> None:
 def _row(name: str, e: Estimate) -> tuple[str, ...]:
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
-    if e.sd is None or e.lower95 is None or e.upper95 is None:
+    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
         return (name, "not determined", "", "", e.unit, f"{e.prior_share:.2f}")
     at_bound = " (at bound)" if e.at_bound else ""
     value, sd = rounded(e.value, e.sd)

@@ -138,7 +138,9 @@ def print_sweep(out: Path) -> None:
         for name, elements in totals[words].items():
             element = elements[0]
             at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
-            print(f"{words} {name}: element {element['element']}, {at}")
+            unit = totals["results"].get(name, {}).get("unit", "")
+            value = f"{element['value']:.4g} {unit if unit != '1' else ''}".rstrip()
+            print(f"{words} {name}: {value}, element {element['element']}, {at}")
     for note in totals["notes"]:
         print(f"! {note}")
     for name, result in totals["results"].items():
@@ -158,3 +160,5 @@ def print_sweep(out: Path) -> None:
             f"({timing['elements_per_s']:.3g} a second, with compilation)"
         )
     print(f"store: {out / 'sweep.zarr'}")
+    if (out / "report.html").is_file():
+        print(f"report: {out / 'report.html'}")

@@ -7,6 +7,7 @@ import numpy as np
 
 from heli_jax.flights.flight import Flight, Signal
 from heli_jax.flights.table import shown
+from heli_jax.numbers import number
 
 
 def scale_problem(signal: Signal) -> str:
@@ -65,12 +66,12 @@ def with_origins(
 def in_words(signal: Signal) -> str:
     """What a signal is in the log: `'RCIN.C1', (number - 1500) x 0.002 in 1, inverted`."""
     if signal.constant is not None:
-        words = f"{signal.constant:g} {_unit(signal)}".rstrip() + ", a constant"
+        words = f"{number(signal.constant, 6)} {_unit(signal)}".rstrip() + ", a constant"
     else:
-        steps = f"number - {signal.offset:g}" if signal.offset else "number"
+        steps = f"number - {number(signal.offset, 6)}" if signal.offset else "number"
         if signal.scale != 1.0:
             steps = f"({steps})" if signal.offset else steps
-            steps += f" x {signal.scale:g}"
+            steps += f" x {number(signal.scale, 6)}"
         words = shown(signal.name) + ("" if steps == "number" else f", {steps}")
         words += f", in {signal.unit}" if _unit(signal) else ""
         words += ", inverted" if signal.invert else ""

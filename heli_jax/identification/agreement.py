@@ -78,6 +78,7 @@ def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...
             dict(f.outputs),
             {n: np.asarray(v) for n, v in by_name.items()},
             error,
+            None if f.source is None else f.window[0],
         )
         for label, f, by_name, error in zip(
             labels(flights), flights, e.simulated, errors, strict=True
@@ -90,7 +91,15 @@ def free_runs(
 ) -> tuple[Signals, ...]:
     """The flights held out as simulated in one piece."""
     return tuple(
-        Signals(label, f.hold_out, f.times, dict(f.inputs), dict(f.outputs), run)
+        Signals(
+            label,
+            f.hold_out,
+            f.times,
+            dict(f.inputs),
+            dict(f.outputs),
+            run,
+            log_start=None if f.source is None else f.window[0],
+        )
         for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
     )
 

@@ -59,6 +59,13 @@ class Signals(NamedTuple):
     """with the estimated bias"""
     innovations: dict[str, np.ndarray] | None = None
     """filter error: measured - predicted from all samples before, SI"""
+    log_start: float | None = None
+    """time in the log of the first sample [s], from the log's beginning; None without a log"""
+
+    @property
+    def log_times(self) -> np.ndarray:
+        """Time in the log (N,) [s], as windows and notes count it; from zero without a log."""
+        return self.times + (self.log_start or 0.0)
 
     def predicted(self, output: str) -> np.ndarray:
         """One sample ahead, from all samples before (filter error)."""

@@ -59,6 +59,8 @@ class Chart(NamedTuple):
     logarithmic: bool
     x_limits: tuple[float, float]
     panels: tuple[Panel, ...]
+    of: str = ""
+    """what its x belongs to, as a flight: charts of the same share cursor and zoom"""
 
 
 def chart_of(figure: Figure) -> Chart:
@@ -80,6 +82,7 @@ def chart_of(figure: Figure) -> Chart:
         first.get_xscale() == "log",
         (float(low), float(high)),
         tuple(_panel(ax, height) for ax in axes),
+        str(figure.get_label()),
     )
 
 

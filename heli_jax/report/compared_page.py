@@ -3,6 +3,8 @@
 import contextlib
 import functools
 import itertools
+import os
+import urllib.parse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,13 +14,17 @@ from matplotlib.figure import Figure
 from heli_jax import units
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
+from heli_jax.report.compared_bode import BODE_WORDS, bode_overlay
 from heli_jax.report.compared_runs import ComparedRuns
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures.panels import panels
+from heli_jax.report.figures.time_domain import time_label
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, picture
+from heli_jax.report.saved_fit import SavedFit
 
+_FILES = ("report.html", "fit.json", "signals.csv", "config.yaml")
 _MOST_FIGURES = 24
 _SHOWN, _FAR = 2.0, 20.0
 """of an output's measured range: how far from its middle the axes reach at most, and curves"""
@@ -34,28 +40,61 @@ def write_page(path: Path, compared: ComparedRuns) -> None:
     """
     numbers = Numbers()
     pictures = list(_pictures(compared, numbers))
+    folder = path.absolute().parent
     page = filled(
         "compared.html.j2",
         labels=compared.labels,
         tables=[
-            ("Estimates", compared.estimates),
+            ("Estimates", compared.page_estimates),
             ("Verdicts", compared.verdicts),
             ("Agreement", compared.agreement),
         ],
         notes=compared.notes,
         pictures=pictures,
         numbers=numbers.content(),
+        # Relative, so that page and runs can be moved together.
+        files=[
+            (label, [(n, _link(run.directory / n, folder)) for n in _FILES if _is(run, n)])
+            for label, run in zip(compared.labels, compared.runs, strict=True)
+        ],
+        configs=[
+            (label, (run.directory / "config.yaml").read_text(encoding="utf-8"))
+            for label, run in zip(compared.labels, compared.runs, strict=True)
+            if _is(run, "config.yaml")
+        ],
         origin=origin(),
     )
     path.write_text(page, encoding="utf-8")
 
 
-def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[Picture]:
+def _is(run: SavedFit, name: str) -> bool:
+    return (run.directory / name).is_file()
+
+
+def _link(file: Path, folder: Path) -> str:
+    """The address of a file for a page in a folder."""
+    try:
+        relative = os.path.relpath(file.absolute(), folder)
+    except ValueError:  # on another drive
+        return file.absolute().as_uri()
+    return urllib.parse.quote(relative.replace(os.sep, "/"))
+
+
+def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Picture, str]]:
+    """The figures, each with its caption."""
     for name, output, found in itertools.islice(_overlaps(compared), _MOST_FIGURES):
         unit = _unit(compared, output)
         made = picture("overlay", functools.partial(_overlay, found, name, output, unit), numbers)
         if made is not None:
-            yield made
+            drawn = {label for label, _ in found}
+            missing = [label for label in compared.labels if label not in drawn]
+            without = f"no {output} in a flight named {name}"
+            yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
+        for input in dict.fromkeys(n for _, s in found for n in s.inputs):
+            draw = functools.partial(bode_overlay, found, name, output, input)
+            made = picture("bode", draw, numbers)
+            if made is not None:
+                yield made, BODE_WORDS
 
 
 def _overlaps(
@@ -92,7 +131,7 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit:
     middle = float(np.mean(measured)) if measured.size else 0.0
     size = float(np.ptp(measured)) if measured.size and np.ptp(measured) > 0 else 1.0
     style.samples(
-        ax, first.times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
+        ax, first.log_times, first.measured[output], color=style.PALE, lw=1.2, label="measured"
     )
     for i, (label, signals) in enumerate(found):
         color = style.CYCLE[i % len(style.CYCLE)]
@@ -101,13 +140,15 @@ def _overlay(found: Sequence[tuple[str, Signals]], name: str, output: str, unit:
         far = np.abs(simulated - middle) > _FAR * size
         if far.any():
             label, simulated = f"{label} (diverges)", np.where(far, np.nan, simulated)
-        style.line(ax, signals.times, simulated, color=color, ls=dashes, lw=0.9, label=label)
+        style.line(ax, signals.log_times, simulated, color=color, ls=dashes, lw=0.9, label=label)
     ax.set_title(f"{output}, {name}: simulated", loc="left")
-    ax.set_xlabel("time [s]")
+    ax.set_xlabel(time_label(first.log_start))
+    ax.figure.set_label(name)
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, middle - _SHOWN * size), min(high, middle + _SHOWN * size))
     ax.set_ylabel(f"{output} [{unit}]" if unit not in ("", "1") else output)
-    ends = [np.nanmin([s.times[0] for _, s in found]), np.nanmax([s.times[-1] for _, s in found])]
-    ax.set_xlim(float(ends[0]), float(ends[1]) if ends[1] > ends[0] else float(ends[0]) + 1.0)
+    begin = min(float(s.log_times[0]) for _, s in found)
+    end = max(float(s.log_times[-1]) for _, s in found)
+    ax.set_xlim(begin, end if end > begin else begin + 1.0)
     style.legend_above(ax)
     return ax.figure  # pyright: ignore[reportReturnType]

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import number, percent, rounded
+from heli_jax.numbers import measured, number, percent, rounded
 from heli_jax.report.saved_fit import SavedFit, load_fit
+from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
 
 if TYPE_CHECKING:
@@ -54,7 +55,27 @@ class ComparedRuns(NamedTuple):
 
     @property
     def estimates(self) -> Table:
-        """Each parameter's estimate and sd by run, and the differences from the first."""
+        """Each parameter's estimate and sd by run, and the differences from the first; in ASCII but
+        for ±, so that a number can be pasted into a vehicle file."""
+        return self._estimates(rounded, str)
+
+    @property
+    def page_estimates(self) -> Table:
+        """As `estimates`, with numbers and units as all pages have them."""
+        head, rows = self._estimates(lambda value, sd: measured(sd, value), pretty)
+        first = 1 + len(self.labels)
+        signed = (
+            tuple(c.replace("-", "−") if i >= first else c for i, c in enumerate(row[:-1]))
+            for row in rows
+        )
+        return Table(
+            head, tuple((*cells, row[-1]) for cells, row in zip(signed, rows, strict=True))
+        )
+
+    def _estimates(
+        self, pair: Callable[[float, float], tuple[str, ...]], shown_unit: Callable[[str], str]
+    ) -> Table:
+        """Estimates with `pair` for the text of a value and its sd, and `shown_unit` of a unit."""
         first = self.labels[0]
         several = [f"{label} - {first} [sd]" for label in self.labels[1:]]
         rows = []
@@ -62,13 +83,13 @@ class ComparedRuns(NamedTuple):
             found = [run.estimates.get(name) for run in self.runs]
             units = {e.unit for e in found if e is not None}
             cells = [
-                _measured(e, with_unit=len(units) > 1, arrived=_arrived(run))
+                _measured(e, pair, shown_unit if len(units) > 1 else None, arrived=_arrived(run))
                 for e, run in zip(found, self.runs, strict=True)
             ]
             # Where an optimiser stopped on its way there is nothing to compare.
             there = [e if _arrived(run) else None for e, run in zip(found, self.runs, strict=True)]
             apart = [_difference(there[0], other) for other in there[1:]]
-            rows.append((name, *cells, *apart, units.pop() if len(units) == 1 else ""))
+            rows.append((name, *cells, *apart, shown_unit(units.pop()) if len(units) == 1 else ""))
         return Table(("parameter", *self.labels, *several, "unit"), tuple(rows))
 
     @property
@@ -222,15 +243,21 @@ def _usable(run: SavedFit) -> dict[str, Estimate]:
     return {name: e._replace(**none) for name, e in run.estimates.items()}
 
 
-def _measured(e: Estimate | None, *, with_unit: bool, arrived: bool) -> str:
+def _measured(
+    e: Estimate | None,
+    pair: Callable[[float, float], tuple[str, ...]],
+    shown_unit: Callable[[str], str] | None,
+    *,
+    arrived: bool,
+) -> str:
     if e is None:
         return _ABSENT
     if not arrived:
         return NOT_CONVERGED
     if e.sd is None:
         return NOT_DETERMINED
-    value, sd = rounded(e.value, e.sd)
-    return f"{value} ± {sd}" + (f" {e.unit}" if with_unit else "")
+    value, sd = pair(e.value, e.sd)
+    return f"{value} ± {sd}" + (f" {shown_unit(e.unit)}" if shown_unit else "")
 
 
 def _difference(first: Estimate | None, other: Estimate | None) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from matplotlib.figure import Figure
 
 from heli_jax import naming, units
@@ -14,6 +15,7 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import figures
+from heli_jax.report.embedded import Logged
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import FittedFlight
@@ -49,7 +51,11 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
             # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
                 drawings[f"residual{part}_{output}"] = _drawing(
-                    figures.residual_correlation, s, output, together=len(fit.whiteness)
+                    figures.residual_correlation,
+                    s,
+                    output,
+                    together=len(fit.whiteness),
+                    test=fit.whiteness.get(f"{s.flight}/{output}"),
                 )
     if fit.signals[0].inputs:
         drawings["bode"] = _bode(fit, problem, baseline)
@@ -59,7 +65,9 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
         drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
     drawings["starts"] = _drawing(figures.waterfall, fit.starts)
     if baseline is not None:
-        drawings["rls"] = _drawing(figures.rls_history, baseline)
+        drawings["rls"] = _drawing(
+            figures.rls_history, baseline, log_start=_log_start(fit, baseline.flight)
+        )
     return drawings
 
 
@@ -74,11 +82,8 @@ def _samples(comparison: Intervals, fit: Fit) -> dict[str, Draw]:
     return drawings
 
 
-def logged_units(analysis: Analysis) -> dict[str, dict[str, tuple[str, float]]]:
-    """By figure and signal: the unit of its log, and what SI is times to be in it.
-
-    Signals that the log has in SI are left out.
-    """
+def logged_units(analysis: Analysis) -> dict[str, dict[str, Logged]]:
+    """By figure and signal how the log has it; signals that it has in SI are left out."""
     fit, problem, _, _ = analysis
     # In the order of the signals: the fitted flights first.
     flights = [*problem.training, *(f for f in problem.flights if f.hold_out)]
@@ -87,11 +92,25 @@ def logged_units(analysis: Analysis) -> dict[str, dict[str, tuple[str, float]]]:
         if flight.source is None:
             continue
         listed = {**flight.source.inputs, **flight.source.outputs}
-        factors = {n: (s.unit, factor) for n, s in listed.items() if (factor := from_si(s)) != 1.0}
+        factors = {n: logged for n, s in listed.items() if (logged := as_logged(s))}
         for output in signals.measured:
             own = factors.get(output)
-            by_figure[f"response{part}_{output}"] = factors | ({"residual": own} if own else {})
+            # A difference of two numbers has no offset.
+            residual = {"residual": own._replace(offset=0.0)} if own else {}
+            by_figure[f"response{part}_{output}"] = factors | residual
     return by_figure
+
+
+def as_logged(signal: Signal) -> Logged | None:
+    """How the log has a signal; None where it is constant, or logged in SI."""
+    if signal.constant is not None:
+        return None
+    if signal.scale == 1.0 and not signal.offset and not signal.invert:
+        factor = from_si(signal)
+        return None if factor == 1.0 else Logged(signal.unit, factor)
+    # The configuration's unit is not the log's, as metres of a pulse width: the column says which.
+    zero, one = map(float, signal.from_si(np.array([0.0, 1.0])))
+    return Logged(signal.name, one - zero, zero)
 
 
 def logged_outputs(analysis: Analysis) -> dict[str, tuple[str, float]]:
@@ -113,6 +132,11 @@ def from_si(signal: Signal) -> float:
         return 1.0 / units.factor(signal.unit, signal.si)
     except ValueError:  # of no known unit: it was never converted
         return 1.0
+
+
+def _log_start(fit: Fit, flight: str) -> float | None:
+    """Time in the log of a flight's first sample [s]."""
+    return next((s.log_start for s in fit.signals if s.flight == flight), None)
 
 
 def _drawn(hold_out: list[bool]) -> list[int]:

@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,15 @@ _STEPS = 65534
 percent"""
 
 
+class Logged(NamedTuple):
+    """How a log has a signal: SI times a factor, and an offset on top."""
+
+    unit: str
+    """or the column's name, where the log's numbers have no unit"""
+    factor: float
+    offset: float = 0.0
+
+
 class Numbers:
     """Arrays and figures of one page."""
 
@@ -27,14 +36,14 @@ class Numbers:
         self.charts: list[dict[str, Any]] = []
         self.scenes: list[dict[str, Any]] = []
         self._known: dict[bytes, int] = {}
-        self._waiting: list[tuple[Chart, dict[str, tuple[str, float]]]] = []
+        self._waiting: list[tuple[Chart, dict[str, Logged]]] = []
 
-    def add_chart(self, chart: Chart, logged: dict[str, tuple[str, float]] | None = None) -> int:
+    def add_chart(self, chart: Chart, logged: dict[str, Logged] | None = None) -> int:
         """Keep a figure; its number on the page.
 
         Args:
             chart: the figure.
-            logged: by signal the unit of its log, and what SI is times to be in it.
+            logged: by signal how its log has it.
         """
         self._waiting.append((chart, logged or {}))
         return len(self._waiting) - 1
@@ -67,9 +76,7 @@ class Numbers:
             self.arrays.append(_uniform(values) or (_single(values) if exact else _coarse(values)))
         return self._known[key]
 
-    def _chart(
-        self, chart: Chart, logged: dict[str, tuple[str, float]], most: int
-    ) -> dict[str, Any]:
+    def _chart(self, chart: Chart, logged: dict[str, Logged], most: int) -> dict[str, Any]:
         panels = [
             {
                 "label": p.label,
@@ -89,6 +96,7 @@ class Numbers:
             "xLabel": chart.x_label,
             "log": chart.logarithmic,
             "xLimits": chart.x_limits,
+            "of": chart.of,
             "panels": panels,
         }
 
@@ -117,7 +125,7 @@ def _most(sizes: list[int]) -> int:
     return max(_LEAST, int(_BYTES / (6 * 4 / 3) / len(sizes)))
 
 
-def _logged_unit(label: str, logged: dict[str, tuple[str, float]]) -> list[Any] | None:
+def _logged_unit(label: str, logged: dict[str, Logged]) -> list[Any] | None:
     unit = logged.get(label.partition(" [")[0])
     return None if unit is None else [label.partition(" [")[2].rstrip("]"), *unit]
 

@@ -168,10 +168,13 @@ def as_json(content: dict[str, Any]) -> str:
 def write_signals(path: Path, signals: tuple[Signals, ...]) -> None:
     """Measured, simulated and residual of all flights in one table, SI.
 
-    A flight without some signal has empty cells there.
+    `time` counts from the flight's first sample, `log_time` from the log's beginning, as windows
+    do; flights without a log have none. A flight without some signal has empty cells there.
     """
     # The columns of all flights, in the order in which they first appear.
     names = ["flight", "time"]
+    if any(s.log_start is not None for s in signals):
+        names.append("log_time")
     for s in signals:
         names += [n for n in s.inputs if n not in names]
         names += [
@@ -188,6 +191,9 @@ def _columns(s: Signals) -> dict[str, Any]:
     # The name of the flight in every row: a table program can group by it, whatever the rows'
     # order.
     columns: dict[str, Any] = {"flight": [s.flight] * s.times.size, "time": s.times, **s.inputs}
+    if s.log_start is not None:
+        # Rounded: 42 + 0.01 k in binary is 42.010000000000005, and nobody's clock has its digits.
+        columns["log_time"] = np.round(s.log_times, 9)
     for output, measured in s.measured.items():
         columns[f"{output}_measured"] = measured
         columns[f"{output}_simulated"] = s.simulated[output]

@@ -277,6 +277,7 @@ def source(flight: Flight) -> dict[str, Any]:
         "n_samples": flight.n_samples,
         "dt": flight.dt,
         "window": list(flight.window),
+        "log_first_time": flight.source.first_time,
         "notes": list(flight.source.notes),
         "signals": {
             "inputs": {n: as_content(s) for n, s in flight.source.inputs.items()},

@@ -14,7 +14,7 @@ from PIL import Image
 from heli_jax.report import style
 from heli_jax.report.alt_text import described
 from heli_jax.report.charts import chart_of
-from heli_jax.report.embedded import Numbers
+from heli_jax.report.embedded import Logged, Numbers
 
 _HEAVY = 45_000
 """bytes of an SVG from which on the page has a PNG in its place: noise has no short outline"""
@@ -45,7 +45,7 @@ def picture(
     numbers: Numbers,
     *,
     folder: Path | None = None,
-    logged: Mapping[str, tuple[str, float]] | None = None,
+    logged: Mapping[str, Logged] | None = None,
     kind: Kind = "live",
 ) -> Picture | None:
     """Draw a figure for a page.
@@ -55,7 +55,7 @@ def picture(
         draw: draws it.
         numbers: the page's, to which it is added.
         folder: for NAME.svg and NAME.png; no files unless given.
-        logged: by signal the unit of its log, and what SI is times to be in it.
+        logged: by signal how its log has it.
         kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
             `panels` words are made alone; of an `image` the title is all.
 

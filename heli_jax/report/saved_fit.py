@@ -188,14 +188,19 @@ def _flight(
     columns = {n: v for n, v in zip(head, table.T, strict=True) if not np.isnan(v).all()}
     # What belongs to no output is an input: the file does not say which columns are.
     of_outputs = {f"{o}_{w}" for o in outputs for w in _OF_AN_OUTPUT}
-    inputs = {n: v for n, v in columns.items() if n != "time" and n not in of_outputs}
+    inputs = {n: v for n, v in columns.items() if n not in (*_TIMES, *of_outputs)}
     measured, simulated, _, innovations = (
         {o: columns[f"{o}_{what}"] for o in outputs if f"{o}_{what}" in columns}
         for what in _OF_AN_OUTPUT
     )
-    return Signals(
-        name, hold_out, columns["time"], inputs, measured, simulated, innovations or None
-    )
+    log = columns.get("log_time")  # runs of earlier versions, and flights without a log, have none
+    start = None if log is None else float(log[0] - columns["time"][0])
+    times = columns["time"]
+    return Signals(name, hold_out, times, inputs, measured, simulated, innovations or None, start)
+
+
+_TIMES = ("time", "log_time")
+"""what is neither an input nor of an output"""
 
 
 _OF_AN_OUTPUT = ("measured", "simulated", "residual", "innovation")

@@ -1,4 +1,4 @@
-"""The page of a sweep: its summary as tables, and its figures; self-contained, without scripts."""
+"""The page of a sweep: its summary as tables, and its figures; self-contained."""
 
 import base64
 import json
@@ -6,9 +6,28 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jinja2
+from PIL import Image
+
+from heli_jax.numbers import NOTHING, number
+from heli_jax.report.origin import origin
+from heli_jax.report.page import filled
+from heli_jax.report.pictures import Picture
+from heli_jax.report.sweeps.files import stems
+from heli_jax.report.tables.table import Table
+from heli_jax.report.unit_symbols import pretty
 
 _QUANTILES = ("min", "q05", "median", "q95", "max")
+_FILES = ("config.yaml", "summary.json", "figures/")
+_DIGITS = 4
+_KINDS = {
+    "slices": ("{} against each axis", "dots, and the median with a 5 to 95 % band"),
+    "maps": ("{} over pairs of axes", "its median in each cell"),
+}
+"""by what a figure's file begins with: its title, and what it draws"""
+_OTHERS = {
+    "corner": ("Axes and results together", "histograms, and densities of each two of them"),
+    "worst": ("Where the worst elements lie", "a line through the axes for each"),
+}
 
 
 def write_page(path: Path, directory: Path, title: str) -> None:
@@ -16,37 +35,81 @@ def write_page(path: Path, directory: Path, title: str) -> None:
 
     Args:
         path: the HTML file.
-        directory: of the sweep, with summary.json and figures/.
+        directory: of the sweep, with summary.json and figures/, and config.yaml if it has one.
         title: of the page.
     """
     content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("heli_jax.report", "."), autoescape=True
-    )
-    page = environment.get_template("sweep.html.j2").render(
+    config = directory / "config.yaml"
+    text = config.read_text(encoding="utf-8") if config.is_file() else ""
+    files = tuple(name for name in _FILES if (directory / name).exists())
+    page = filled(
+        "sweep.html.j2",
         title=title,
         summary=content,
         counts=", ".join(f"{n} {s.replace('_', ' ')}" for s, n in content["status"].items() if n),
-        results=[_result(name, result) for name, result in content["results"].items()],
-        elements=list(_elements(content)),
-        pictures=[
-            (png.stem, base64.b64encode(png.read_bytes()).decode("ascii"))
-            for png in sorted((directory / "figures").glob("*.png"))
-        ],
+        results=_results(content),
+        elements=_elements(content),
+        pictures=list(_pictures(content, directory / "figures")),
+        origin=origin(text, files),
     )
     path.write_text(page, encoding="utf-8")
 
 
 # Any: what summary.json holds.
-def _result(name: str, result: dict[str, Any]) -> tuple[str, ...]:
-    numbers = (f"{result[k]:.4g}" if k in result else "" for k in _QUANTILES)
-    return (name, *numbers, result.get("unit", ""))
+def _results(content: dict[str, Any]) -> Table:
+    rows = [
+        (name, *(number(r.get(k), _DIGITS) for k in _QUANTILES), pretty(r.get("unit")))
+        for name, r in content["results"].items()
+    ]
+    return Table(("result", "min", "5 %", "median", "95 %", "max", "unit"), rows)
 
 
-def _elements(content: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
-    """Result, whether worst or best, number, and where it lies: worst and best first."""
-    for words in ("worst", "best"):
-        for name, elements in content[words].items():
-            for element in elements:
-                at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
-                yield name, words, str(element["element"]), at
+def _elements(content: dict[str, Any]) -> Table:
+    """Result, whether worst or best, value, and where it lies: a column for each axis."""
+    listed = [
+        (name, words, element)
+        for words in ("worst", "best")
+        for name, elements in content[words].items()
+        for element in elements
+    ]
+    axes = list(dict.fromkeys(axis for *_, e in listed for axis in e["axes"]))
+    rows = [
+        (
+            name,
+            words,
+            number(e.get("value"), _DIGITS),
+            pretty(content["results"].get(name, {}).get("unit")),
+            str(e["element"]),
+            *(number(e["axes"][a], _DIGITS) if a in e["axes"] else NOTHING for a in axes),
+        )
+        for name, words, e in listed
+    ]
+    return Table(("result", "which", "value", "unit", "element", *axes), rows)
+
+
+def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, str]]:
+    """The figures with their captions: titles in words, and what they show in numbers."""
+    results = {stem: name for name, stem in stems(list(content["results"])).items()}
+    for png in sorted(folder.glob("*.png")):
+        kind, _, stem = png.stem.partition("-")
+        name = results.get(stem, stem)
+        title, words = _OTHERS.get(png.stem) or _KINDS.get(kind, (png.stem, ""))
+        title = title.format(name)
+        told = [name] if kind in _KINDS else list(content["results"])
+        numbers = "; ".join(_range(n, content["results"][n]) for n in told[:_TOLD])
+        alt = f"{title}: {words}. Over the sweep {numbers}."
+        with Image.open(png) as image:
+            size = image.size
+        data = base64.b64encode(png.read_bytes()).decode("ascii")
+        picture = Picture(png.stem, title, f"data:image/png;base64,{data}", size, alt)
+        yield picture, f"{title}: {words}. (figures/{png.stem}.svg, .png)"
+
+
+_TOLD = 6
+"""results whose numbers a figure's words give"""
+
+
+def _range(name: str, result: dict[str, Any]) -> str:
+    unit = pretty(result.get("unit"))
+    ends = f"{number(result.get('min'), 3)} to {number(result.get('max'), 3)}"
+    return f"{name} {ends}{'' if unit == NOTHING else f' {unit}'}"

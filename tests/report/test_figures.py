@@ -55,8 +55,8 @@ def test_residual_bands_and_lags(n):
     axes = figures.residual_correlation(noise_signals(n), "roll")
     band, lags = 2.5758 / np.sqrt(n), lags_for(n)
     for ax in axes:
-        [patch] = ax.patches
-        low, high = patch.get_extents().transformed(ax.transData.inverted()).intervaly
+        [shade] = ax.collections
+        low, high = shade.get_datalim(ax.transData).intervaly
         assert high == pytest.approx(band, rel=1e-3)
         assert low == pytest.approx(-band, rel=1e-3)
     drawn = [np.asarray(c.get_xdata()) for c in axes[0].get_lines()[:2]]
@@ -104,7 +104,7 @@ def test_labels_carry_units(sound):
     assert top.get_ylabel() == "roll [rad]"
     assert below.get_ylabel() == "residual [rad]"
     assert stick.get_ylabel() == "x_roll [m]"
-    assert stick.get_xlabel() == "time [s]"
+    assert stick.get_xlabel() == "time in the log [s]"
 
 
 def test_one_start_is_no_waterfall():

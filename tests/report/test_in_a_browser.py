@@ -1,5 +1,6 @@
 """The pages in a real browser: console, zoom, hover, keyboard, narrow screens, printing."""
 
+import json
 import re
 import zlib
 
@@ -45,9 +46,18 @@ def view(tmp_path_factory, vehicles_folder):
     return path
 
 
+def over_time(window):
+    """The group of figures over the log's time, of one flight; axes say what they are of."""
+    groups = window.value("[...heliCharts.groups.keys()]")
+    [group] = [g for g in groups if g.startswith("time in the log [s], ")]
+    label = "heliCharts.groups.get({}).some(u => u.axes[0].label === 'time in the log [s]')"
+    assert window.value(label.format(json.dumps(group)))
+    return group
+
+
 def scales(window, group, k=0):
     return window.value(
-        f"(({{min, max}}) => [min, max])(heliCharts.groups.get('{group}')[{k}].scales.x)"
+        f"(({{min, max}}) => [min, max])(heliCharts.groups.get({json.dumps(group)})[{k}].scales.x)"
     )
 
 
@@ -93,14 +103,15 @@ def test_nothing_overlaps_and_nothing_fails(window, report, view, width, dark):
 def test_zoom_and_hover_move_all_time_histories_together(window, report):
     window.size(1200)
     window.open(report)
-    group, first = "time [s]", "heliCharts.groups.get('time [s]')[0]"
+    group = over_time(window)
+    first = f"heliCharts.groups.get({json.dumps(group)})[0]"
     low, high = scales(window, group)
     drag(window, first, 0.25, 0.5)
     window.until(f"{first}.scales.x.max < {high - 1}")
     zoomed = scales(window, group)
     quarter = np.array([0.75 * low + 0.25 * high, 0.5 * (low + high)])
     assert zoomed == pytest.approx(quarter, abs=0.02 * (high - low))
-    for k in range(window.value(f"heliCharts.groups.get('{group}').length")):
+    for k in range(window.value(f"heliCharts.groups.get({json.dumps(group)}).length")):
         assert scales(window, group, k) == pytest.approx(zoomed, abs=0.03 * (high - low))
     # A hover says the measured value, in the table below the panel.
     x, y = window.value(
@@ -111,7 +122,9 @@ def test_zoom_and_hover_move_all_time_histories_together(window, report):
     measured = float(re.search(r"measured:?\s*([−\d.]+) rad", legend)[1].replace("−", "-"))
     k = window.value(f"{first}.cursor.idx")
     assert measured == pytest.approx(window.value(f"{first}.data[1][{k}]"), abs=1e-4)
-    others = window.value(f"heliCharts.groups.get('{group}').map(u => u.cursor.left >= 0)")
+    others = window.value(
+        f"heliCharts.groups.get({json.dumps(group)}).map(u => u.cursor.left >= 0)"
+    )
     assert all(others)
     assert not window.problems
 
@@ -119,7 +132,7 @@ def test_zoom_and_hover_move_all_time_histories_together(window, report):
 def test_charts_answer_to_keys(window, report):
     window.size(1200)
     window.open(report)
-    group = "time [s]"
+    group = over_time(window)
     low, high = scales(window, group)
     window.value("document.querySelector('.live').focus()")
     window.press("+")
@@ -157,6 +170,13 @@ def test_a_flight_plays_and_pauses_by_keys_and_shares_its_time(window, view):
     window.size(1200)
     window.open(view)
     window.value("document.querySelector('[data-role=speed]').value = '10'")
+    # Where nothing has the focus as well: the page says that space plays, and shall not scroll.
+    window.value("document.activeElement.blur()")
+    window.press(" ")
+    window.until("heliFlights[0].time > 0 && heliFlights[0].playing")
+    window.press(" ")
+    assert window.value("heliFlights[0].playing") == 0
+    assert window.value("scrollY") == 0
     window.value("document.querySelector('canvas').focus()")
     window.press(" ")
     window.until("heliFlights[0].time > 1 && heliFlights[0].playing")

@@ -64,8 +64,13 @@ def test_a_directory_with_all_that_is_promised(write, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["status"]["ok"] == 6
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(list((out / "figures").glob("*.png")))
-    assert "6 elements of roll-on-stand: 6 ok." in page
-    assert "http" not in page
+    assert "6 elements of roll-on-stand: 6 ok" in page
+    # As every page: what made it, its files, and words for who does not see the figures.
+    assert "How this was made" in page
+    assert '<a href="config.yaml">' in page
+    assert "rms against each axis: dots" in page
+    assert f"report: {out / 'report.html'}" in shown.out
+    assert "://" not in page  # nothing but the page itself
     found = opened(out)
     np.testing.assert_allclose(found["Ixx"], np.linspace(0.02, 0.05, 6))
     assert yaml.safe_load(found.attrs["configuration"])["sweep"]["design"] == "grid"

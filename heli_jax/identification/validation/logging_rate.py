@@ -20,6 +20,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.finding import Finding, Severity
 from heli_jax.identification.validation.operating_point import operating_point
+from heli_jax.numbers import number
 
 HOPELESS, ENOUGH = 2.0, 5.0
 """samples in a period of a mode: below the first it is not seen, above the second it is"""
@@ -170,18 +171,19 @@ def _of_outputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> l
 def _judged(begun: str, ratio: float, hz: float, hopeless: float = HOPELESS) -> Finding:
     criterion = f"samples in a period of the fastest mode that shows, {ENOUGH:g} ({hopeless:g})"
     severity: Severity = "ok"
-    ending = f": {ratio:.2g} samples in a period are enough."
+    ending = f": {number(ratio, 2)} samples in a period are enough."
     if ratio < hopeless:
         severity = "refuse"
         ending = (
-            f": {ratio:.2g} samples in a period cannot show it, so this log cannot be fitted with "
-            f"this model; log at {hopeless * hz:.3g} Hz at least, better {ENOUGH * hz:.3g} Hz."
+            f": {number(ratio, 2)} samples in a period cannot show it, so this log cannot be "
+            f"fitted with this model; log at {hopeless * hz:.3g} Hz at least, "
+            f"better {ENOUGH * hz:.3g} Hz."
         )
     elif ratio < ENOUGH:
         severity = "doubt"
         ending = (
-            f": {ratio:.2g} samples in a period hardly show it, and what happened between them "
-            f"biases the estimates; log at {ENOUGH * hz:.3g} Hz."
+            f": {number(ratio, 2)} samples in a period hardly show it, and what happened "
+            f"between them biases the estimates; log at {ENOUGH * hz:.3g} Hz."
         )
     return Finding("logging rate", severity, f"{begun}{ending}", ratio, criterion)
 

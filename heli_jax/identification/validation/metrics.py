@@ -159,7 +159,7 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
     """
     residual = sequence(residual)
     n = int(np.count_nonzero(~np.isnan(residual)))
-    r, pairs, whole = _seen_autocorrelation(residual)
+    _, r, pairs, whole = seen_autocorrelation(residual)
     lags = r.size
     # Of the squared autocorrelation at a lag white noise expects one over the pairs seen there.
     q = (n + 2) / max(n, 1) * np.cumsum(r**2 * pairs)
@@ -169,14 +169,22 @@ def whiteness(residual: np.ndarray, together: int = 1) -> Whiteness:
     p_short = scipy.special.chdtrc(short, q[short - 1])
     # Bonferroni again, for two tests of each signal.
     p = min(1.0, 2.0 * together * min(p_all, p_short))
-    outside = float(np.mean(np.abs(r) * whole > BAND99 * np.sqrt(whole / pairs)))
+    outside = float(np.mean(np.abs(r) * whole > band99(pairs, whole)))
     return Whiteness(bool(p > 0.01), float(p), lags, outside, float(r[0] * whole[0]))
 
 
-def _seen_autocorrelation(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Autocorrelation over the pairs of samples that are seen, the number of these, and the part of
-    the record that a lag leaves, each (lags,), at the shortest lags at which enough are seen; at
-    all of them where nothing is missing."""
+def band99(pairs: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Where 99 % of white noise's autocorrelations lie (lags,), as `seen_autocorrelation` counts
+    them times the part of the record that a lag leaves."""
+    return BAND99 * np.sqrt(whole / pairs)
+
+
+def seen_autocorrelation(
+    residual: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Lags in samples, autocorrelation over the pairs of samples that are seen, the number of
+    these, and the part of the record that a lag leaves, each (lags,), at the shortest lags at which
+    enough are seen; at all of them where nothing is missing."""
     seen = ~np.isnan(residual)
     r = _centred(residual)
     n, count = r.size, int(seen.sum())
@@ -193,5 +201,5 @@ def _seen_autocorrelation(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     # the division by them would blow up.
     at = at[pairs[at] >= min(0.1 * count, 0.75 * n)][: lags_for(count)]
     if at.size == 0 or not c[0] > 0:
-        return np.zeros(1), np.ones(1), np.ones(1)
-    return c[at] / c[0] * count / pairs[at], pairs[at], 1.0 - at / n
+        return np.ones(1, int), np.zeros(1), np.ones(1), np.ones(1)
+    return at, c[at] / c[0] * count / pairs[at], pairs[at], 1.0 - at / n

@@ -39,7 +39,9 @@
   // The numbers of an axis; all with one power of ten.
   function ticks(splits) {
     const size = Math.max(...splits.map(v => Math.abs(v ?? 0))), power = Math.floor(Math.log10(size || 1));
-    if (power < -3 || power > 5) return splits.map(v => v == null ? null : powered(v, power, 4));
+    // Zoomed in on a small part of a large number the last digits are those that differ.
+    const step = Math.abs(splits.at(-1) - splits[0]) || size, digits = Math.max(4, 2 + power - Math.floor(Math.log10(step || 1)));
+    if (power < -3 || power > 5) return splits.map(v => v == null ? null : powered(v, power, Math.min(digits, 12)));
     return splits.map(v => v == null ? null : String(+v.toFixed(8)).replace("-", "−"));
   }
 
@@ -85,7 +87,7 @@
       if (v == null) return "–";
       const si = text(v, span) + (unit ? ` ${unit}` : "");
       const l = panel.logged;
-      return l ? `${si} = ${text(v * l[2], span * Math.abs(l[2]))} ${l[1]}` : si;
+      return l ? `${si} = ${text(v * l[2] + l[3], span * Math.abs(l[2]))} ${l[1]}` : si;
     };
     panel.series.forEach((s, k) => {
       const at = list.length, points = s.kind === "points" || s.kind === "bars";
@@ -161,17 +163,18 @@
       const [first, last] = chart.xLimits, hair = 1e-9 * (last - first);
       const whole = u.scales.x.min <= first + hair && u.scales.x.max >= last - hair;
       if (whole || low == null) return panel.limits;
-      const margin = 0.06 * (high - low) || 0.05 * Math.abs(high) || 1;
+      // What stands still is shown with room for ticks of its own size, and not from -1 to 1.
+      const margin = 0.06 * (high - low) || 0.1 * (panel.limits[1] - panel.limits[0]) || 1;
       return [low - margin, high + margin];
     };
     const axis = { stroke: () => style("--ink"), grid: { stroke: () => style("--grid"), width: 1 },
       ticks: { stroke: () => style("--grid"), size: 4 }, font: "12px system-ui, sans-serif" };
     const u = new uPlot({
-      width: Math.max(260, place.clientWidth), height: panel.height + (last ? 34 : 10),
+      width: Math.max(260, place.clientWidth), height: panel.height + (last ? 52 : 10),
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
       scales: { x: { time: false, distr: chart.log ? 3 : 1, range: (u, low, high) => low === x0 && high === x1 ? chart.xLimits : [low, high] }, y: { range } },
-      axes: [{ ...axis, size: last ? 30 : 6, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
-        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: 62, space: 16, values: (u, splits) => ticks(splits) }],
+      axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.xLabel : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
+        values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 16, values: (u, splits) => ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },
       cursor: { sync: { key: chart.group, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, dataIdx: near, focus: { prox: -1 }, points: { size: 6 } },
       hooks: {
@@ -263,8 +266,8 @@
     const chart = numbers.charts[+figure.dataset.chart];
     // Of a figure without any line the image says as much.
     if (!chart.panels.some(p => p.series.length)) return;
-    // Figures over the same quantity move together.
-    chart.group = chart.xLabel || "x";
+    // Figures over the same quantity move together; over time those of one flight.
+    chart.group = (chart.xLabel || "x") + (chart.of ? `, ${chart.of}` : "");
     const box = document.createElement("div");
     box.className = "live";
     box.tabIndex = 0;

@@ -79,6 +79,14 @@
       this.show(this.time, true);
     }
 
+    // Space where nothing has the focus: the page would scroll, and says that space plays.
+    keyOfPage(event) {
+      const idle = !document.activeElement || document.activeElement === document.body;
+      if (event.key !== " " || !idle || event.ctrlKey || event.metaKey || event.altKey || event.shiftKey) return;
+      this.toggle();
+      event.preventDefault();
+    }
+
     key(event) {
       const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
       if (turn) this.turn(...turn);
@@ -283,6 +291,11 @@
   const flights = [...document.querySelectorAll(".flight[data-scene]")].map(box => {
     for (const hidden of box.querySelectorAll("[hidden]")) hidden.hidden = false;
     return new Flight(box, numbers.scenes[+box.dataset.scene]);
+  });
+  // Of several the one in view.
+  document.addEventListener("keydown", event => {
+    const seen = flights.find(f => f.canvas.getBoundingClientRect().bottom > 0) ?? flights.at(-1);
+    seen?.keyOfPage(event);
   });
   listen((chart, time) => {
     if (chart.xLabel !== TIME) return;

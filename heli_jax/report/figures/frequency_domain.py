@@ -121,7 +121,7 @@ def _draw_fit(
     H = continuous(omega) * frequency.nuisance_factor(flight.fit, input, omega)
     held = sampled(below) * frequency.nuisance_factor(flight.fit, input, below)
     reference = _Reference(omega, H)
-    _curve(axes, reference, omega, H, color=style.BLUE, lw=0.7, alpha=0.55, label=_CONTINUOUS)
+    _curve(axes, reference, omega, H, color=style.SKY, lw=1.0, label=_CONTINUOUS)
     _curve(axes, reference, below, held, color=style.BLUE, lw=1.6, label="fit, sampled")
     return reference
 

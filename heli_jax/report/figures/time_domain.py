@@ -31,7 +31,7 @@ def response(
     axes = panels(figure, 4.0 + 0.8 * len(inputs), [2.4, 1.0, *[0.8] * len(inputs)])
     unit = naming.unit(model.Outputs, output)
     top, below, *rest = axes
-    t = signals.times
+    t = signals.log_times
     # The measured line is the wider and lies behind, so that it still shows as a rim where the
     # simulation covers it.
     samples(top, t, signals.measured[output], color=style.PALE, lw=1.9, label="measured")
@@ -46,10 +46,17 @@ def response(
     for ax, name in zip(rest, inputs, strict=True):
         line(ax, t, signals.inputs[name], color=style.BLACK, lw=0.8, drawstyle="steps-post")
         ax.set_ylabel(label(name, naming.unit(model.Inputs, name)))
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel(time_label(signals.log_start))
+    # Only panels of one flight share cursor and zoom: those of two have no moment in common.
+    axes[0].figure.set_label(signals.flight)
     # A record of one sample has no duration, and matplotlib warns of an axis without length.
     top.set_xlim(t[0], t[-1] if t.size > 1 else t[0] + 1.0)
     return axes
+
+
+def time_label(log_start: float | None) -> str:
+    """Of an axis: time in the log where the flight has one, else from its first sample."""
+    return "time [s]" if log_start is None else "time in the log [s]"
 
 
 def _agreement(signals: Signals, output: str) -> str:
@@ -60,10 +67,19 @@ def _agreement(signals: Signals, output: str) -> str:
     return f"{output}, {signals.flight}: {source}{vaf}"
 
 
-def rls_history(baseline: Baseline, *, figure: Figure | None = None) -> Panels:
-    """Every coefficient of the recursive least squares over time, the a's above the b's."""
+def rls_history(
+    baseline: Baseline, *, log_start: float | None = None, figure: Figure | None = None
+) -> Panels:
+    """Every coefficient of the recursive least squares over time, the a's above the b's.
+
+    Args:
+        baseline: the recursive least squares.
+        log_start: time in the log of its flight's first sample [s], where there is a log.
+        figure: to draw on; a new one where None.
+    """
     n, history = baseline.order, baseline.history
-    t = baseline.dt * np.arange(history.shape[0])
+    begin = log_start or 0.0
+    t = begin + baseline.dt * np.arange(history.shape[0])
     # The right margin holds the legends, which have a line for each of up to n + 1 coefficients.
     axes = panels(figure, 4.4, [1.0, 1.0], right=0.75)
     groups = (
@@ -79,8 +95,9 @@ def rls_history(baseline: Baseline, *, figure: Figure | None = None) -> Panels:
     axes[0].set_ylabel("-a")
     # b_i is output over input in SI, and each has the same unit; the a's are plain numbers.
     axes[1].set_ylabel("b (SI)")
-    axes[1].set_xlabel("time [s]")
-    axes[0].set_xlim(0.0, max(t[-1], baseline.dt))
+    axes[1].set_xlabel(time_label(log_start))
+    axes[0].figure.set_label(baseline.flight)
+    axes[0].set_xlim(begin, max(t[-1], begin + baseline.dt))
     return axes
 
 

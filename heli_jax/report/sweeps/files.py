@@ -36,7 +36,7 @@ def write_figures(directory: Path, ds: xr.Dataset, worst: Mapping[str, np.ndarra
     # One table for all figures: each column is read and sorted once.
     table = Table(ds, worst.values())
     draw: dict[str, Callable[[], Figure | None]] = {}
-    for result, stem in _stems(table.results[:RESULTS]).items():
+    for result, stem in stems(table.results[:RESULTS]).items():
         draw[f"slices-{stem}"] = functools.partial(draw_slices, table, result)
         draw[f"maps-{stem}"] = functools.partial(draw_maps, table, result)
     draw["corner"] = functools.partial(draw_corner, table)
@@ -53,7 +53,7 @@ def write_figures(directory: Path, ds: xr.Dataset, worst: Mapping[str, np.ndarra
     return written
 
 
-def _stems(names: Sequence[str]) -> dict[str, str]:
+def stems(names: Sequence[str]) -> dict[str, str]:
     """A different file name for each name, on file systems that fold case too."""
     stems: dict[str, str] = {}
     taken: set[str] = set()

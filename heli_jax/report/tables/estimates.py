@@ -51,7 +51,7 @@ def _estimate(name: str, e: Estimate) -> tuple[str, ...]:
     start, share = number(e.start, 5), percent(e.prior_share, 0)
     bound = "yes" if e.at_bound else "no"
     # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
-    if e.sd is None or e.lower95 is None or e.upper95 is None:
+    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
         return (name, NOT_DETERMINED, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
     value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
     interval = f"{low} to {high}"
@@ -78,7 +78,9 @@ def nuisances(fit: Fit) -> Nuisances:
 
 
 def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
-    if e.sd is None or e.lower95 is None or e.upper95 is None:
+    # An interval without an end says that nothing is known, and a number beside it that something
+    # is.
+    if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
         return (name, NOT_DETERMINED, NOTHING, NOTHING, pretty(e.unit))
     value, low, high, sd = measured(e.sd, e.value, e.lower95, e.upper95)
     return (name, value, sd, f"{low} to {high}", pretty(e.unit))

@@ -38,6 +38,9 @@ def origins(fit: Fit, problem: Problem) -> list[Origin]:
         if flight.source:
             start, end = flight.window
             rows.append(("window", f"{start:.6g} s to {end:.6g} s from the log's beginning"))
+            # An autopilot's clock rarely begins at zero: by this a moment is found in the raw log.
+            first = f"{flight.source.first_time:.15g} s of the log's own clock"
+            rows.append(("log's beginning", first))
         if flight.known:
             values = ", ".join(f"{n} = {number(v, 6)}" for n, v in flight.known.items())
             rows.append(("differs in", values))

@@ -1,0 +1,143 @@
+"""What all pages share: log time, numbers that can be read, one number for one thing."""
+
+import csv
+import math
+import types
+
+import numpy as np
+import pytest
+
+from heli_jax import compare_runs, models
+from heli_jax.flights.flight import Signal
+from heli_jax.identification.result import Signals
+from heli_jax.identification.validation.metrics import whiteness
+from heli_jax.numbers import percent, relative
+from heli_jax.report import compared_page, drawings, figures
+from heli_jax.report.charts import chart_of
+from heli_jax.report.embedded import Logged, Numbers
+from heli_jax.report.files import write_signals
+from heli_jax.report.saved_fit import load_fit
+from heli_jax.report.tables import estimates
+from tests.report.test_compared_runs import write_run
+
+
+def part(name, start, n=300):
+    """A part of a log that begins `start` seconds into it."""
+    rng = np.random.default_rng(0)
+    t = 0.02 * np.arange(n)
+    y = rng.standard_normal(n)
+    u = {"x_roll": np.sign(np.sin(t))}
+    return Signals(name, False, t, u, {"roll": y}, {"roll": 0.0 * y}, log_start=start)
+
+
+def test_the_time_of_the_log_is_kept_in_the_table_and_read_back(tmp_path):
+    folder = write_run(tmp_path / "run", {"Ixx": (0.02, 0.001)}, metrics={"roll": {}})
+    write_signals(folder / "signals.csv", (part("part 1", 0.0), part("part 2", 42.0001)))
+    rows = list(csv.DictReader((folder / "signals.csv").read_text().splitlines()))
+    second = [row for row in rows if row["flight"] == "part 2"]
+    assert (float(second[0]["time"]), float(second[0]["log_time"])) == (0.0, 42.0001)
+    assert float(second[-1]["log_time"]) == pytest.approx(42.0001 + 299 * 0.02, abs=1e-12)
+    # A time is no input of the model.
+    assert list(second[0])[:4] == ["flight", "time", "log_time", "x_roll"]
+
+
+def test_a_saved_run_has_the_time_of_its_log(tmp_path):
+    folder = write_run(tmp_path / "run", {"Ixx": (0.02, 0.001)})
+    of_p = part("flight 1", 42.0)._replace(
+        measured={"p": np.ones(300)}, simulated={"p": np.ones(300)}
+    )
+    write_signals(folder / "signals.csv", (of_p,))
+    [signals] = load_fit(folder).signals
+    assert signals.log_start == pytest.approx(42.0)
+    assert list(signals.inputs) == ["x_roll"]
+    # Of an earlier version, whose tables had no such column.
+    [older] = load_fit(write_run(tmp_path / "old", {"Ixx": (0.02, 0.001)})).signals
+    assert older.log_start is None
+
+
+def test_figures_over_time_are_in_log_time_and_two_parts_share_no_cursor():
+    charts = [
+        chart_of(figures.response(part(n, s), "roll", models.roll_on_stand)[0].figure)
+        for n, s in (("part 1", 0.0), ("part 2", 42.0))
+    ]
+    assert [c.x_label for c in charts] == ["time in the log [s]"] * 2
+    assert charts[1].x_limits == pytest.approx((42.0, 42.0 + 299 * 0.02))
+    assert charts[1].panels[0].series[0].x[0] == 42.0
+    assert charts[0].of != charts[1].of
+
+
+def test_card_and_figure_give_one_number_where_samples_are_missing():
+    signals = part("one", 0.0)
+    signals.measured["roll"][100:160] = np.nan
+    test = whiteness(signals.measured["roll"])
+    ax = figures.residual_correlation(signals, "roll", test=test)[0]
+    chart = chart_of(ax.figure)
+    assert f"{percent(test.outside, 1)} of {test.lags} lags" in chart.note
+    # The stems that are drawn outside the band are those that the number counts.
+    inside, outside = (np.isfinite(line.get_ydata()).sum() / 2 for line in ax.get_lines()[:2])
+    assert outside / (inside + outside) == pytest.approx(test.outside)
+
+
+def test_shares_of_what_diverges_have_powers():
+    assert percent(-3.8919864e30) == "−3.89·10³² %"
+    assert percent(0.98765) == "98.77 %"
+    assert percent(-45.1) == "−4510.00 %"
+    assert relative(1e9, 1.0) == "1·10¹¹ %"
+
+
+def test_an_interval_without_ends_is_not_determined():
+    unknown = types.SimpleNamespace(
+        value=8.9e-4, sd=math.inf, lower95=-math.inf, upper95=math.inf, unit="rad"
+    )
+    table = estimates.nuisances(types.SimpleNamespace(nuisance={"bias roll": unknown}))
+    assert table.shown.rows == [("bias roll", "not determined", "–", "–", "rad")]
+
+
+def test_a_pulse_width_is_shown_as_logged_beside_si():
+    pwm = Signal("aileron_pwm", "m", "m", offset=1496.0, scale=6e-9, invert=True)
+    as_logged = drawings.as_logged(pwm)
+    assert as_logged is not None
+    x = 6e-9 * (1496.0 - 1436.0)  # the log's 1436, inverted
+    assert x * as_logged.factor + as_logged.offset == pytest.approx(1436.0)
+    assert as_logged.unit == "aileron_pwm"
+    assert drawings.as_logged(Signal("roll", "rad", "rad")) is None
+    degrees = drawings.as_logged(Signal("roll", "deg", "rad"))
+    assert degrees == ("deg", pytest.approx(180.0 / math.pi), 0.0)
+    # On the page: SI, the log's name, factor and offset.
+    numbers = Numbers()
+    chart = chart_of(figures.response(part("one", 0.0), "roll", models.roll_on_stand)[0].figure)
+    numbers.add_chart(chart, {"x_roll": Logged("aileron_pwm", -1.0 / 6e-9, 1496.0)})
+    panels = numbers.content()["charts"][0]["panels"]
+    assert panels[-1]["logged"] == ["m", "aileron_pwm", -1.0 / 6e-9, 1496.0]
+
+
+def test_runs_side_by_side_have_files_configurations_and_bode_diagrams(tmp_path):
+    rng = np.random.default_rng(0)
+    u, held = rng.standard_normal(4000), part("flight 1", 7.0, 4000)
+    for name, gain in (("a", 1.0), ("b", 2.0)):
+        folder = write_run(tmp_path / name, {"Ixx": (2.0e-5, 1e-6)})
+        (folder / "config.yaml").write_text(f"model: <{name}>\n")
+        y = np.convolve(u, [0.5, 0.3, 0.2])[:4000]
+        run = held._replace(inputs={"lat": u}, measured={"p": y}, simulated={"p": gain * y})
+        write_signals(folder / "signals.csv", (run,))
+    third = write_run(tmp_path / "c", {"Ixx": (2.0e-5, 1e-6)})
+    text = (third / "signals.csv").read_text().replace("flight 1", "other")
+    (third / "signals.csv").write_text(text)
+    compared = compare_runs([tmp_path / n for n in "abc"])
+    page = tmp_path / "pages" / "out.html"
+    page.parent.mkdir()
+    compared_page.write_page(page, compared)
+    html = page.read_text()
+    assert '<a href="../a/fit.json">fit.json</a>' in html
+    assert "model: &lt;b&gt;" in html
+    assert "Not drawn: c (no p in a flight named flight 1)." in html
+    assert "lat to p, flight 1" in html
+    assert "2.00·10⁻⁵ ± 0.10·10⁻⁵" in html
+    assert "kg m²" in html
+    # Twice the gain is 6.02 dB at every frequency.
+    found = [(n, r.signals[0]) for n, r in zip("ab", compared.runs, strict=False)]
+    figure = compared_page.bode_overlay(found, "flight 1", "p", "lat")
+    assert figure is not None
+    measured, one, two = (line.get_ydata() for line in figure.axes[0].get_lines())
+    np.testing.assert_allclose(two - one, 20.0 * np.log10(2.0), atol=1e-6)
+    np.testing.assert_allclose(one, measured, atol=1e-6)
