@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 import scipy.stats
 
-from heli_jax import models
+from heli_jax import linear_model, models
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import innovations
@@ -164,3 +164,53 @@ def test_an_option_of_simulations_alone_is_refused(bench30, options, message):
     inputs = model.Inputs(x_roll=jnp.asarray(u))
     with pytest.raises(TypeError, match=message):
         innovations(model, params, inputs, y, SD, **options)
+
+
+YAW = """name: yaw
+states: {psi: {unit: rad}, r: {unit: rad/s}}
+inputs: {ped: '1'}
+outputs: {psi: rad, r: rad/s}
+parameters: {Nr: {value: 0.8, unit: 1/s}, Nped: {value: 6.0, unit: 1/s^2}}
+A: {psi: {r: 1}, r: {r: Nr}}
+B: {r: {ped: Nped}}
+axes: {yaw: {rate: r, angle: psi, stick: ped}}
+"""
+
+
+def joint_filter(y, u, Nr, Nped, sigma, tau, sd):
+    """-log-likelihood but for a constant: both outputs corrected together, P made symmetric."""
+    A = np.array([[0, 1, 0], [0, Nr, 1], [0, 0, -1 / tau]])
+    B, Q = np.array([[0.0], [Nped], [0.0]]), np.diag([0, 0, 2 * sigma**2 / tau])
+    held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, 4))]]) * DT)
+    loan = scipy.linalg.expm(np.block([[-A, Q], [np.zeros((3, 3)), A.T]]) * DT)
+    Ad, Bd = held[:3, :3], held[:3, 3]
+    added, C, R = Ad @ loan[:3, 3:], np.eye(2, 3), np.diag(np.square(sd))
+    x, P, total = np.zeros(3), np.diag([0, 0, sigma**2]), 0.0
+    for yk, uk in zip(y, u, strict=True):
+        e, S = yk - C @ x, C @ P @ C.T + R
+        total += 0.5 * (e @ np.linalg.solve(S, e) + np.log(np.linalg.det(S)))
+        K = P @ C.T @ np.linalg.inv(S)
+        x, P = Ad @ (x + K @ e) + Bd * uk, Ad @ (P - K @ C @ P) @ Ad.T + added
+        P = 0.5 * (P + P.T)
+    return total
+
+
+@pytest.mark.parametrize("Nr", [-0.5, 0.5, 0.8, 2.0])
+def test_an_unstable_machine_over_a_long_record(tmp_path, Nr):
+    # exp(2.0 * 60 s) is 1e52: what rounding leaves that no correction sees grows by that.
+    (tmp_path / "yaw.yaml").write_text(YAW)
+    model = with_disturbance(linear_model(tmp_path / "yaw.yaml").model, "yaw", 1)
+    params = model.Params(Nr=Nr, Nped=6.0, sigma_w=0.35, tau_w=1.0)
+    params = jax.tree.map(jnp.asarray, params)
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal(3000) * 0.1, rng.standard_normal((3000, 2)) * 0.02
+    sd = {"psi": 0.009, "r": 0.017}
+    inputs, measured = model.Inputs(ped=jnp.asarray(u)), {"psi": y[:, 0], "r": y[:, 1]}
+    measured = {n: jnp.asarray(v) for n, v in measured.items()}
+    found = innovations(model, params, inputs, measured, sd, dt=DT)
+    total = sum(
+        0.5 * float(jnp.sum(e**2 / found.variance[n] + jnp.log(found.variance[n])))
+        for n, e in found.error.items()
+    )
+    wanted = joint_filter(y, u, Nr, 6.0, 0.35, 1.0, (0.009, 0.017))
+    assert total == pytest.approx(wanted, rel=1e-8)

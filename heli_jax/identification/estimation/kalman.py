@@ -190,8 +190,10 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
             variances.append(jnp.where(seen, s, jnp.nan))
         x = _sum(Ad[:, i] * x[i] for i in range(n)) + w
         M = once([_sum(P[k] * a[i][k] for k in range(n)) for i in range(n)])
-        P = [_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)]
-        return (x, P), (errors, variances)
+        P = jnp.stack([_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)])
+        # Symmetric by force: a correction takes nothing of what rounding leaves between P and its
+        # transpose, which an unstable mode would then blow up by its growth over the whole record.
+        return (x, list(0.5 * (P + P.T))), (errors, variances)
 
     samples = (list((y - system.feed).T), system.drive)
     _, (e, s) = jax.lax.scan(step, (x0, list(P0)), samples)
