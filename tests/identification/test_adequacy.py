@@ -50,7 +50,7 @@ SLOW = scipy.signal.lfilter([1.0], [1.0, -0.98], rng.standard_normal(N))
 SLOW /= SLOW.std()
 
 
-def judged(measured, simulated, *, model=own, against=None, **how):
+def judged(measured, simulated, *, model=own, against=None, ahead=None, **how):
     if model is own:
         params, free, inputs, name = Params(-2.0, 5.0), {"Lp": Free(-2.0)}, {"d": D}, "p"
     else:
@@ -66,7 +66,7 @@ def judged(measured, simulated, *, model=own, against=None, **how):
     white = {f"flight 1/{name}": whiteness(measured - simulated)}
     against = None if against is None else {name: against}
     agreement = {name: metrics(measured, simulated)}
-    return assess(problem, params, Evidence((record,), agreement, white, against))
+    return assess(problem, params, Evidence((record,), agreement, white, against, ahead=ahead))
 
 
 def test_white_residuals_are_adequate_whatever_is_explained():
@@ -136,6 +136,18 @@ def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
 
 
 @pytest.mark.slow
+def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
+    good = judged(P + 0.05 * WHITE, P, against=1.0, ahead=2.0)
+    assert good.adequate
+    assert good.summary == "yes"
+    assert good.ahead == 2.0
+    assert "predictions up to 2 s ahead" in good.sentences[0]
+    assert not any("Driven by the inputs alone" in sentence for sentence in good.sentences)
+    bad = judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0)
+    assert not bad.adequate
+    assert "predicted up to 2 s ahead misses" in bad.reasons[0]
+
+
 def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     model, _, start, flight = made(bench30, 3)
     right = fit(Problem(model, start, [flight], FREE, method="filter-error"))
