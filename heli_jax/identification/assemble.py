@@ -44,6 +44,7 @@ from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     feedback_trust_notes,
     held_upright,
+    known_no_gusts,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import by_excitation
@@ -220,6 +221,7 @@ def assemble(
         held_upright=stays,
         weak_instrument=weak,
         instruments=instruments,
+        disturbed_loop=not all_white and known_no_gusts(problem, found),
         seed=run.seed,
         timing=run.timing,
     )
