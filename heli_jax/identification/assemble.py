@@ -24,6 +24,7 @@ from heli_jax.identification.estimation.frequency_instrument import instruments_
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum, measured_count
 from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
@@ -37,12 +38,13 @@ from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unp
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
-from heli_jax.identification.validation.advice import Record
+from heli_jax.identification.validation.advice import Record, is_unstable
 from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     feedback_trust_notes,
     held_upright,
+    known_no_gusts,
     moved_by_feedback,
 )
 from heli_jax.identification.validation.excitation_test import by_excitation
@@ -54,7 +56,7 @@ from heli_jax.identification.validation.feedback import (
 )
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
-from heli_jax.identification.validation.metrics import Whiteness
+from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
@@ -172,11 +174,12 @@ def assemble(
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     instruments = _instruments(problem, by_instrument, responses)
     in_time = (problem, params, signals, white, against, layout.determined)
+    ahead = against is not None and is_unstable(problem, params)
     pooled = pooled_metrics(signals)
     adequacy = (
         by_responses(responses, pooled)
         or by_excitation(problem, solution, pooled)
-        or _adequacy(*in_time)
+        or (_ahead(problem, params, solution, white) if ahead else _adequacy(*in_time))
     )
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
@@ -225,6 +228,7 @@ def assemble(
         held_upright=stays,
         weak_instrument=weak,
         instruments=instruments,
+        disturbed_loop=not all_white and known_no_gusts(problem, found),
         seed=run.seed,
         timing=run.timing,
     )
@@ -310,6 +314,29 @@ def _absent(estimate: Estimate, *, gone: bool) -> Estimate:
     # Its size is then zero, at its bound; its correlation time means nothing.
     value = 0.0 if gone else estimate.value
     return estimate._replace(value=value, sd=None, lower95=None, upper95=None, at_bound=gone)
+
+
+def _ahead(problem: Problem, params: Any, at: Solution, white: dict[str, Whiteness]) -> Adequacy:
+    """Of an unstable model under filter error, whose simulation says nothing over a whole record:
+    by what is predicted some seconds ahead."""
+    records, error, expected = [], {}, {}
+    for label, flight, found in zip(
+        labels(problem.training), problem.training, predictions_ahead(at), strict=True
+    ):
+        records.append(Record(label, flight.dt, flight.outputs, found.predicted))
+        for n, v in found.predicted.items():
+            missed = float(np.nansum(np.square(flight.outputs[n] - v)))
+            error[n] = error.get(n, 0.0) + missed
+            expected[n] = expected.get(n, 0.0) + float(np.nansum(found.variance[n]))
+    agreement = {}
+    for n in error:
+        both = [(r.measured[n], r.simulated[n]) for r in records if n in r.measured]
+        measured, predicted = (np.concatenate(v) for v in zip(*both, strict=True))
+        agreement[n] = metrics(measured, predicted)
+    against = {n: error[n] / expected[n] if expected[n] > 0 else np.inf for n in error}
+    return assess(
+        problem, params, Evidence(tuple(records), agreement, white, against, ahead=SECONDS)
+    )
 
 
 def _adequacy(

@@ -161,6 +161,9 @@ class Fit:
     closes a loop even where no input was found to follow the response"""
     instruments: tuple[str, ...] = ()
     """the inputs that were taken by their instrument"""
+    disturbed_loop: bool = False
+    """in time without process noise: whether inputs follow the response and the residuals are not
+    white, so that a disturbance comes back through the inputs"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
@@ -175,6 +178,9 @@ class Fit:
     def untrusted(self) -> tuple[str, ...]:
         """The parameters that feedback may have biased, or of which the instruments say too
         little."""
+        if self.disturbed_loop:
+            # Nothing tells which of them: a disturbance in the inputs moves all.
+            return tuple(self.estimates)
         loop = Loop(self.feedback, self.instruments, self.held_upright)
         doubted = (*untrusted(self.moved_by_feedback, loop), *self.weak_instrument)
         return tuple(n for n in self.estimates if n in doubted)
@@ -185,6 +191,8 @@ class Fit:
         if not self.untrusted or self.status == "not-converged":
             return ""
         why = "weak instrument" if self.weak_instrument else "closed loop without an instrument"
+        if self.disturbed_loop:
+            why = "the inputs follow the response, and the residuals are not white"
         return f"Not to be trusted: {', '.join(self.untrusted)} ({why})."
 
     @property

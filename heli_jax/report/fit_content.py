@@ -57,6 +57,7 @@ def residuals(fit: Fit) -> dict[str, Any]:
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
         "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
         "held_upright": fit.held_upright,
+        "disturbed_loop": fit.disturbed_loop,
         "untrusted": list(fit.untrusted),
     }
 

@@ -52,7 +52,7 @@ SLOW = scipy.signal.lfilter([1.0], [1.0, -0.98], rng.standard_normal(N))
 SLOW /= SLOW.std()
 
 
-def judged(measured, simulated, *, model=own, against=None, ahead=None, **how):
+def judged(measured, simulated, *, model=own, against=None, errors=None, ahead=None, **how):
     if model is own:
         params, free, inputs, name = Params(-2.0, 5.0), {"Lp": Free(-2.0)}, {"d": D}, "p"
     else:
@@ -68,8 +68,8 @@ def judged(measured, simulated, *, model=own, against=None, ahead=None, **how):
     white = {f"flight 1/{name}": whiteness(measured - simulated)}
     against = None if against is None else {name: against}
     agreement = {name: metrics(measured, simulated)}
-    ahead = () if ahead is None else ({name: ahead},)
-    evidence = Evidence((record,), agreement, white, against, innovations=ahead)
+    errors = () if errors is None else ({name: errors},)
+    evidence = Evidence((record,), agreement, white, against, innovations=errors, ahead=ahead)
     return assess(problem, params, evidence)
 
 
@@ -142,7 +142,7 @@ def test_with_a_disturbance_the_simulation_is_held_against_what_it_makes():
 def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_one_step_ahead_only():
     # A simulation that has nothing of the measured output in it, with a difference that is white.
     other = np.random.default_rng(9).standard_normal(N)
-    found = judged(WHITE, 0.9 * other, against=1.2, ahead=WHITE)
+    found = judged(WHITE, 0.9 * other, against=1.2, errors=WHITE)
     assert found.adequate
     assert not found.less_than_mean
     assert found.summary.startswith("one step ahead only (VAF of p, simulated, is -")
@@ -153,7 +153,7 @@ def test_filter_error_that_simulates_worse_than_the_mean_is_adequate_one_step_ah
 def test_a_filter_that_predicts_no_better_than_the_mean_explains_nothing(left, named):
     # `left`: the error of the prediction over white noise, of which nothing can be foretold.
     measured = WHITE - WHITE.mean()
-    found = judged(measured, 0.01 * np.roll(measured, 7), against=1.2, ahead=left * measured)
+    found = judged(measured, 0.01 * np.roll(measured, 7), against=1.2, errors=left * measured)
     assert found.adequate
     assert ("but nothing of p is explained" in found.summary) == named
 
@@ -161,12 +161,24 @@ def test_a_filter_that_predicts_no_better_than_the_mean_explains_nothing(left, n
 def test_a_filter_that_only_repeats_the_sample_before_explains_nothing():
     walk = np.cumsum(WHITE)
     for ahead, named in ((np.diff(walk, prepend=0.0), True), (0.3 * WHITE, False)):
-        found = judged(walk, np.zeros(N), against=1.2, ahead=ahead)
+        found = judged(walk, np.zeros(N), against=1.2, errors=ahead)
         assert ("nothing of p" in " ".join(found.sentences)) == (found.adequate and named)
         assert predicts_nothing([(walk, ahead)]) == named
 
 
 @pytest.mark.slow
+def test_an_unstable_machine_is_judged_by_what_is_predicted_ahead():
+    good = judged(P + 0.05 * WHITE, P, against=1.0, ahead=2.0)
+    assert good.adequate
+    assert good.summary == "yes"
+    assert good.ahead == 2.0
+    assert "predictions up to 2 s ahead" in good.sentences[0]
+    assert not any("Driven by the inputs alone" in sentence for sentence in good.sentences)
+    bad = judged(P + 5.0 * SLOW, P, against=20.0, ahead=2.0)
+    assert not bad.adequate
+    assert "predicted up to 2 s ahead misses" in bad.reasons[0]
+
+
 def test_filter_error_does_not_hide_an_input_of_the_wrong_sign(bench30):
     model, _, start, flight = made(bench30, 3)
     right = fit(Problem(model, start, [flight], FREE, method="filter-error"))

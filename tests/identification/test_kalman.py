@@ -10,12 +10,14 @@ import scipy.integrate
 import scipy.linalg
 import scipy.stats
 
-from heli_jax import models
+from heli_jax import linear_model, models, simulate
 from heli_jax.dynamics import kinematics
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.identification.estimation.kalman import innovations
+from heli_jax.identification.estimation.predictions_ahead import errors_ahead
 from heli_jax.naming import asdict, names, replace
+from heli_jax.simulation.options import SimulationOptions
 
 N, DT = 40, 0.02
 SD = {"roll": 2e-3, "roll_rate": 0.03}
@@ -119,8 +121,6 @@ def test_gradient_is_that_of_finite_differences(bench30, name):
 
 
 def test_without_a_disturbance_the_innovations_are_the_simulation_error(bench30):
-    from heli_jax import simulate
-
     model, params, u, y = case(bench30, 1, sigma_w=0.0)
     x0 = model.initial_state(params)
     inputs = model.Inputs(x_roll=jnp.asarray(u))
@@ -215,3 +215,81 @@ def test_explicit_steps_follow_the_moments_of_the_kinematics(hold):
     assert np.asarray(found.variance["theta"])[-1] - 1.0 == pytest.approx(
         P[1, 1] - P[0, 1] ** 2 / P[0, 0], rel=1e-6
     )
+
+
+YAW = """name: yaw
+states: {psi: {unit: rad}, r: {unit: rad/s}}
+inputs: {ped: '1'}
+outputs: {psi: rad, r: rad/s}
+parameters: {Nr: {value: 0.8, unit: 1/s}, Nped: {value: 6.0, unit: 1/s^2}}
+A: {psi: {r: 1}, r: {r: Nr}}
+B: {r: {ped: Nped}}
+axes: {yaw: {rate: r, angle: psi, stick: ped}}
+"""
+
+
+YAW_SD = {"psi": 0.009, "r": 0.017}
+
+
+def unstable_yaw(tmp_path, Nr):
+    (tmp_path / "yaw.yaml").write_text(YAW)
+    model = with_disturbance(linear_model(tmp_path / "yaw.yaml").model, "yaw", 1)
+    params = model.Params(Nr=Nr, Nped=6.0, sigma_w=0.35, tau_w=1.0)
+    return model, jax.tree.map(jnp.asarray, params)
+
+
+def joint_filter(y, u, Nr, Nped, sigma, tau, sd):
+    """-log-likelihood but for a constant: both outputs corrected together, P made symmetric."""
+    A = np.array([[0, 1, 0], [0, Nr, 1], [0, 0, -1 / tau]])
+    B, Q = np.array([[0.0], [Nped], [0.0]]), np.diag([0, 0, 2 * sigma**2 / tau])
+    held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, 4))]]) * DT)
+    loan = scipy.linalg.expm(np.block([[-A, Q], [np.zeros((3, 3)), A.T]]) * DT)
+    Ad, Bd = held[:3, :3], held[:3, 3]
+    added, C, R = Ad @ loan[:3, 3:], np.eye(2, 3), np.diag(np.square(sd))
+    x, P, total = np.zeros(3), np.diag([0, 0, sigma**2]), 0.0
+    for yk, uk in zip(y, u, strict=True):
+        e, S = yk - C @ x, C @ P @ C.T + R
+        total += 0.5 * (e @ np.linalg.solve(S, e) + np.log(np.linalg.det(S)))
+        K = P @ C.T @ np.linalg.inv(S)
+        x, P = Ad @ (x + K @ e) + Bd * uk, Ad @ (P - K @ C @ P) @ Ad.T + added
+        P = 0.5 * (P + P.T)
+    return total
+
+
+@pytest.mark.parametrize("Nr", [-0.5, 0.5, 0.8, 2.0])
+def test_an_unstable_machine_over_a_long_record(tmp_path, Nr):
+    # exp(2.0 * 60 s) is 1e52: what rounding leaves that no correction sees grows by that.
+    model, params = unstable_yaw(tmp_path, Nr)
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal(3000) * 0.1, rng.standard_normal((3000, 2)) * 0.02
+    inputs, measured = model.Inputs(ped=jnp.asarray(u)), {"psi": y[:, 0], "r": y[:, 1]}
+    measured = {n: jnp.asarray(v) for n, v in measured.items()}
+    found = innovations(model, params, inputs, measured, YAW_SD, dt=DT)
+    total = sum(
+        0.5 * float(jnp.sum(e**2 / found.variance[n] + jnp.log(found.variance[n])))
+        for n, e in found.error.items()
+    )
+    wanted = joint_filter(y, u, Nr, 6.0, 0.35, 1.0, tuple(YAW_SD.values()))
+    assert total == pytest.approx(wanted, rel=1e-8)
+
+
+def test_predictions_ahead_lie_between_one_step_and_a_simulation(tmp_path):
+    model, params = unstable_yaw(tmp_path, 0.8)
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal(200) * 0.1, rng.standard_normal((200, 2)) * 0.02
+    y[7, 1] = np.nan
+    inputs, measured = model.Inputs(ped=jnp.asarray(u)), {"psi": y[:, 0], "r": y[:, 1]}
+    asked = (model, params, inputs, {n: jnp.asarray(v) for n, v in measured.items()}, YAW_SD)
+    one = errors_ahead(asked, SimulationOptions(dt=DT), 1)
+    wanted = innovations(*asked, dt=DT)
+    # The first output of a sample is corrected first: of it both know the same.
+    np.testing.assert_allclose(one.error["psi"], wanted.error["psi"], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(one.variance["psi"], wanted.variance["psi"], rtol=1e-9)
+    run = simulate(model, params, inputs, dt=DT).outputs
+    whole = errors_ahead(asked, SimulationOptions(dt=DT), 200)
+    np.testing.assert_allclose(whole.error["r"], y[:, 1] - run.r, rtol=1e-9, atol=1e-12)
+    some = errors_ahead(asked, SimulationOptions(dt=DT), 50)
+    for n in YAW_SD:
+        by = [float(np.nanmax(found.variance[n])) for found in (one, some, whole)]
+        assert by == sorted(by)
+        assert by[0] < by[1] < by[2]

@@ -1,8 +1,11 @@
 """The numbers of a problem over its flights, as arrays that the residual is traced with."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
@@ -112,8 +115,7 @@ def _with_state_scales(problem: Problem, layout: Layout, data: Data) -> Data:
     """
     # Initial states are zero in it whatever their scales are, which may be the ones still.
     z = start_vector(layout, data, problem)
-    at_start = jax.device_get(_simulated(layout, data, z))
-    simulated = with_biases(layout, at_start)
+    at_start, simulated = _before_it_grows(layout, data, z)
     scaled, names = [], naming.names(layout.model.State)
     for flight, runs, rms in zip(data.flights, simulated, at_start.state_rms, strict=True):
         y = {n: np.asarray(v) for n, v in flight.outputs.items()}
@@ -135,3 +137,49 @@ def _simulated(layout: Layout, data: Data, z: jax.Array) -> SimulatedOutputs:
         if at.simulated is not None:
             return at.simulated
     return simulated_at(layout, data, z)
+
+
+_GROWN = 100.0
+"""times all that was measured of a flight, from which on a run that grows says nothing of sizes:
+its unstable mode drowns all other states"""
+_HALVINGS = 8
+
+
+def _before_it_grows(
+    layout: Layout, data: Data, z: Array
+) -> tuple[SimulatedOutputs, tuple[dict[str, np.ndarray], ...]]:
+    """What is simulated at z, of an unstable machine over as much of the records as it stays near
+    them; as NumPy arrays, and by flight and output."""
+    simulate = _simulated
+    for _ in range(_HALVINGS):
+        runs = jax.device_get(simulate(layout, data, z))
+        simulated = with_biases(layout, runs)
+        windows = [count for count, _ in layout.windows]
+        far = any(
+            _grows(v) and not _rms(v) < _GROWN * _size(f.outputs[n][np.isfinite(f.outputs[n])])
+            for f, by_name in zip(data.flights, simulated, strict=True)
+            for n, v in by_name.items()
+        )
+        # Windows are short already.
+        if not far or max(windows) > 1 or min(m for _, m in layout.windows) < 4:
+            break
+        cut = tuple((1, m // 2) for _, m in layout.windows)
+        flights = tuple(
+            f._replace(inputs=jax.tree.map(lambda v, m=m: v[:m], f.inputs))
+            for f, (_, m) in zip(data.flights, cut, strict=True)
+        )
+        layout, data = replace(layout, windows=cut), data._replace(flights=flights)
+        # Of the cut records the simulation alone: their outputs are no longer of their length.
+        simulate = simulated_at
+    return runs, simulated
+
+
+def _rms(values: np.ndarray) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _grows(values: np.ndarray) -> bool:
+    """Whether a run is ten times as large in its second half, which no wrong gain makes it."""
+    half = len(values) // 2
+    return not _rms(values[half:]) <= 10.0 * _rms(values[:half])

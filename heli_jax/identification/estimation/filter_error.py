@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
-from heli_jax.dynamics.model import correlation_of, initial_sd_of
+from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
@@ -36,6 +36,7 @@ from heli_jax.identification.unknowns.layout import (
     unpack,
 )
 from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.simulation.options import SimulationOptions
 from heli_jax.simulation.simulate import simulate
 
 _FLOOR = 1e-3
@@ -272,19 +273,25 @@ def filtered_flights(
 
 
 def _filtered(layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int) -> Innovations:
+    positional, options = filter_arguments(layout, data, noise, u, i)
+    return innovations(*positional, options)
+
+
+def filter_arguments(
+    layout: Layout, data: Data, noise: Noise, u: Unknowns, i: int
+) -> tuple[tuple[Model, Any, Any, dict[str, Array], dict[str, Any]], SimulationOptions]:
+    """Of `kalman.innovations` for the i-th flight; arguments as of `filtered_flights`."""
     drive = driven(layout, data, u, i)
-    return innovations(
-        layout.model,
-        drive.params,
-        drive.inputs,
-        {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()},
-        {n: s * u.scales[n] if n in u.scales else s for n, s in noise.sd[i].items()},
+    measured = {n: y - u.biases[i][n] for n, y in data.flights[i].outputs.items()}
+    sd = {n: s * u.scales[n] if n in u.scales else s for n, s in noise.sd[i].items()}
+    options = SimulationOptions(
         dt=drive.dt,
         initial_state=drive.state,
         delay=u.shift,
         substeps=layout.substeps,
         hold=layout.hold(i),
     )
+    return (layout.model, drive.params, drive.inputs, measured, sd), options
 
 
 def _likelihood_rows(

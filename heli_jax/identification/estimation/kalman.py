@@ -10,7 +10,7 @@ inverted. A measurement that is NaN is skipped.
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,12 +22,12 @@ from jaxtyping import Array, Float
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
-from heli_jax.identification.estimation.moments import moments_after
+from heli_jax.identification.estimation.extended_filter import local_filter
+from heli_jax.identification.estimation.filter_step import Drive, Estimate, Filter
 from heli_jax.naming import Scalar
-from heli_jax.numerics.matrix_exponential import product, van_loan
-from heli_jax.simulation.delays import delays_of
+from heli_jax.numerics.matrix_exponential import product
 from heli_jax.simulation.discretize import process_noise
-from heli_jax.simulation.hold import Segment, delayed, linear_inputs, segments
+from heli_jax.simulation.hold import linear_inputs
 from heli_jax.simulation.options import DEFAULT, SimulationOptions
 from heli_jax.simulation.stepping import held_columns
 
@@ -39,9 +39,6 @@ _ONLY_SIMULATE = (
     "solver", "controller", "adjoint", "max_steps", "key", "block", "feedback", "events",
 )  # fmt: skip
 """options of a simulation that mean nothing to a filter"""
-
-type _Estimate = tuple[Float[Array, " n"], Float[Array, "n n"]]
-"""a state and its covariance"""
 
 
 class Innovations(NamedTuple):
@@ -81,24 +78,45 @@ def innovations(
     Source: Kalman (1960); the covariance's integral in Van Loan (1978); local linearisation by
     Ozaki (1985).
     """
-    options = _checked(options.changed(keywords))
+    drive, (x, P), y, R = begun(model, params, inputs, measured, sd, options.changed(keywords))
+    if not model.linear:
+        e, s = _run(local_filter(drive), x, P, y, R)
+    elif x.shape[0] <= SMALL:
+        e, s = _by_rows(_linear(drive), x, P, y, R)
+    else:
+        e, s = _run(_exact(_linear(drive)), x, P, y, R)
+    return by_name(measured, e, s)
+
+
+def begun(
+    model: Model,
+    params: Any,
+    inputs: Any,
+    measured: Mapping[str, Float[Array, " N"]],
+    sd: Mapping[str, Scalar],
+    options: SimulationOptions,
+) -> tuple[Drive, Estimate, Float[Array, "N p"], Float[Array, " p"]]:
+    """What drives a filter, its first estimate, what is measured and the variances of its noise;
+    arguments as of `innovations`."""
+    options = _checked(options)
     linear = linear_inputs(model, inputs, options.hold)
     begin = options.initial_state
     x0 = model.initial_state(params) if begin is None else begin
     dtype = jax.tree.leaves(inputs)[0].dtype
-    x = naming.ravel(x0, dtype)
-    P = first_covariance(model, params, dtype)
+    estimate = naming.ravel(x0, dtype), first_covariance(model, params, dtype)
     # Only what is measured: an output more would cost a correction a sample.
-    names = list(measured)
-    rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in names])
+    rows = jnp.asarray([naming.names(model.Outputs).index(n) for n in measured])
     y = jnp.stack(list(measured.values()), axis=1)
-    R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in names])
-    drive = _Drive(model, params, inputs, options, linear, rows)
-    if model.linear:
-        e, s = (_by_rows if x.shape[0] <= SMALL else _by_arrays)(_linear(drive), x, P, y, R)
-    else:
-        e, s = _run(_local(drive), x, P, y, R)
-    return Innovations(dict(zip(names, e.T, strict=True)), dict(zip(names, s.T, strict=True)))
+    R = jnp.stack([jnp.asarray(sd[n], dtype) ** 2 for n in measured])
+    return Drive(model, params, inputs, options, linear, rows), estimate, y, R
+
+
+def by_name(names: Iterable[str], errors: Array, variances: Array) -> Innovations:
+    """Of arrays (N, p)."""
+    names = list(names)
+    return Innovations(
+        dict(zip(names, errors.T, strict=True)), dict(zip(names, variances.T, strict=True))
+    )
 
 
 def first_covariance(model: Model, params: Any, dtype: DTypeLike) -> Float[Array, "n n"]:
@@ -122,20 +140,6 @@ def _checked(options: SimulationOptions) -> SimulationOptions:
     return options
 
 
-class _Drive(NamedTuple):
-    """A model, what drives it along one record, and what is measured of it."""
-
-    model: Model
-    params: Any
-    inputs: Any
-    """the model's Inputs, arrays (N,)"""
-    options: SimulationOptions
-    linear: tuple[bool, ...]
-    """of each input whether it moves between samples; () where none does"""
-    rows: Array
-    """where the measured outputs stand among the model's (p,)"""
-
-
 class _Linear(NamedTuple):
     """x[k+1] = Ad x[k] + drive[k] + noise, y[k] = C x[k] + feed[k] + noise."""
 
@@ -146,7 +150,7 @@ class _Linear(NamedTuple):
     feed: Float[Array, "N p"]
 
 
-def _linear(drive: _Drive) -> _Linear:
+def _linear(drive: Drive) -> _Linear:
     model, params, options = drive.model, drive.params, drive.options
     _, _, C, D = jacobians(model, params)
     Ad, B, U, acting = held_columns(
@@ -192,8 +196,10 @@ def _by_rows(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple
             variances.append(jnp.where(seen, s, jnp.nan))
         x = _sum(Ad[:, i] * x[i] for i in range(n)) + w
         M = once([_sum(P[k] * a[i][k] for k in range(n)) for i in range(n)])
-        P = [_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)]
-        return (x, P), (errors, variances)
+        P = jnp.stack([_sum(Ad[:, k] * M[i][k] for k in range(n)) + Q[i] for i in range(n)])
+        # Symmetric by force: a correction takes nothing of what rounding leaves between P and its
+        # transpose, which an unstable mode would then blow up by its growth over the whole record.
+        return (x, list(0.5 * (P + P.T))), (errors, variances)
 
     samples = (list((y - system.feed).T), system.drive)
     _, (e, s) = jax.lax.scan(step, (x0, list(P0)), samples)
@@ -204,9 +210,14 @@ def _sum(terms: Iterable[Any]) -> Any:
     return functools.reduce(operator.add, terms)
 
 
-def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tuple[Array, Array]:
+def filter_of(drive: Drive) -> Filter:
+    """The exact filter of a linear model, else the extended one."""
+    return _exact(_linear(drive)) if drive.model.linear else local_filter(drive)
+
+
+def _exact(system: _Linear) -> Filter:
     # Rows written out one by one are a program whose length grows with the square of the states.
-    def move(x: Array, P: Array, now: tuple[Array, Array]) -> _Estimate:
+    def move(x: Array, P: Array, now: tuple[Array, Array]) -> Estimate:
         """The state and its covariance a sample on.
 
         Args:
@@ -220,24 +231,30 @@ def _by_arrays(system: _Linear, x0: Array, P0: Array, y: Array, R: Array) -> tup
 
     # C stays, so that no step differentiates the outputs.
     samples = (system.drive, system.feed)
-    return _run(_Filter(samples, lambda x, now: (system.C, now[1]), move), x0, P0, y, R)
+    return Filter(samples, lambda x, now: (system.C, now[1]), move)
 
 
-class _Filter(NamedTuple):
-    """What a step of the filter needs of a model; `samples` is a pytree of arrays (N, ...)."""
-
-    samples: Any
-    measure: Callable[[Array, Any], tuple[Array, Array]]
-    """(state, sample) -> C (p, n) and what C x leaves of the predicted outputs (p,)"""
-    move: Callable[[Array, Array, Any], _Estimate]
-    """(state, its covariance, sample) -> both at the next sample"""
-
-
-def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
+def _run(filter_: Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Array, Array]:
     """Errors and variances (N, p)."""
 
-    def correct(carry: _Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:
-        """The state and its covariance after one output, as in `_by_rows`."""
+    def step(carry: Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
+        y, now = sample
+        estimate, innovation = corrected(filter_, carry, R, y, now)
+        x, P = filter_.move(*estimate, now)
+        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
+        # never take the difference away again.
+        return (x, 0.5 * (P + P.T)), innovation
+
+    return jax.lax.scan(step, (x, P), (y, filter_.samples))[1]
+
+
+def corrected(
+    filter_: Filter, estimate: Estimate, R: Array, y: Array, now: Any
+) -> tuple[Estimate, tuple[Array, Array]]:
+    """An estimate after one sample's outputs (p,), one after another as in `_by_rows`; errors and
+    variances (p,) of their innovations."""
+
+    def correct(carry: Estimate, measured: tuple[Array, ...]) -> tuple[Any, Any]:
         (x, P), (c, rest, r, y) = carry, measured
         p = jnp.sum(P * c[None, :], axis=1)
         s = jnp.sum(c * p) + r
@@ -247,151 +264,5 @@ def _run(filter_: _Filter, x: Array, P: Array, y: Array, R: Array) -> tuple[Arra
         x, P = x + p * (gain * e), P - p[:, None] * (gain * p)[None, :]
         return (x, P), (jnp.where(seen, e, jnp.nan), jnp.where(seen, s, jnp.nan))
 
-    def step(carry: _Estimate, sample: tuple[Array, Any]) -> tuple[Any, Any]:
-        x, P = carry
-        y, now = sample
-        C, rest = filter_.measure(x, now)
-        (x, P), innovation = jax.lax.scan(correct, (x, P), (C, rest, R, y))
-        x, P = filter_.move(x, P, now)
-        # Phi P Phi' is symmetric but for rounding; the corrections, symmetric themselves, would
-        # never take the difference away again.
-        return (x, 0.5 * (P + P.T)), innovation
-
-    return jax.lax.scan(step, (x, P), (y, filter_.samples))[1]
-
-
-class _Equations(NamedTuple):
-    """A model's equations over vectors, to be linearised anew at every estimate."""
-
-    rates: Callable[[Array, Any], Array]
-    """(state (n,), Inputs) -> (n,), per second"""
-    outputs: Callable[[Array, Any], Array]
-    """(state (n,), Inputs) -> what is measured (p,)"""
-    intensity: Float[Array, " n"]
-    """of the process noise, see `Model.noise_intensity`"""
-    explicit: bool
-    """see `Model.explicit`"""
-
-
-def _equations(drive: _Drive) -> _Equations:
-    model, params = drive.model, drive.params
-    dtype = jax.tree.leaves(drive.inputs)[0].dtype
-    intensity = (
-        jnp.zeros(len(naming.names(model.State)), dtype)
-        if model.noise_intensity is None
-        else naming.ravel(model.noise_intensity(params), dtype)
-    )
-
-    def rates(x: Array, u: Any) -> Array:
-        return naming.ravel(model.vector_field(params, naming.unravel(model.State, x), u), dtype)
-
-    def outputs(x: Array, u: Any) -> Array:
-        y = naming.ravel(model.output(params, naming.unravel(model.State, x), u), dtype)
-        return y[drive.rows]
-
-    return _Equations(rates, outputs, intensity, model.explicit)
-
-
-class _Intervals(NamedTuple):
-    """The sample intervals, in parts within which every input stays or follows a straight line."""
-
-    lengths: tuple[Any, ...]
-    """of each part [s]; the same in all intervals, so no part of a sample"""
-    inputs: tuple[Any, ...]
-    """at the begin of each part, the model's Inputs with arrays (N,)"""
-    slopes: tuple[Any, ...] | None
-    """of the inputs in each part, per second; None where all of them stay"""
-    acting: Any
-    """the Inputs (N,) at the samples themselves, when what is measured is measured"""
-
-
-def _intervals(drive: _Drive) -> _Intervals:
-    inputs, linear = drive.inputs, drive.linear
-    # The linear filter has its drive from `held_columns`; here steps need the inputs themselves.
-    first = jax.tree.leaves(inputs)[0]
-    k, dt = jnp.arange(first.shape[0]), jnp.asarray(drive.options.dt, first.dtype)
-    delays = delays_of(drive.model, drive.params, drive.options.delay, dt)
-    acting = inputs if delays is None else delayed(inputs, delays, k, linear)
-    # A late sample arrives within an interval: before it the one before it still acts.
-    lengths, held, slopes = zip(*segments(inputs, dt, delays, k, linear), strict=True)
-    return _Intervals(lengths, held, slopes if linear else None, acting)
-
-
-def _local(drive: _Drive) -> _Filter:
-    """The extended filter: the model linearised at every estimate (Ozaki, 1985)."""
-    equations, intervals = _equations(drive), _intervals(drive)
-
-    def measure(x: Array, sample: Any) -> tuple[Array, Array]:
-        # With the inputs that act at the sample, which no part of an interval begins with when they
-        # are late.
-        u = sample[1]
-        C = jax.jacfwd(equations.outputs)(x, u)
-        return C, equations.outputs(x, u) - jnp.sum(C * x[None, :], axis=1)
-
-    def move(x: Array, P: Array, sample: Any) -> _Estimate:
-        """The state and its covariance a sample on, along the linearised model.
-
-        Args:
-            x: (n,), corrected.
-            P: (n, n).
-            sample: inputs and slopes of each part of the interval.
-        """
-        held, _, slopes = sample
-        estimate = (x, P)
-        slopes = (None,) * len(held) if slopes is None else slopes
-        for part in zip(intervals.lengths, held, slopes, strict=True):
-            estimate = _along(equations, estimate, Segment(*part), drive.options.substeps)
-        return estimate
-
-    samples = (intervals.inputs, intervals.acting, intervals.slopes)
-    return _Filter(samples, measure, move)
-
-
-def _along(equations: _Equations, estimate: _Estimate, part: Segment, substeps: int) -> _Estimate:
-    """The estimate after a part of an interval, linearised anew in each of its substeps."""
-    # With no slope nothing in the loop depends on time, and it needs no counter.
-    h = part.length / substeps
-    if part.slope is None:
-        return jax.lax.scan(
-            lambda estimate, _: (_held_step(equations, estimate, h, part.inputs), None),
-            estimate,
-            None,
-            length=substeps,
-        )[0]
-
-    def step(estimate: _Estimate, j: Array) -> tuple[_Estimate, None]:
-        now = jax.tree.map(lambda u, slope: u + slope * (j * h), part.inputs, part.slope)
-        return _ramped_step(equations, estimate, part._replace(length=h, inputs=now)), None
-
-    return jax.lax.scan(step, estimate, jnp.arange(substeps, dtype=estimate[0].dtype))[0]
-
-
-def _held_step(equations: _Equations, estimate: _Estimate, h: Array, u: Any) -> _Estimate:
-    (x, P), rates = estimate, equations.rates
-    if equations.explicit:
-        return moments_after(rates, equations.intensity, estimate, Segment(h, u, None))
-    # With J and f at x itself: shift is the whole step of the linearised equation from there.
-    step = van_loan(jax.jacfwd(rates)(x, u), rates(x, u), equations.intensity, h)
-    return x + step.shift, product(product(step.Phi, P), step.Phi.T) + step.Q
-
-
-def _ramped_step(equations: _Equations, estimate: _Estimate, part: Segment) -> _Estimate:
-    """`_held_step` where the inputs move."""
-    (x, P), rates = estimate, equations.rates
-    if equations.explicit:
-        return moments_after(rates, equations.intensity, estimate, part)
-    n, dtype = x.shape[0], x.dtype
-    # Time is a state more, whose rate is 1: the column of derivatives by time then makes the step
-    # of a linear model exact (local linearisation of an equation that depends on time).
-    _, by_time = jax.jvp(lambda u: rates(x, u), (part.inputs,), (part.slope,))
-    unit, zero = jnp.ones(1, dtype), jnp.zeros(1, dtype)
-    A = jnp.zeros((n + 1, n + 1), dtype).at[:n, :n].set(jax.jacfwd(rates)(x, part.inputs))
-    step = van_loan(
-        A.at[:n, n].set(by_time),
-        jnp.concatenate([rates(x, part.inputs), unit]),
-        # Time itself is certain: no noise acts on it.
-        jnp.concatenate([equations.intensity, zero]),
-        part.length,
-    )
-    Phi = step.Phi[:n, :n]
-    return x + step.shift[:n], product(product(Phi, P), Phi.T) + step.Q[:n, :n]
+    C, rest = filter_.measure(estimate[0], now)
+    return jax.lax.scan(correct, estimate, (C, rest, R, y))

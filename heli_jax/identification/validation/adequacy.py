@@ -69,6 +69,8 @@ class Adequacy(NamedTuple):
     """what keeps an adequate model from a plain yes, where no residual in time is judged"""
     at_optimum: bool = True
     """whether the optimiser arrived"""
+    ahead: float | None = None
+    """[s] that is predicted at most where that, and no simulation, was judged"""
 
     def doubted(self, doubts: Sequence[str]) -> "Adequacy":
         """The same, not adequate where there is such a doubt, each in a few words."""
@@ -116,6 +118,9 @@ class Adequacy(NamedTuple):
     def one_step_only(self) -> tuple[str, ...]:
         """The outputs that an adequate model predicts one step ahead (filter error), though driven
         by the inputs alone it follows them worse than their mean does."""
+        # Of what is predicted further ahead the VAF is no simulation's, and a remark gives it.
+        if self.ahead is not None:
+            return ()
         return tuple(o.output for o in self.judged if o.disturbed_below_mean)
 
     @property
@@ -166,6 +171,9 @@ class Evidence(NamedTuple):
     noise by chance shows nothing"""
     innovations: tuple[Mapping[str, np.ndarray] | None, ...] = ()
     """by flight and output (N,), SI: the errors of the prediction one step ahead"""
+    ahead: float | None = None
+    """[s] that is predicted at most, from a filter's states, where that stands in place of the
+    simulation: of an unstable model"""
 
 
 def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
@@ -178,7 +186,7 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
     """
     disturbed = evidence.error_ratio is not None
     # Linearising takes a compiled program of its own, so it is asked only where the answer counts.
-    unstable = disturbed and is_unstable(problem, params)
+    unstable = disturbed and evidence.ahead is None and is_unstable(problem, params)
     outputs = tuple(
         _of_output(name, m, evidence, unstable)
         for name, m in evidence.agreement.items()
@@ -201,10 +209,11 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         # Written so that a VAF that is no number counts as less than the mean.
         any(not output.vaf >= 0 for output in bad),
         outputs,
-        tuple(_reason(output) for output in bad),
+        tuple(_reason(output, evidence.ahead) for output in bad),
         tuple(dict.fromkeys(advice)),
-        (*_as_expected(outputs), *(_unexplained(output) for output in unexplained)),
+        (*_as_expected(outputs, evidence.ahead), *(_unexplained(output) for output in unexplained)),
         tuple(output.output for output in unexplained),
+        ahead=evidence.ahead,
     )
 
 
@@ -228,8 +237,15 @@ def by_responses(
     return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
 
 
-def _as_expected(outputs: tuple[OutputAdequacy, ...]) -> list[str]:
+def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[str]:
     """What looks bad and is what the estimated disturbance makes."""
+    if ahead is not None:
+        vafs = ", ".join(f"{output.output} {output.vaf:.3g}" for output in outputs)
+        return [
+            "The model is unstable over the length of the record, so that no simulation of it can "
+            f"follow the record: it is judged by predictions up to {ahead:g} s ahead from the "
+            f"filter's state (VAF: {vafs})."
+        ]
     return [
         f"Driven by the inputs alone, the model follows {output.output} worse than its mean does "
         f"(VAF {output.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
@@ -357,8 +373,14 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
     return 1.0 - other / rest, other / residual if residual > 0 else 0.0
 
 
-def _reason(output: OutputAdequacy) -> str:
+def _reason(output: OutputAdequacy, ahead: float | None) -> str:
     name, vaf, ratio = output.output, output.vaf, output.against_disturbance
+    if ahead is not None:
+        return (
+            f"{name} predicted up to {ahead:g} s ahead misses the measured one by "
+            f"{np.sqrt(ratio or np.nan):.2g} times what the estimated disturbance explains (VAF "
+            f"{vaf:.3g}, autocorrelation of the innovations {output.lag1:+.2f} at one sample)."
+        )
     if not np.isfinite(vaf):
         return f"The simulated {name} is not finite: nothing of it is explained."
     if vaf < 0:

@@ -37,7 +37,7 @@ class OutputAdequacy(NamedTuple):
     output: str
     adequate: bool
     vaf: float
-    """of the simulation, over all fitted flights"""
+    """of the simulation (`Adequacy.ahead`: of predictions), over all fitted flights"""
     explained: float
     """share explained of what is not white noise"""
     white: bool

@@ -12,7 +12,10 @@ which is nowhere more than all of the input; with the largest such gain, as a me
 since nobody knows which is fed back. A loop holds the machine at low frequencies, where gusts are
 large in it and sweeps move sticks no more than elsewhere.
 
-Either is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
+An unstable machine that was held all the same had a loop with a bandwidth of twice its unstable
+pole at least: up to there all of the input may have come of it, whatever the residual is.
+
+Each is a mean over the frequencies that tell of a parameter, by what they tell. Neither says that
 there is a loop: gusts leave residuals that a response is coherent with by chance, and so does a
 model that lacks something. Parameters are named where inputs were found to follow the response, or
 where somebody must have held the machine: the model is unstable, and the record does not grow.
@@ -21,7 +24,8 @@ Inputs that are taken by instrument bring in nothing; of the others in the same 
 is told, since equations by instrument leave a residual that feedback makes coherent.
 
 Sources: L. Ljung, System Identification (1999), 13.4, for the direct estimate's bias; Bendat and
-Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance.
+Piersol, Random Data (2010), chapter 7, for multiple coherence and what of it is chance; Astrom and
+Murray, Feedback Systems (2008), 11.4, for the bandwidth that an unstable pole asks for.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,6 +41,8 @@ from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.estimation.frequency_spectrum import LEAST, smoothed
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Noise, Solution
 from heli_jax.identification.validation.feedback import Feedback
 
@@ -45,11 +51,17 @@ TRUSTED = 1.4
 interval then covers two thirds of the time"""
 MAY_BE = 0.25
 """part of the input that feedback may have brought in, where a parameter that is trusted shows"""
+HELD = 0.1
+"""part of what tells of a parameter that is trusted from frequencies at which the loop that holds
+an unstable machine has to act: there all of the input may be that loop's"""
 BESIDE = 0.05
 """the same where other inputs are taken by instrument: an input's effect is off by that part of it
 at least, in a fit that is taken for one that feedback does no harm to"""
 _GROWS = 3.0
 """e-foldings over a record of the model's fastest growing mode, from which on somebody holds it"""
+_REACHES = 2.0
+"""times an unstable pole, up to which the loop that holds it has to act: with less bandwidth no
+feedback has margins (Astrom and Murray, 2008, section 11.4)"""
 _SEEN = 2.0
 """times the residual's power, above which an output shows the response: only there is it asked how
 large a gain the input leaves room for"""
@@ -64,6 +76,13 @@ class Moved(NamedTuple):
     """standard deviations that it is off by at least"""
     may_be: float
     """part of the input that feedback may have brought in, 0 to 1"""
+    held: float = 0.0
+    """part of what tells of it that lies where the loop which holds an unstable machine acts"""
+
+    @property
+    def part(self) -> float:
+        """Of the input where it shows, what may have come of feedback."""
+        return max(self.may_be, self.held)
 
 
 def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Moved]:
@@ -88,9 +107,9 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     mean = mean_share(J[:q, :q].T @ J[:q, :q])
     by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
     may_be = mean(information(at, _room_for_feedback(lines)))
-    return {
-        n: Moved(float(b), float(m)) for n, b, m in zip(layout.of_interest, by, may_be, strict=True)
-    }
+    held = mean(information(at, _where_held(at, shares)))
+    each = zip(layout.of_interest, by, may_be, held, strict=True)
+    return {n: Moved(float(b), float(m), float(h)) for n, b, m, h in each}
 
 
 def mean_share(
@@ -152,18 +171,41 @@ def held_upright(at: Solution) -> bool:
     Args:
         at: where the fit ended.
     """
+    return any(pole > 0.0 for pole in _held_poles(at))
+
+
+def _held_poles(at: Solution) -> list[float]:
+    """By flight |p| [rad/s] of the model's fastest unstable mode that the record would show, and
+    does not: somebody holds it. 0 where there is none."""
     layout, data, *_, z = at
     if not layout.estimator.by_instrument or layout.estimator.fits_responses:
-        return False
-    rate = float(np.log(np.max(np.abs(np.linalg.eigvals(machine_of(layout, data, z).Ad)))))
+        return [0.0]
+    with np.errstate(divide="ignore"):  # what a sample forgets altogether
+        modes = np.log(np.linalg.eigvals(machine_of(layout, data, z).Ad).astype(complex))
+    held = []
     for names, flight in zip(layout.outputs, data.flights, strict=True):
         y = [np.asarray(flight.outputs[n]) for n in names]
         half = len(y[0]) // 2
         grown = max(float(np.nanstd(v[half:]) / max(np.nanstd(v[:half]), 1e-300)) for v in y)
         # Alone it would grow by half of the e-foldings from one half to the other.
-        if 2 * half * rate > _GROWS and np.log(grown) < 0.5 * half * rate:
-            return True
-    return False
+        growing = modes[2 * half * np.real(modes) > _GROWS]
+        alone = np.max(np.real(growing), initial=0.0)
+        stays = alone > 0.0 and np.log(grown) < 0.5 * half * alone
+        held.append(float(np.max(np.abs(growing))) / float(flight.dt) if stays else 0.0)
+    return held
+
+
+def _where_held(
+    at: Solution, like: Sequence[Float[np.ndarray, " K"]]
+) -> list[Float[np.ndarray, " K"]]:
+    """By record and frequency 1 up to where the loop that holds an unstable mode has to reach, and
+    0 above: nothing tells test from correction there."""
+    held, inside = _held_poles(at), []
+    for record, part in zip(records_of(at.layout), like, strict=True):
+        dt = float(at.data.flights[record.flight].dt)
+        omega = 2.0 * np.pi * np.arange(1, len(part) + 1) / (record.samples * dt)
+        inside.append((omega <= _REACHES * held[record.flight]).astype(float))
+    return inside
 
 
 class Loop(NamedTuple):
@@ -203,7 +245,23 @@ def untrusted(moved: Mapping[str, Moved], loop: Loop) -> tuple[str, ...]:
     if not loop.closed:
         return ()
     most = BESIDE if loop.instruments else MAY_BE
-    return tuple(n for n, m in moved.items() if m.by > TRUSTED or m.may_be > most)
+    # Beside inputs by instrument somebody logged what excites the slow mode.
+    beyond = 1.0 if loop.instruments else HELD
+    return tuple(
+        n for n, m in moved.items() if m.by > TRUSTED or m.may_be > most or m.held > beyond
+    )
+
+
+def known_no_gusts(problem: Problem, found: Sequence[Feedback]) -> bool:
+    """Whether inputs follow the response in a fit in time that knows no gusts.
+
+    Args:
+        problem: says the method.
+        found: of `feedback_of`.
+    """
+    estimator = estimator_of(problem.method)
+    in_time = not (estimator.by_instrument or estimator.fits_responses)
+    return in_time and not estimator.process_noise and any(one.present for one in found)
 
 
 class _Lines(NamedTuple):
@@ -318,18 +376,20 @@ def feedback_trust_notes(moved: Mapping[str, Moved], loop: Loop) -> list[str]:
     if not any(one.present for one in loop.found):
         of += " (the model is unstable, and the record does not grow: somebody holds the machine)"
     if not doubted:
+        most = max(m.part for m in moved.values())
         return [
-            f"Closed loop without an instrument{of}: feedback can hardly have moved these "
-            "estimates: they are known from frequencies at which it brings in little."
+            f"Closed loop without an instrument{of}: up to {100 * most:.0f} % of the input may be "
+            "gusts that feedback brought in, where these parameters show; no interval allows for "
+            "that. Nothing shows that it moved them, and nothing that it did not."
         ]
-    words = ", ".join(f"{n} ({100 * moved[n].may_be:.0f} %)" for n in doubted)
+    words = ", ".join(f"{n} ({100 * moved[n].part:.0f} %)" for n in doubted)
     rest = [n for n in moved if n not in doubted]
     inputs = " and ".join(loop.inputs) if loop.instruments else "the inputs"
     return [
         f"Closed loop without an instrument{of}: this fit cannot be trusted on "
         f"{', '.join(doubted)}. Where these show, so much of {inputs} may be gusts that feedback "
         f"brought in: {words}; no interval allows for that. "
-        + (f"{', '.join(rest)} are hardly touched. " if rest else "")
+        + (f"Less of it is where {', '.join(rest)} show. " if rest else "")
         + "Remedy: log the excitation and name it (signals.instruments), or method: filter-error "
         "with a disturbance."
     ]

@@ -32,8 +32,10 @@ def meanings(fit: Fit) -> list[tuple[str, str]]:
 
 def _adequate(fit: Fit) -> str:
     if any(output.against_disturbance is not None for output in fit.adequacy.judged):
+        ahead = fit.adequacy.ahead
+        what = "simulation" if ahead is None else f"predictions up to {ahead:g} s ahead"
         return (
-            "yes where the innovations of all outputs are white and the error of the simulation "
+            f"yes where the innovations of all outputs are white and the error of the {what} "
             f"has at most {EXPECTED:g} times the power that the estimated disturbance makes; in "
             "size only where innovations are not white but have an autocorrelation below "
             f"{FAR_FROM_WHITE:g} at one sample, or the simulation explains "
