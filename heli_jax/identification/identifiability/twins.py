@@ -124,5 +124,6 @@ def _as_good(
 ) -> bool:
     a, b = pair
     # At the start values nothing has been fitted: any step would make the exchange the better one.
-    point = valley.visit({a: values[b], b: values[a]}, {}, steps=5 if optimum else 0, priors=True)
-    return point is not None and (point.excess if optimum else abs(point.excess)) <= SAME
+    held = {a: values[b], b: values[a]}
+    point = valley.visit(held, {}, same=not optimum, priors=True)
+    return point is not None and point.excess <= SAME

@@ -56,7 +56,7 @@ class Valley(NamedTuple):
         held: Mapping[str, float],
         guess: Mapping[str, float],
         *,
-        steps: int = _STEPS,
+        same: bool = False,
         priors: bool = False,
     ) -> Point | None:
         """The best point with some values held; None where there is none.
@@ -65,7 +65,8 @@ class Valley(NamedTuple):
             held: values that stay, SI.
             guess: of other unknowns of interest, where the search begins; the optimum's unless
                 named.
-            steps: of Gauss and Newton at most.
+            same: whether the residuals themselves have to stay, each of them, and not only the sum
+                of their squares; asked where the valley's own point is no optimum too.
             priors: whether the parameters' own priors count.
         """
         layout = self.at.layout
@@ -76,9 +77,11 @@ class Valley(NamedTuple):
                 return None
             z[names.index(name)] = at
         moving = np.array([i >= len(names) or names[i] not in held for i in range(layout.size)])
-        now = self._at(z)
-        for _ in range(steps):
+        now, here = self._at(z), self._rows(self.e, priors)[0]
+        base = here if same else np.zeros(here.size)
+        for _ in range(_STEPS):
             r, J = self._rows(now, priors)
+            r = r - base
             step = np.zeros(layout.size)
             ridge = _RIDGE * np.eye(int(moving.sum()))
             left = np.concatenate([-r, np.zeros(len(ridge))])
@@ -86,14 +89,14 @@ class Valley(NamedTuple):
                 return None
             step[moving] = np.linalg.lstsq(np.vstack([J[:, moving], ridge]), left, rcond=None)[0]
             then = self._at(now.z + step)
-            gained = _squares(r) - _squares(self._rows(then, priors)[0])
+            gained = _squares(r) - _squares(self._rows(then, priors)[0] - base)
             # Negated: also what is not finite is no step.
             if not gained > 0:
                 break
             now = then
             if gained < 0.01 * SAME:
                 break
-        excess = _squares(self._rows(now, priors)[0]) - _squares(self._rows(self.e, priors)[0])
+        excess = _squares(self._rows(now, priors)[0] - base) - _squares(here - base)
         values = {n: float(v) for n, v in zip(names, now.named, strict=True)}
         return Point(values, excess) if math.isfinite(excess) else None
 
@@ -137,7 +140,7 @@ class Valley(NamedTuple):
             for factor in (_FACTOR, 1.0 / _FACTOR):
                 held = {u.name: u.value * factor}
                 for guess in _tangents(along, factor, i, unknowns):
-                    point = self.visit(held, guess)
+                    point = self.visit(held, guess, same=True)
                     if point is not None and point.excess <= SAME:
                         points.append(point.values)
                         break
