@@ -26,6 +26,8 @@ from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
+from heli_jax.identification.identifiability.twins import twins_of
+from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
@@ -39,7 +41,11 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
 from heli_jax.identification.validation.advice import Record, is_unstable
-from heli_jax.identification.validation.aliases import fast_modes, measurement_noise
+from heli_jax.identification.validation.aliases import (
+    as_good_as_aliases,
+    fast_modes,
+    measurement_noise,
+)
 from heli_jax.identification.validation.closed_loop_trust import (
     Loop,
     feedback_trust_notes,
@@ -47,7 +53,10 @@ from heli_jax.identification.validation.closed_loop_trust import (
     known_no_gusts,
     moved_by_feedback,
 )
-from heli_jax.identification.validation.excitation_test import by_excitation
+from heli_jax.identification.validation.excitation_test import (
+    by_excitation,
+    unless_unrelated,
+)
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -146,7 +155,7 @@ def assemble(
         run: how it came there.
     """
     e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
-    optimum = unless_stuck(search.layout, optimum, e)
+    optimum = unless_stuck(search.layout, optimum, e, problem.free)
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
     signals, absent = signals_of(e, problem.training), absent_names(layout, optimum)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
@@ -156,8 +165,13 @@ def assemble(
     # Whether the sample time is short enough is a question to the estimated machine.
     values = {k: float(v) for k, v in zip(layout.of_interest, e.named, strict=True)}
     fast = fast_modes(problem, values, measurement_noise(problem, noise.sd))
+    if bool(best.converged):
+        fast = as_good_as_aliases(fast, Valley(problem, solution, e))
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
-    errors = standard_errors(problem, solution, e, run.before, white=all_white, aliased=aliased)
+    twins = twins_of(problem, solution, e) if bool(best.converged) else ()
+    errors = standard_errors(
+        problem, solution, e, run.before, white=all_white, aliased=aliased, twins=twins
+    )
     if bool(best.converged):
         verdict = unless_inputs_explain_nothing(solution, e, errors.verdict)
         errors = errors._replace(verdict=verdict)
@@ -181,6 +195,11 @@ def assemble(
         or by_excitation(problem, solution, pooled)
         or (_ahead(problem, params, solution, white) if ahead else _adequacy(*in_time))
     )
+    if layout.estimator.noise_spectrum:
+        adequacy = unless_unrelated(problem, adequacy)
+    if adequacy.by_chance:
+        # Of an optimum of chance nothing is to be told, of who holds the machine either.
+        moved, stays = {}, False
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += excitation.aliasing(fast)
     status = _status(best, e, numbers, errors.verdict)

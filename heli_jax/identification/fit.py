@@ -27,7 +27,9 @@ from heli_jax.identification.estimation.noise_covariance import (
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.identifiability.disturbances import of_disturbances
-from heli_jax.identification.identifiability.sensitivity import verdict_of
+from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.twins import twins_of
+from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Check, Estimate, Fit, Signals, Status
@@ -121,7 +123,10 @@ def check(problem: Problem) -> Check:
         guess = guess._replace(noise=noise, e=evaluate(guess.layout, guess.data, noise, guess.z))
     # At the start values, since nothing else is known yet: where these are far off, what is
     # determined there may differ from what is at the optimum, for which the fit asks again.
-    verdict = verdict_of(problem, guess.layout, guess.e)
+    at = Solution(*guess[:4])
+    twins = twins_of(problem, at, guess.e, optimum=False)
+    around = Around(twins=twins, valley=Valley(problem, at, guess.e))
+    verdict = verdict_of(problem, guess.layout, guess.e, around=around)
     # What the model does at the start values says whether the record can show it in this noise.
     runs = tuple(s.simulated for s in signals_of(guess.e, problem.training))
     notes = [*cautions(problem), *excitation.notes(problem, runs, guess.noise.sd)]
@@ -130,7 +135,7 @@ def check(problem: Problem) -> Check:
     # A parameter that is not identifiable moves by any amount, with another hold too.
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += tuple(of_disturbances(guess.layout, guess.e))
-    notes += other_hold(problem, Solution(*guess[:4]), guess.e, skip=not_identifiable)
+    notes += other_hold(problem, at, guess.e, skip=not_identifiable)
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
@@ -138,7 +143,7 @@ def check(problem: Problem) -> Check:
         if name not in flight.sd
     )
     sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
-    findings = is_it_enough(problem, Solution(*guess[:4]), guess.e, feedback)
+    findings = is_it_enough(problem, at, guess.e, feedback)
     return Check(verdict, sds, tuple(notes), guessed, findings)
 
 

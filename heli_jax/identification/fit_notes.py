@@ -74,8 +74,10 @@ def fit_notes(
     """
     layout, data, best = search.layout, search.data, optimum.best
     none, absent = no_disturbance(optimum), absent_names(layout, optimum)
-    # An optimiser that has not arrived comes first: it makes all else doubtful.
+    # A bound that the data do not bear out comes first: it is the cause of what follows. Then an
+    # optimiser that has not arrived, which makes all else doubtful.
     return [
+        *bound_notes(numbers.of_interest),
         *_stopped_notes(layout, best, optimum),
         *_disturbance_notes(optimum.ratio if none else None),
         *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
@@ -85,7 +87,6 @@ def fit_notes(
         *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
         *stated_noise_notes(problem, numbers.noise),
         *_correlation_notes(correlated),
-        *bound_notes(numbers.of_interest),
         *delay_notes(problem, numbers.of_interest),
         *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),
         *_hold_notes(problem, search, optimum, e, numbers.of_interest),

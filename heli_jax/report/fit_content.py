@@ -220,6 +220,7 @@ def verdict(verdict: Verdict) -> dict[str, Any]:
         "without_effect": list(verdict.without_effect),
         "resting_on_priors": list(verdict.resting),
         "exchangeable_nuisances": list(verdict.exchangeable),
+        "exchangeable_parameters": [list(pair) for pair in verdict.twins],
         "names": list(verdict.names),
         "correlation": verdict.correlation,
         "covariance_log": verdict.covariance,

@@ -1,11 +1,15 @@
 """Whether a search that says so has arrived at an optimum."""
 
+from collections.abc import Collection, Mapping
+
 import numpy as np
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.multistart import gauss_newton_gain
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
+from heli_jax.identification.free import Free
+from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
 
 _SHARE = 0.1
@@ -17,7 +21,10 @@ _MODEST = 0.5
 
 
 def gain_left(
-    r: Float[np.ndarray, " n"], J: Float[np.ndarray, "n q"], parameters: int
+    r: Float[np.ndarray, " n"],
+    J: Float[np.ndarray, "n q"],
+    parameters: int,
+    at_bound: Collection[int] = (),
 ) -> float | None:
     """The share of the sum of squares that a modest step would take away, where that is so much
     that no optimiser can have arrived; None where it is not.
@@ -30,7 +37,11 @@ def gain_left(
         r: residuals with the rows of the priors, whitened.
         J: their derivatives by the unknowns.
         parameters: how many of these, the first, are parameters, of which a step has a size.
+        at_bound: those of them that the optimiser may move no further.
     """
+    if at_bound:
+        J = np.delete(J, list(at_bound), axis=1)
+        parameters -= len(at_bound)
     squares = float(np.sum(np.square(r)))
     least = squares * max(_SHARE, _PER_UNKNOWN * J.shape[1] / r.size)
     # Negated: also what is not finite is none of this function's business.
@@ -49,18 +60,28 @@ def gain_left(
     return gain / squares if gain > least else None
 
 
-def unless_stuck(layout: Layout, optimum: RelaxedOptimum, e: Evaluation) -> RelaxedOptimum:
+def unless_stuck(
+    layout: Layout, optimum: RelaxedOptimum, e: Evaluation, free: Mapping[str, Free]
+) -> RelaxedOptimum:
     """The optimum, no longer taken for one where its own slopes say that it is none.
 
     Args:
         layout: what the unknowns are.
         optimum: where the search ended.
         e: at that optimum.
+        free: the bounds of the free parameters, by name.
     """
     # A filter's rows hold the level of its variances too, and have no squares to take a share of.
     if not (bool(optimum.best.converged) and layout.estimator.least_squares):
         return optimum
-    share = gain_left(np.asarray(e.r, np.float64), np.asarray(e.J, np.float64), len(layout.free))
+    # What lies beyond a bound is a gain that no optimiser may take.
+    at_bound = [
+        i
+        for i, name in enumerate(layout.free)
+        if transforms.at_bound(free[name], float(e.named[i]))
+    ]
+    r, J = np.asarray(e.r, np.float64), np.asarray(e.J, np.float64)
+    share = gain_left(r, J, len(layout.free), at_bound)
     if share is None:
         return optimum
     note = (

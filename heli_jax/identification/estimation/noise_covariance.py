@@ -71,6 +71,18 @@ def noise_guess(signal: np.ndarray) -> float:
     return max(guess, floor, 1e-300)
 
 
+def white_part(signal: np.ndarray) -> float:
+    """The sd of the white noise in a signal: what is there at its fastest and at its slowest.
+
+    Args:
+        signal: (N,), NaN where nothing is measured.
+    """
+    # Third differences look at the fast end of the spectrum alone, where a swing near the Nyquist
+    # frequency passes for noise. With every other sign turned the ends change places.
+    turned = signal * np.where(np.arange(signal.size) % 2, -1.0, 1.0)
+    return min(noise_guess(signal), noise_guess(turned))
+
+
 def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Third divided differences (N - 3,) of samples (N,) at any instants, scaled so that those of
     white noise have its variance; a parabola has none."""

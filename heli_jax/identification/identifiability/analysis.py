@@ -11,7 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.identification.identifiability.combinations import (
+    NOT_ASKED,
     TAKES_PART,
+    Elsewhere,
+    Tied,
     combinations,
     row_reduced,
     unit_vector,
@@ -140,14 +143,17 @@ class _Analysis(NamedTuple):
     resting: tuple[Inseparable, ...]
     """what priors determine, and the data alone do not"""
     exchange: Exchange
+    twins: tuple[tuple[str, str], ...]
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Also those that take a small part in a direction that is not determined."""
+        """Also those that take a small part in a direction that is not determined, and those whose
+        values may be exchanged."""
         return tuple(
             u.name
             for i, u in enumerate(self.unknowns)
             if any(abs(v[i]) > TAKES_NO_PART for v in self.determined.null)
+            or any(u.name in pair for pair in self.twins)
         )
 
     @property
@@ -164,6 +170,7 @@ def analyse(
     null_below: float = NULL,
     without_weak: WithoutWeakPriors | None = None,
     reported: np.ndarray | None = None,
+    elsewhere: Elsewhere = NOT_ASKED,
 ) -> Verdict:
     """The verdict from a whitened sensitivity in relative coordinates.
 
@@ -178,6 +185,7 @@ def analyse(
         reported: covariance (q, q) of the intervals that are reported, in relative coordinates,
             where it is not that of white residuals: these must not reach further than the factor
             either.
+        elsewhere: what is known of other points.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
     determined = _determined(sensitivity, bare, unknowns, null_below, reported)
@@ -187,10 +195,14 @@ def analyse(
     exchange = Exchange(sensitivity, without_weak, least)
     # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
     # number that the prior has put there.
-    groups = _groups(determined.null, determined.covariance, unknowns, dead, exchange)
+    groups = _groups(
+        determined.null, determined.covariance, unknowns, dead, (exchange, elsewhere.tied)
+    )
     # What the data alone say, so that no prior is in it.
-    resting = _groups(data.null, data.covariance, unknowns, (), exchange)
-    analysis = _Analysis(unknowns, determined, data, dead, groups, resting, exchange)
+    resting = _groups(data.null, data.covariance, unknowns, (), (exchange, elsewhere.tied))
+    analysis = _Analysis(
+        unknowns, determined, data, dead, groups, resting, exchange, elsewhere.twins
+    )
     return _verdict(analysis, remedies or {})
 
 
@@ -214,11 +226,12 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
         dict(remedies),
         roughly,
         through_zero,
+        a.twins,
     )
     directions_not_determined = (*known.null, *a.data.null)
     return Verdict(
         names=names,
-        identifiable=not known.null,
+        identifiable=not known.null and not a.twins,
         rank=known.rank,
         rank_without_priors=a.data.rank,
         condition=a.condition,
@@ -242,6 +255,7 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
                 label for v in directions_not_determined for label in a.exchange.labels(v)
             )
         ),
+        twins=a.twins,
     )
 
 
@@ -301,10 +315,10 @@ def _groups(
     covariance: np.ndarray,
     unknowns: tuple[Unknown, ...],
     dead: tuple[str, ...],
-    exchange: Exchange,
+    asked: tuple[Exchange, Tied],
 ) -> tuple[Inseparable, ...]:
     """The parameters in null directions, those apart that no direction ties together."""
-    names = [u.name for u in unknowns]
+    names, (exchange, tied) = [u.name for u in unknowns], asked
     # Parameters without effect have a sentence of their own, and no combination to offer.
     gone = {names.index(n) for n in dead}
     alive = [v for v in null if np.delete(np.abs(v), list(gone)).max(initial=0.0) > TAKES_PART]
@@ -317,7 +331,7 @@ def _groups(
         Inseparable(
             tuple(names[i] for i in sorted(members)),
             len(rows),
-            combinations(rows, covariance, unknowns),
+            tied(rows, covariance, unknowns),
             exchange.words(rows),
             exchange.switches(rows),
         )
@@ -370,7 +384,7 @@ def _pairs(
 def _weakest(a: _Analysis) -> Weakest | None:
     """The least determined direction, and what is determined far better; None where there is more
     to say than that."""
-    if a.determined.null or a.data.null or not a.condition > ILL_CONDITIONED:
+    if a.determined.null or a.data.null or a.twins or not a.condition > ILL_CONDITIONED:
         return None
     covariance = a.determined.covariance
     _, vectors = np.linalg.eigh(covariance)

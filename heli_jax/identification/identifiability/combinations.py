@@ -1,6 +1,9 @@
-"""Products of powers, such as a/Ixx, that the data determine where the parameters are not."""
+"""Products of powers, such as a/Ixx, and sums, such as La + Lb, that the data may determine where
+the parameters are not: by the slopes at one point, which `valley` asks far from it."""
 
 import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -98,6 +101,72 @@ def _combination(
     )
 
 
+_LARGEST_FACTOR = 4.0
+"""of a parameter in a sum that is worth naming"""
+
+
+def sums(
+    null: list[np.ndarray],
+    covariance: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    units: Mapping[str, str | None],
+) -> tuple[Combination, ...]:
+    """Sums of parameters of one unit, with simple factors, that do not change along the null
+    directions.
+
+    Args:
+        null: unit directions (q,) in relative coordinates.
+        covariance: (q, q) of what is determined, in the same.
+        unknowns: (q,) what the coordinates are.
+        units: by name, of those that are parameters.
+    """
+    if not null:
+        return ()
+    # Of a logarithmic coordinate a unit is so much of the value itself.
+    to_value = np.array([u.value * u.per_log if u.logarithmic else 0.0 for u in unknowns])
+    moved = [v * to_value for v in null]
+    if not all(np.linalg.norm(v) > 0 for v in moved):
+        return ()
+    W, pivots = row_reduced(np.array([unit_vector(v) for v in moved]), unknowns)
+    found = []
+    for i in range(W.shape[1]):
+        factors = np.zeros(W.shape[1])
+        factors[i] = 1.0
+        factors[pivots] = -W[:, i]
+        factors = np.where(np.abs(factors) < 0.02, 0.0, np.round(4.0 * factors) / 4.0)
+        part = np.flatnonzero(factors)
+        if i in pivots or part.size < 2 or np.abs(factors).max() > _LARGEST_FACTOR:
+            continue
+        members = [unknowns[k] for k in part]
+        # What has another unit has no sum, and a gain or a shift is no parameter.
+        if len({units.get(u.name, u.name) for u in members}) > 1:
+            continue
+        if all(u.logarithmic for u in members):
+            found.append(_sum(factors, covariance, unknowns, to_value))
+    return tuple(found)
+
+
+def _sum(
+    factors: np.ndarray,
+    covariance: np.ndarray,
+    unknowns: tuple[Unknown, ...],
+    to_value: np.ndarray,
+) -> Combination:
+    by_name = {u.name: float(w) for u, w in zip(unknowns, factors, strict=True) if w}
+    value = float(sum(w * u.value for u, w in zip(unknowns, factors, strict=True)))
+    along = factors * to_value
+    sd = math.sqrt(max(0.0, float(along @ covariance @ along)))
+    name = " ".join(_term(n, w, k == 0) for k, (n, w) in enumerate(by_name.items()))
+    ends = (value - Z95 * sd, value + Z95 * sd)
+    return Combination(name, by_name, value, sd, *ends, kind="sum")
+
+
+def _term(name: str, factor: float, first: bool) -> str:
+    sign = "-" if factor < 0 else "" if first else "+"
+    size = "" if abs(factor) == 1 else f"{abs(factor):g} "
+    return f"{sign}{'' if first else ' '}{size}{name}"
+
+
 def combination_name(exponents: dict[str, float]) -> str:
     """`a/Ixx` for {a: 1, Ixx: -1}."""
 
@@ -110,3 +179,18 @@ def combination_name(exponents: dict[str, float]) -> str:
         return " * ".join(over)
     below = under[0] if len(under) == 1 else f"({' * '.join(under)})"
     return f"{' * '.join(over) or '1'}/{below}"
+
+
+type Tied = Callable[[list[np.ndarray], np.ndarray, tuple[Unknown, ...]], tuple[Combination, ...]]
+"""what is determined along null directions, as `combinations` has it"""
+
+
+class Elsewhere(NamedTuple):
+    """What slopes at one point do not tell."""
+
+    twins: tuple[tuple[str, str], ...] = ()
+    """pairs of parameters whose values may be exchanged"""
+    tied: Tied = combinations
+
+
+NOT_ASKED = Elsewhere()

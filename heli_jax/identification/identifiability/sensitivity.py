@@ -8,7 +8,9 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.analysis import NULL, analyse
+from heli_jax.identification.identifiability.combinations import Elsewhere, combinations
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
+from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
@@ -49,7 +51,15 @@ def _unknown(problem: Problem, name: str, value: float) -> Unknown:
     per_log = reference / abs(value) if symmetric and log else 1.0
     distance = abs(value) / reference if symmetric else 1.0
     return Unknown(
-        name, value, log, scale, prior, per_log=per_log, symmetric=symmetric, distance=distance
+        name,
+        value,
+        log,
+        scale,
+        prior,
+        per_log=per_log,
+        symmetric=symmetric,
+        distance=distance,
+        at_bound=transforms.at_bound(free, value),
     )
 
 
@@ -206,6 +216,18 @@ def _remedies(problem: Problem) -> dict[str, str]:
     return {n: "add a run with a known inertia" for n in problem.free if f"{n}_added" in known}
 
 
+class Around(NamedTuple):
+    """What is known of points other than the one whose slopes are asked."""
+
+    aliased: Collection[str] = ()
+    """the parameters that move a mode which the samples do not tell from its aliases"""
+    twins: tuple[tuple[str, str], ...] = ()
+    """pairs of parameters whose values may be exchanged"""
+    valley: Valley | None = None
+    """tells which combinations are the same far from the point; else its slopes are believed"""
+
+
+NOTHING_ELSE = Around()
 _WITHOUT_ALIASES = "bound it where that mode is slower, or log faster"
 
 
@@ -214,7 +236,7 @@ def verdict_of(
     layout: Layout,
     e: Evaluation,
     reported: np.ndarray | None = None,
-    aliased: Collection[str] = (),
+    around: Around = NOTHING_ELSE,
 ) -> Verdict:
     """What the data determine at one point.
 
@@ -224,7 +246,7 @@ def verdict_of(
         e: the whitened residuals' Jacobian and the values there.
         reported: covariance (k, k) of the parameters of interest, in the optimiser's coordinates,
             that the reported intervals have where it is not that of white residuals.
-        aliased: the parameters that move a mode which the samples do not tell from its aliases.
+        around: what is known of points other than this one.
 
     Raises:
         ValueError: the simulation is not finite there.
@@ -235,7 +257,7 @@ def verdict_of(
             "the length of this record; start elsewhere or use a shorter window"
         )
     unknowns, rows = relative_rows(problem, layout, e)
-    unknowns = tuple(u._replace(aliased=u.name in aliased) for u in unknowns)
+    unknowns = tuple(u._replace(aliased=u.name in around.aliased) for u in unknowns)
     # In float32 rounding alone reaches a part in 1e6 of the largest singular value.
     null_below = max(NULL, 100.0 * float(np.finfo(e.J.dtype).eps))
     q = len(unknowns)
@@ -248,5 +270,7 @@ def verdict_of(
         references = references_of(problem, unknowns)
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
-    remedies = _remedies(problem) | dict.fromkeys(aliased, _WITHOUT_ALIASES)
-    return analyse(sensitivity, unknowns, remedies, null_below, without, reported)
+    remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
+    tied = around.valley.tied if around.valley is not None else combinations
+    elsewhere = Elsewhere(around.twins, tied)
+    return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)

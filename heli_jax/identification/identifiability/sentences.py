@@ -61,20 +61,25 @@ class Facts(NamedTuple):
     """by name, the factor to the ends of a 95 % interval that is wide"""
     through_zero: tuple[str, ...] = ()
     """parameters of either sign whose 95 % interval holds zero"""
+    twins: tuple[tuple[str, str], ...] = ()
+    """pairs whose values may be exchanged"""
 
 
 def sentences(facts: Facts) -> tuple[str, ...]:
     """What the data determine, what they do not, and what can be done, most important first."""
     lines = [_without_effect(name) for name in facts.without_effect]
+    lines += [_exchanged(pair, facts) for pair in facts.twins]
     lines += [_not_determined(group, facts) for group in facts.groups]
     # Each parameter is spoken of once, in the sentence that says most: what comes later leaves out
     # what an earlier one has named.
     in_groups = {n for group in facts.groups for n in group.names} | set(facts.without_effect)
+    in_groups |= {n for pair in facts.twins for n in pair}
     partners = [n for n in facts.undetermined if n not in in_groups]
     not_determined = in_groups | set(partners)
     if partners:
         verb = "take part in that and are" if len(partners) > 1 else "takes part in that and is"
         lines.append(f"{listed(partners)} {verb} not determined either.")
+    lines += [_at_bound(u) for u in facts.unknowns if u.at_bound and u.name not in not_determined]
     lines += _determined(facts, not_determined)
     # A pair whose members have both been spoken of needs no sentence of its own.
     covered = set(not_determined)
@@ -97,7 +102,10 @@ def _determined(facts: Facts, not_determined: set[str]) -> list[str]:
     # interval is as narrow as any.
     by_prior = [n for n, share in shares if share > _BY_PRIOR and n not in not_determined]
     by_data = [
-        u.name for u in facts.unknowns if u.name not in not_determined and u.name not in by_prior
+        u.name
+        for u in facts.unknowns
+        # The bound's value is nobody's measurement.
+        if not (u.name in not_determined or u.name in by_prior or u.at_bound)
     ]
     lines = [_by_data(by_data, facts)] if by_data else []
     return lines + _by_prior(by_prior)
@@ -189,6 +197,22 @@ def listed(words: list[str] | tuple[str, ...], last: str = "and") -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
+def _exchanged(pair: tuple[str, str], facts: Facts) -> str:
+    values = [f"{u.value:.4g}" for n in pair for u in facts.unknowns if u.name == n]
+    return (
+        f"{listed(pair)} can be exchanged: the data tell the two values, {listed(values)}, and do "
+        f"not tell which is which: fix one of {', '.join(pair)}, give it a prior, or bound them "
+        "apart."
+    )
+
+
+def _at_bound(u: Unknown) -> str:
+    return (
+        f"{u.name} is at its bound, {u.value:.4g}: the data want it beyond, and do not determine "
+        "it there."
+    )
+
+
 def _without_effect(name: str) -> str:
     # A gain or a shift has no value in the configuration: it goes with its switch.
     switch = _switch(name)
@@ -212,6 +236,12 @@ def _not_determined(group: Inseparable, facts: Facts) -> str:
         )
     elif len(names) == 1:
         what = f"the data do not determine {names[0]}"
+    elif group.count < len(names):
+        # Slopes at one point tell how they trade off there; no number holds along the whole valley.
+        what = (
+            f"the data determine {listed(names)} only together, since they trade off against each "
+            "other"
+        )
     else:
         what = f"the data determine no part of {listed(names)}"
     if group.nuisances:

@@ -1,7 +1,7 @@
 """What the identifiability analysis says: plain data."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -38,17 +38,21 @@ class Unknown(NamedTuple):
     that coordinate is log |value|"""
     aliased: bool = False
     """whether it moves a mode that the samples do not tell from its aliases"""
+    at_bound: bool = False
+    """whether it ended at its bound, so that the data want it beyond"""
 
 
 class Combination(NamedTuple):
-    """A product of powers that the data determine."""
+    """A product of powers, or a sum, that the data determine."""
 
     name: str
     exponents: dict[str, float]
+    """by parameter; of a sum its factors"""
     value: float
     sd: float
     lower95: float
     upper95: float
+    kind: Literal["product", "sum"] = "product"
 
 
 class Pair(NamedTuple):
@@ -94,6 +98,8 @@ class Verdict:
     """parameters that are determined, with an interval that holds zero: their sign is open"""
     exchangeable: tuple[str, ...] = ()
     """nuisances, as 'flight 1/bias p', that make up for what is not determined"""
+    twins: tuple[tuple[str, str], ...] = ()
+    """pairs of parameters whose values may be exchanged: the data do not tell which is which"""
 
     @property
     def text(self) -> str:

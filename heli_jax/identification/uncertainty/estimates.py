@@ -57,6 +57,8 @@ def estimates_of(
         if free is not None and u.name in problem.model.delay_parameters:
             # Symmetric, as that of what may be zero; what it was not searched for it cannot be.
             low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
+        if u.at_bound and free is not None:
+            low, high = (float(v) for v in np.clip((low, high), *transforms.limits(free)))
         not_identifiable = u.name in verdict.undetermined or u.name in verdict.without_effect
         start = free.start if free else (0.0 if u.name == "time_shift" else 1.0)
         estimates[u.name] = Estimate(
@@ -110,21 +112,15 @@ def _at_bound(problem: Problem, name: str, value: float) -> bool:
     if free is None:
         # The shift is searched through a tanh, which comes near to its bound and never to it.
         return name == "time_shift" and abs(value) > 0.999 * MAX_TIME_SHIFT
-    low, high = free.lower, free.upper
-    width = high - low if low is not None and high is not None else abs(value)
-    near = 1e-3 * width
-    # Of a small lower bound beside a wide range: near in proportion to the bound itself, since the
-    # search is in logarithms there.
-    by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
-    by_high = high is not None and high - value < near
-    return bool(by_low or by_high)
+    return transforms.at_bound(free, value)
 
 
 def bound_notes(estimates: dict[str, Estimate]) -> list[str]:
     """Where an estimate ended at its bound."""
     return [
-        f"{name} ended at its bound: the data want it beyond {estimate.value:g}; its interval does "
-        "not hold there."
+        f"{name} ended at its bound: the data want it beyond {estimate.value:g}. Its interval ends "
+        "there and does not hold, and the other estimates are those of a bound that the data do "
+        "not bear out. Remedy: widen the bound, or mend what makes the data want that."
         for name, estimate in estimates.items()
         if estimate.at_bound
     ]

@@ -9,8 +9,9 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
-from heli_jax.identification.identifiability.sensitivity import verdict_of
-from heli_jax.identification.identifiability.verdict import Z95, Verdict
+from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.valley import Valley
+from heli_jax.identification.identifiability.verdict import Z95, Combination, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.autocorrelated_residuals import (
     Sandwich,
@@ -40,6 +41,7 @@ def standard_errors(
     *,
     white: bool,
     aliased: Collection[str] = (),
+    twins: tuple[tuple[str, str], ...] = (),
 ) -> StandardErrors:
     """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
     estimated, the sandwich.
@@ -51,10 +53,11 @@ def standard_errors(
         before: the verdict at the first guess, which stands where the optimum has no Jacobian.
         white: whether the residuals are white and independent between outputs.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
+        twins: the pairs of parameters whose values may be exchanged.
     """
     layout, estimator = at.layout, at.layout.estimator
     usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
-    verdict = verdict_of(problem, layout, e, aliased=aliased) if usable else before
+    around = Around(frozenset(aliased), twins, Valley(problem, at, e))
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
     freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
@@ -62,6 +65,7 @@ def standard_errors(
     # Rows that are dependent under white noise too say nothing by the residuals' whiteness.
     white = white and estimator.rows_are_white
     if white or not (usable and estimator.rows_are_samples):
+        verdict = verdict_of(problem, layout, e, around=around) if usable else before
         # Weighed by the noise's own spectrum, the bound allows for it as it stands.
         allowed = usable and not white and estimator.noise_spectrum
         return StandardErrors(verdict, np.ones(layout.size), quantiles, allowed)
@@ -69,21 +73,21 @@ def standard_errors(
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)
     # The rule of the factor of ten has to see the intervals that are reported.
-    verdict = verdict_of(problem, layout, e, _reported(errors, layout, quantiles), aliased)
+    verdict = verdict_of(problem, layout, e, _reported(errors, layout, quantiles), around)
     verdict = _widened(verdict, errors, _along(verdict, layout, e))
     return StandardErrors(verdict, errors.inflation(), quantiles, True)
 
 
 def _along(verdict: Verdict, layout: Layout, e: Evaluation) -> np.ndarray:
-    """The logarithms of the verdict's combinations as directions (k, q) of the unknowns."""
-    # d log p / dz: combinations are products of powers, sums in logarithms, and z is either the
-    # logarithm itself or, with bounds or a free sign, another coordinate.
-    slopes = np.asarray(e.slopes) / np.asarray(e.named)
+    """The verdict's combinations, of products the logarithms, as directions (k, q) of the
+    unknowns."""
+    # d log p / dz: products of powers are sums in logarithms, and z is either the logarithm itself
+    # or, with bounds or a free sign, another coordinate.
     along = np.zeros((len(verdict.combinations), layout.size))
     for k, c in enumerate(verdict.combinations):
         for name, power in c.exponents.items():
             i = layout.of_interest.index(name)
-            along[k, i] = power * slopes[i]
+            along[k, i] = power * e.slopes[i] / (e.named[i] if c.kind == "product" else 1.0)
     return along
 
 
@@ -105,13 +109,20 @@ def _widened(verdict: Verdict, errors: Sandwich, along: np.ndarray) -> Verdict:
         return verdict
     wider = errors.inflation(along)
     reach = wider * errors.quantile(along) / Z95
-    # In logarithms: the ends of an interval of a product lie at equal factors, not distances.
     combinations = tuple(
-        c._replace(
-            sd=float(c.sd * w),
-            lower95=float(c.value * (c.lower95 / c.value) ** r),
-            upper95=float(c.value * (c.upper95 / c.value) ** r),
-        )
+        _wider(c, float(w), float(r))
         for c, w, r in zip(verdict.combinations, wider, reach, strict=True)
     )
     return replace(verdict, combinations=combinations)
+
+
+def _wider(c: Combination, sd: float, reach: float) -> Combination:
+    """A combination with its sd and the reach of its interval multiplied."""
+
+    def end(at: float) -> float:
+        # The ends of an interval of a product lie at equal factors, not distances.
+        if c.kind == "product":
+            return c.value * (at / c.value) ** reach
+        return c.value + (at - c.value) * reach
+
+    return c._replace(sd=c.sd * sd, lower95=end(c.lower95), upper95=end(c.upper95))

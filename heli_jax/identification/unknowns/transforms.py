@@ -94,6 +94,23 @@ def inside(free: Free, value: float) -> bool:
     return bool(low <= value <= high)
 
 
+def at_bound(free: Free, value: float) -> bool:
+    """Whether an estimate ended at a bound that was stated.
+
+    Args:
+        free: with the bounds.
+        value: of the estimate.
+    """
+    low, high = free.lower, free.upper
+    width = high - low if low is not None and high is not None else abs(value)
+    near = 1e-3 * width
+    # Of a small lower bound beside a wide range: near in proportion to the bound itself, since the
+    # search is in logarithms there.
+    by_low = low is not None and value - low < min(near, 1e-3 * abs(low) if low else near)
+    by_high = high is not None and high - value < near
+    return bool(by_low or by_high)
+
+
 def to_value(transform: str, z: Real, sign: Real, low: Real, high: Real) -> Real:
     """The parameter's value for a coordinate.
 

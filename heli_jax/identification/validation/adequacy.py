@@ -21,7 +21,7 @@ import numpy as np
 import scipy.special
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.estimation.noise_covariance import white_part
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
@@ -43,6 +43,7 @@ NEARLY_WHITE = 0.1
 WORSE = -0.1
 """VAF below which not even a white residual is taken for noise alone: in a short record of noise
 chance makes it a few hundredths negative"""
+CHANCE = "what is said to be determined is so at an optimum of chance"
 EXPECTED = 9.0
 """power of the simulation's error over that which the disturbance lets expect: its square root is
 three standard deviations where the disturbance is so slow that the record holds one swing of it"""
@@ -65,6 +66,8 @@ class Adequacy(NamedTuple):
     residuals are white and others carry the fit"""
     doubts: tuple[str, ...] = ()
     """what forbids to call it adequate, however well it fits"""
+    by_chance: bool = False
+    """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
     limited: str = ""
     """what keeps an adequate model from a plain yes, where no residual in time is judged"""
     at_optimum: bool = True
@@ -211,7 +214,11 @@ def assess(problem: Problem, params: Any, evidence: Evidence) -> Adequacy:
         outputs,
         tuple(_reason(output, evidence.ahead) for output in bad),
         tuple(dict.fromkeys(advice)),
-        (*_as_expected(outputs, evidence.ahead), *(_unexplained(output) for output in unexplained)),
+        (
+            *_as_expected(outputs, evidence.ahead),
+            *(_unexplained(output) for output in unexplained),
+            *(_stays(n) for n in evidence.agreement if _still(n, evidence.records)),
+        ),
         tuple(output.output for output in unexplained),
         ahead=evidence.ahead,
     )
@@ -307,6 +314,13 @@ def _unexplained(output: OutputAdequacy) -> str:
     )
 
 
+def _stays(name: str) -> str:
+    return (
+        f"The measured {name} never moves: its VAF is undefined, and nothing of it is judged. Is "
+        "it the right column, and does the sensor work?"
+    )
+
+
 def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
     """The measured output (any,), flight after flight."""
     return np.concatenate([r.measured[name] for r in records if name in r.measured])
@@ -323,13 +337,19 @@ def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
             "as much of noise alone.",
         ),
         ("Use larger or more inputs, a longer record, or an output with less noise.",),
-        doubts=("what is said to be determined is so at an optimum of chance",),
+        doubts=(CHANCE,),
+        by_chance=True,
     )
 
 
 def _still(name: str, records: tuple[Record, ...]) -> bool:
     """Whether an output never moves: nothing is to be explained."""
-    return all(np.nanstd(r.measured[name]) == 0 for r in records if name in r.measured)
+    # By its range: the mean of equal numbers, and so their variance, is off by rounding. As
+    # `metrics` has it, so that what has no VAF is not judged by one.
+    return all(
+        np.nanmax(y) - np.nanmin(y) <= 1e-9 * np.nanmax(np.abs(y))
+        for y in (r.measured[name] for r in records if name in r.measured)
+    )
 
 
 def _of_output(name: str, m: Metrics, evidence: Evidence, unstable: bool) -> OutputAdequacy:
@@ -363,7 +383,7 @@ def _explained(error: list[np.ndarray], measured: np.ndarray) -> tuple[float, fl
         residual, total = float(np.nanvar(np.concatenate(error))), float(np.nanvar(measured))
         # Flight by flight, since differences across the joint of two flights are no noise.
         sizes = [int(np.count_nonzero(~np.isnan(r))) for r in error]
-        noises = [noise_guess(r) ** 2 for r in error]
+        noises = [white_part(r) ** 2 for r in error]
         noise = float(np.average(noises, weights=sizes))
     if not np.isfinite(residual):
         return float("nan"), float("nan")

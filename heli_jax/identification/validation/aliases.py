@@ -13,12 +13,14 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.identification.estimation.noise_covariance import white_part
+from heli_jax.identification.identifiability.valley import SAME, Valley
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.operating_point import OperatingPoint, operating_point
 
-_AT_NYQUIST = 0.9
-"""part of the Nyquist frequency from which on a mode is hardly shown by the samples"""
+_NEAR, _AT_NYQUIST = 0.8, 0.9
+"""parts of the Nyquist frequency from which on the samples hardly show a mode: from the first its
+alias is tried, from the second nobody has to ask"""
 _MOVED = 1e-6
 """relative change of a mode, for a relative change of a parameter, that is none"""
 _TURNED = 0.2
@@ -47,6 +49,8 @@ class FastMode(NamedTuple):
     """where the model was linearised; empty for a linear one"""
     undetermined: tuple[str, ...]
     """the free parameters that can take it to an alias, where it shows in an output"""
+    turning: tuple[tuple[str, float], ...] = ()
+    """those that can, whether it shows or not, each with the factor that takes it there"""
 
     @property
     def words(self) -> str:
@@ -66,7 +70,7 @@ def measurement_noise(
     """
     # What a wrong optimum misses passes for noise in its residuals, and would hide its fast mode.
     return tuple(
-        {n: max(min(float(s), noise_guess(flight.outputs[n])), 1e-300) for n, s in one.items()}
+        {n: max(min(float(s), white_part(flight.outputs[n])), 1e-300) for n, s in one.items()}
         for flight, one in zip(problem.training, sd, strict=True)
     )
 
@@ -168,7 +172,7 @@ def _of_flight(
         return None
     nyquist = np.pi / flight.dt
     # The imaginary part alone: a fast decay without oscillation has no alias.
-    past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _AT_NYQUIST * nyquist]
+    past = [k for k, v in enumerate(modes.eigenvalues) if v.imag >= _NEAR * nyquist]
     if not past:
         return None
     slopes = {n: _relative_slopes(problem, params, at, n, modes) for n in moving}
@@ -176,13 +180,14 @@ def _of_flight(
     past = [k for k in past if any(abs(s[k]) > _MOVED for s in slopes.values())]
     if not past:
         return None
+    slopes = {n: s for n, s in slopes.items() if not _known_otherwise(problem, n)}
     undetermined = [
         n
         for n, slope in slopes.items()
         if noise is not None
-        and not _known_otherwise(problem, n)
         and any(
             abs(slope[k].imag) > _TURNED
+            and modes.eigenvalues[k].imag >= _AT_NYQUIST * nyquist
             # What is gone within a sample swings in none, under any alias, unless it swings many
             # times before it is gone: then its frequency was told by nothing.
             and (
@@ -193,9 +198,41 @@ def _of_flight(
             for k in past
         )
     ]
-    fastest = max(float(modes.eigenvalues[k].imag) for k in past)
+    first = max(past, key=lambda k: float(modes.eigenvalues[k].imag))
+    fastest = float(modes.eigenvalues[first].imag)
+    # By powers: that is how a frequency goes with a stiffness or a time constant.
+    turned = {n: float(s[first].imag) for n, s in slopes.items() if abs(s[first].imag) > _TURNED}
+    other = (2.0 * nyquist - fastest) / fastest
+    turning = tuple((n, other ** (1.0 / s)) for n, s in turned.items() if other > 0)
     label = flight.name or "the flight"
-    return FastMode(label, fastest, nyquist, at.words, tuple(undetermined))
+    return FastMode(label, fastest, nyquist, at.words, tuple(undetermined), turning)
+
+
+_AS_GOOD = 0.02
+"""of the sum of squares by which an alias may be worse and still fit as well: where a model lacks
+something, chi-squared's few squares tell nothing"""
+
+
+def as_good_as_aliases(modes: Sequence[FastMode], valley: Valley) -> list[FastMode]:
+    """The modes, each with the parameters that take it to an alias which fits as well.
+
+    Args:
+        modes: of `fast_modes` at an optimum.
+        valley: about that optimum.
+    """
+    # A filter's rows hold the level of its variances too, and no squares to take a part of.
+    if not valley.at.layout.estimator.least_squares:
+        return list(modes)
+    values = dict(zip(valley.at.layout.of_interest, valley.e.named, strict=True))
+    worse = max(SAME, _AS_GOOD * float(np.sum(np.square(np.asarray(valley.e.r, np.float64)))))
+    found = []
+    for mode in modes:
+        more = []
+        for name, factor in () if mode.undetermined else mode.turning:
+            point = valley.visit({name: float(values[name]) * factor}, {}, priors=True)
+            more += [name] if point is not None and point.excess <= worse else []
+        found.append(mode._replace(undetermined=(*mode.undetermined, *more)))
+    return found
 
 
 def _known_otherwise(problem: Problem, name: str) -> bool:

@@ -23,7 +23,7 @@ from heli_jax.identification.estimation.frequency_lines import errors_of_lines
 from heli_jax.identification.estimation.frequency_records import records_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.adequacy import EXPLAINED, Adequacy
+from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
 
 LEVEL = 0.01
@@ -76,6 +76,64 @@ def by_excitation(
     limited = f"some of the residual of {', '.join(failed)} follows {what}" if failed else ""
     notes = (said, *remarks) if failed else remarks
     return Adequacy(True, False, (), remarks=notes, limited=limited)
+
+
+def unless_unrelated(problem: Problem, adequacy: Adequacy) -> Adequacy:
+    """The adequacy of a fit in frequency, none where no output follows what excites the machine.
+
+    Residuals that do not follow the excitation are no merit where the output does not either.
+
+    Args:
+        problem: with the flights, their inputs and instruments.
+        adequacy: as judged by the residuals alone.
+    """
+    p_values = outputs_against_excitation(problem)
+    if not p_values or min(p_values.values()) < LEVEL / len(p_values):
+        return adequacy
+    what = "excitation" if instruments_of(problem) else "inputs"
+    numbers = ", ".join(f"{n} (p {p:.2g})" for n, p in p_values.items())
+    return Adequacy(
+        False,
+        False,
+        (),
+        (
+            f"No output follows the {what} beyond chance: {numbers}. So these data say nothing of "
+            "the model, and any optimum is one of noise.",
+        ),
+        (
+            "Is it the right column, and the same clock? Else use larger or more inputs, or a "
+            "longer record.",
+        ),
+        doubts=(f"no output follows the {what}: {CHANCE}",),
+        by_chance=True,
+    )
+
+
+def outputs_against_excitation(problem: Problem) -> dict[str, float]:
+    """By output the probability that noise alone follows the excitation as much; outputs with gaps
+    and of too few lines are left out.
+
+    Args:
+        problem: with the flights, their inputs and instruments.
+    """
+    by = instruments_of(problem)
+    sums: dict[str, np.ndarray] = {}
+    for flight in problem.training:
+        drives = [flight.instruments[n] if n in by else u for n, u in flight.inputs.items()]
+        drives = [v for v in drives if np.ptp(v) > 0]
+        names = [n for n, y in flight.outputs.items() if np.isfinite(y).all() and np.ptp(y) > 0]
+        if not drives or not names:
+            continue
+        count = flight.n_samples // 2
+        X, y = _lines(drives, count), _lines([flight.outputs[n] for n in names], count)
+        for j, name in enumerate(names):
+            found = _in_bands(y[:, j], y[:, j], np.ones(count), X)
+            sums[name] = sums.get(name, np.zeros(4)) + found
+    return {
+        name: float(scipy.special.chdtrc(freedom, statistic))
+        for name, (statistic, freedom, *_) in sums.items()
+        if freedom > 0
+    }
 
 
 def _diverged(agreement: Mapping[str, Metrics]) -> tuple[str, ...]:

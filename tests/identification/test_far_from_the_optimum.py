@@ -1,0 +1,196 @@
+"""What slopes at one point do not tell: sums that look like products, parameters that may be
+exchanged, bounds, and swings that the samples hardly show."""
+
+import json
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
+from heli_jax.identification.estimation.noise_covariance import noise_guess, white_part
+from heli_jax.identification.validation.excitation_test import outputs_against_excitation
+from heli_jax.naming import Scalar
+from heli_jax.report import fit_content
+from tests.identification.test_enough import steps
+
+DT, N = 0.02, 1000
+U = steps(np.random.default_rng(5), N)
+
+
+class Params(NamedTuple):
+    La: Annotated[Scalar, "1/s", "a part of the damping"]
+    Lb: Annotated[Scalar, "1/s", "the other part"]
+    T1: Annotated[Scalar, "s", "first lag"]
+    T2: Annotated[Scalar, "s", "second lag"]
+    K: Annotated[Scalar, "1/s^2", "effect"]
+    M: Annotated[Scalar, "1", "factor of the effect"]
+
+
+class Rate(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "roll rate"]
+
+
+class Two(NamedTuple):
+    p: Annotated[Scalar, "rad/s", "roll rate"]
+    s: Annotated[Scalar, "rad/s", "what the servo has made of the stick"]
+
+
+class Inputs(NamedTuple):
+    u: Annotated[Scalar, "1", "stick"]
+
+
+SUM = Model(
+    "sum",
+    lambda q, x, i: Rate((q.La + q.Lb) * x.p + q.K * q.M * i.u),
+    lambda q, x, i: Rate(x.p),
+    Params, Rate, Inputs, Rate, linear=True,
+)  # fmt: skip
+LAGS = Model(
+    "lags",
+    lambda q, x, i: Two((x.s - x.p) / q.T1, (q.K * i.u - x.s) / q.T2),
+    lambda q, x, i: Rate(x.p),
+    Params, Two, Inputs, Rate, linear=True,
+)  # fmt: skip
+TRUTH = Params(-1.5, -1.5, 0.3, 0.06, 10.0, 1.0)
+
+
+def lagged(A, B, C):
+    """The output for the held stick, from rest, by SciPy."""
+    F, G, *_ = scipy.signal.cont2discrete((A, B, C, [[0.0]]), DT)
+    x, y = np.zeros(len(A)), np.empty(N)
+    for k, u in enumerate(U):
+        y[k] = (C @ x).item()
+        x = F @ x + G[:, 0] * u
+    return y
+
+
+def flight(p, noise=0.02, seed=0):
+    y = p + noise * np.random.default_rng(seed).standard_normal(N)
+    return Flight(dt=DT, inputs={"u": U}, outputs={"p": y})
+
+
+FIRST = flight(lagged(np.array([[-3.0]]), np.array([[10.0]]), np.array([[1.0]])))
+SECOND = flight(
+    lagged(
+        np.array([[-1 / 0.3, 1 / 0.3], [0.0, -1 / 0.06]]),
+        np.array([[0.0], [10.0 / 0.06]]),
+        np.array([[1.0, 0.0]]),
+    )
+)
+
+
+def fitted(model, record, **free):
+    return fit(Problem(model, TRUTH, [record], free, Nuisance(bias=False)))
+
+
+@pytest.mark.parametrize(
+    "starts", [(-1.0, -1.0), pytest.param((-0.5, -2.5), marks=pytest.mark.slow)]
+)
+def test_of_a_sum_nothing_but_the_sum_is_said_to_be_determined(starts):
+    record, (La, Lb) = FIRST, starts
+    found = fitted(SUM, record, La=Free(La), Lb=Free(Lb), K=Free(3.0))
+    assert found.status == "not-identifiable"
+    [c] = found.verdict.combinations
+    assert (c.name, c.kind, c.exponents) == ("La + Lb", "sum", {"La": 1.0, "Lb": 1.0})
+    assert c.lower95 < -3.0 < c.upper95
+    # The oracle: one of the two known, the other is as sure as the sum.
+    alone = fitted(SUM, record, La=Free(La), K=Free(3.0)).estimates["La"]
+    assert c.value == pytest.approx(alone.value + TRUTH.Lb, rel=1e-4)
+    assert c.sd == pytest.approx(alone.sd, rel=0.02)
+    assert "The data determine only La + Lb of La and Lb" in found.verdict.text
+    assert json.loads(json.dumps(fit_content.combinations(found.verdict)))[0]["kind"] == "sum"
+
+
+def test_a_product_is_one_far_from_the_optimum_too():
+    found = fitted(SUM, FIRST, La=Free(-1.0), K=Free(3.0), M=Free(2.0))
+    [c] = found.verdict.combinations
+    assert (c.name, c.kind) == ("K * M", "product")
+    assert c.lower95 < 10.0 < c.upper95
+
+
+@pytest.mark.parametrize("starts", [(0.06, 0.3), (0.4, 0.03)])
+def test_two_lags_in_series_are_told_to_be_exchangeable(starts):
+    T1, T2 = (Free(s, sign="keep") for s in starts)
+    found = fitted(LAGS, SECOND, T1=T1, T2=T2, K=Free(3.0))
+    assert found.verdict.twins == (("T1", "T2"),)
+    assert found.status == "not-identifiable"
+    assert found.not_identifiable == ("T1", "T2")
+    assert "T1 and T2 can be exchanged" in found.verdict.text
+    assert "The data determine K." in found.verdict.text
+    assert sorted(found.estimates[n].value for n in ("T1", "T2")) == pytest.approx(
+        [0.06, 0.3], rel=0.1
+    )
+
+
+@pytest.mark.slow
+def test_bounds_that_tell_lags_apart_are_enough():
+    T1, T2 = Free(0.2, lower=0.12, upper=2.0), Free(0.05, lower=0.01, upper=0.12)
+    problem = Problem(LAGS, TRUTH, [SECOND], {"T1": T1, "T2": T2}, Nuisance(bias=False))
+    assert fit(problem).verdict.twins == ()
+    assert check(problem).verdict.twins == ()
+    free = {"T1": Free(0.2, sign="keep"), "T2": Free(0.05, sign="keep")}
+    open_ = Problem(LAGS, TRUTH, [SECOND], free, Nuisance(bias=False))
+    assert check(open_).verdict.twins == (("T1", "T2"),)
+
+
+@pytest.mark.parametrize(
+    "method", ["output-error", pytest.param("frequency-error", marks=pytest.mark.slow)]
+)
+def test_a_parameter_at_its_bound_is_not_determined_and_no_failure(method):
+    free = {"La": Free(-0.1, lower=-0.5), "K": Free(3.0)}
+    found = fit(Problem(SUM, TRUTH, [FIRST], free, Nuisance(bias=False), method=method))
+    assert found.status == "converged"
+    assert found.notes[0].startswith("La ended at its bound: the data want it beyond -0.5.")
+    assert "La is at its bound, -0.5" in found.verdict.text
+    assert "determine La" not in found.verdict.text
+    estimate = found.estimates["La"]
+    assert estimate.at_bound
+    assert estimate.lower95 == -0.5
+    assert not any("stuck" in note for note in found.notes)
+
+
+def test_a_fast_swing_is_no_white_noise():
+    rng = np.random.default_rng(1)
+    white = rng.standard_normal(4000)
+    assert white_part(white) == pytest.approx(1.0, rel=0.1)
+    swing = scipy.signal.lfilter([1.0], [1.0, 1.8, 0.9], white)
+    # Its spectrum at zero is (1 / 3.7)^2, all of which may be white.
+    assert white_part(swing) == pytest.approx(1.0 / 3.7, rel=0.3)
+    assert noise_guess(swing) > 3.0
+    # What is slow is no noise either, and was none before.
+    slow = scipy.signal.lfilter([1.0], [1.0, -1.8, 0.9], white)
+    assert white_part(slow) == noise_guess(slow)
+
+
+@pytest.mark.parametrize(
+    "method", ["frequency-error", pytest.param("frequency-response", marks=pytest.mark.slow)]
+)
+def test_an_output_that_does_not_follow_the_stick_makes_no_model_adequate(method):
+    rng = np.random.default_rng(3)
+    drift = scipy.signal.lfilter([0.05], [1.0, -0.95], rng.standard_normal(N))
+    record = flight(drift, noise=0.0)
+    free = {"La": Free(-1.0), "K": Free(3.0)}
+    problem = Problem(SUM, TRUTH, [record], free, Nuisance(bias=False), method=method)
+    assert outputs_against_excitation(problem)["p"] > 0.01
+    found = fit(problem)
+    assert not found.adequate
+    assert "no output follows the inputs" in found.adequacy.summary
+    assert not any("somebody holds" in note for note in found.notes)
+    assert outputs_against_excitation(Problem(SUM, TRUTH, [FIRST], free))["p"] < 1e-10
+
+
+def test_an_output_that_never_moves_has_no_vaf_and_is_finite():
+    phi = np.full(N, np.deg2rad(3.0))
+    record = Flight(dt=DT, inputs={"u": U}, outputs={"p": FIRST.outputs["p"], "s": phi})
+    both = Model(
+        "both",
+        LAGS.vector_field,
+        lambda q, x, i: x,
+        Params, Two, Inputs, Two, linear=True,
+    )  # fmt: skip
+    free = {"T1": Free(0.3), "K": Free(10.0)}
+    found = fit(Problem(both, TRUTH, [record], free, Nuisance(bias=False)))
+    assert not any("not finite" in note for note in found.notes)
+    assert any("The measured s never moves: its VAF is undefined" in n for n in found.notes)
