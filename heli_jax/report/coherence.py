@@ -11,11 +11,11 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.operating_point import OperatingPoint
 from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
-from heli_jax.identification.validation.operating_point import OperatingPoint
 from heli_jax.report import frequency
 
 COHERENT = 0.6

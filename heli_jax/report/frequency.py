@@ -9,16 +9,16 @@ import scipy.linalg
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.operating_point import (
+    EVERYWHERE,
+    OperatingPoint,
+    operating_point,
+)
 from heli_jax.analysis.spectra import OWN, leakage, spectra
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
-from heli_jax.identification.validation.operating_point import (
-    EVERYWHERE,
-    OperatingPoint,
-    operating_point,
-)
 from heli_jax.simulation.simulate import substeps_for
 
 type Response = Callable[[np.ndarray], np.ndarray]

@@ -39,6 +39,20 @@ class Picture(NamedTuple):
     """its number among the page's charts; None where the image is all"""
 
 
+def of_file(png: Path, title: str, alt: str) -> Picture:
+    """An image that is drawn already.
+
+    Args:
+        png: its file.
+        title: of the figure.
+        alt: what it shows, in words.
+    """
+    with Image.open(png) as image:
+        size = image.size
+    data = base64.b64encode(png.read_bytes()).decode("ascii")
+    return Picture(png.stem, title, f"data:image/png;base64,{data}", size, alt)
+
+
 def picture(
     name: str,
     draw: Draw,

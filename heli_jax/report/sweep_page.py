@@ -1,17 +1,14 @@
 """The page of a sweep: its summary as tables, and its figures; self-contained."""
 
-import base64
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from heli_jax.numbers import NOTHING, number
 from heli_jax.report.origin import origin
 from heli_jax.report.page import filled
-from heli_jax.report.pictures import Picture
+from heli_jax.report.pictures import Picture, of_file
 from heli_jax.report.sweeps.files import stems
 from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
@@ -98,11 +95,7 @@ def _pictures(content: dict[str, Any], folder: Path) -> Iterator[tuple[Picture, 
         told = [name] if kind in _KINDS else list(content["results"])
         numbers = "; ".join(_range(n, content["results"][n]) for n in told[:_TOLD])
         alt = f"{title}: {words}. Over the sweep {numbers}."
-        with Image.open(png) as image:
-            size = image.size
-        data = base64.b64encode(png.read_bytes()).decode("ascii")
-        picture = Picture(png.stem, title, f"data:image/png;base64,{data}", size, alt)
-        yield picture, f"{title}: {words}. (figures/{png.stem}.svg, .png)"
+        yield of_file(png, title, alt), f"{title}: {words}. (figures/{png.stem}.svg, .png)"
 
 
 _TOLD = 6

@@ -118,7 +118,7 @@ def test_feedback_that_was_not_tested_is_said():
     assert "was not tested: the record is too short (3 s, expected 4 s" in found.sentence
     jumps = problem(flight(0))
     [found] = _of_feedback(jumps, feedback_of(jumps))
-    assert found.severity == "ok"
+    assert found.severity == "note"
     assert "between jumps" in found.sentence
 
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.valley import SAME, Valley
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
-from heli_jax.identification.validation.operating_point import OperatingPoint, operating_point
 
 _FREQUENCIES = 9
 """at which responses are compared, from the record's length to the samples'"""

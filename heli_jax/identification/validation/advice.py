@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
+from heli_jax.analysis.operating_point import modes_of_flight
 from heli_jax.dynamics.disturbance import disturbable
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.validation.metrics import cross_correlation
-from heli_jax.identification.validation.operating_point import modes_of_flight
 from heli_jax.simulation.simulate import simulate
 
 # params is Any: a record of a model's Params, whose class may be a user's own.

@@ -12,11 +12,11 @@ import numpy as np
 
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
+from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.noise_covariance import white_part
 from heli_jax.identification.identifiability.valley import SAME, Valley
 from heli_jax.identification.problem import Problem
-from heli_jax.identification.validation.operating_point import OperatingPoint, operating_point
 
 _NEAR, _AT_NYQUIST = 0.8, 0.9
 """parts of the Nyquist frequency from which on the samples hardly show a mode: from the first its

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from heli_jax import naming
+from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.onboard.filters import states_behind
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.finding import Finding, Severity
-from heli_jax.identification.validation.operating_point import operating_point
 from heli_jax.numbers import number
 
 HOPELESS, ENOUGH = 2.0, 5.0

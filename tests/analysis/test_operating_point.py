@@ -10,10 +10,10 @@ import scipy.integrate
 import scipy.signal
 
 from heli_jax import Flight, Free, Helicopter, Model, Problem, models
+from heli_jax.analysis.operating_point import operating_point
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.excitation import sampling
-from heli_jax.identification.validation.operating_point import operating_point
 from heli_jax.report import figures, frequency
 from heli_jax.report.frequency import FittedFlight
 from tests.dynamics import whole_helicopter as oracle
