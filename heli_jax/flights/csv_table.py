@@ -88,16 +88,16 @@ def open_csv(path: Path) -> "CsvTable":
         text = Body(where, rows, delimiter, 1, False).text
         header, delimiter = tabs_for_blanks(header), "\t"
         rows = memoryview(tabs_for_blanks(text).encode())
-    # Counted before the names are parsed, so that a line of commas makes no million names.
+    # Before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(where, header.count(delimiter) + 1, line)
     names = header_names(where, header, delimiter, head.number)
     if all(is_number(name) for name in names):
         listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
         problem = "got numbers, expected the names of the columns; write a line of names above"
         raise wrong(where, f"{problem}, such as {shown(listed)}", line)
-    has_quotes = data.find(b'"', head.after) >= 0
-    body = Body(where, rows, delimiter, head.number + 1, has_quotes)
-    units = _units_below(body, names)
+    quotes = data.find(b'"', head.after) >= 0
+    body, cut = Body(where, rows, delimiter, head.number + 1, quotes).whole(len(names))
+    notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
         return CsvTable(size, digest, names, body, notes)
     body, number_of_line = _below(body)

@@ -23,6 +23,10 @@ class OnDisk(NamedTuple):
     """some of the lines, from the first on"""
 
 
+_LAST = 1 << 16
+"""bytes in which the last line is looked for"""
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """The bytes below the header; they are text in UTF-8."""
@@ -62,6 +66,33 @@ class Body:
         else:
             rows = rows[size:]
         return replace(self, rows=rows, first_line=self.first_line + lines)
+
+    def whole(self, width: int) -> tuple["Body", tuple[str, ...]]:
+        """The body without a last line that ends before its last cells, as where a logger lost its
+        power, and a note of it.
+
+        Args:
+            width: cells of a row.
+        """
+        tail = self._end(_LAST)
+        at = max(tail.rfind(b"\n"), tail.rfind(b"\r")) + 1
+        cells = tail[at:].count(self.delimiter.encode()) + 1
+        # Of quotes a delimiter may stand within; an only line is told as what it is.
+        if at in (0, len(tail)) or cells >= width or self.has_quotes:
+            return self, ()
+        # In memory from here on: a file on the disk is read to its end.
+        return replace(self, rows=self.data[: at - len(tail)]), (
+            f"the last line is cut off ({cells} of {width} cells): it is left out",
+        )
+
+    def _end(self, size: int) -> bytes:
+        """The last `size` bytes, or fewer."""
+        if not isinstance(self.rows, OnDisk):
+            return bytes(self.rows[-size:])
+        with self.rows.path.open("rb") as file:
+            begin = max(self.rows.begin, self.rows.end - size)
+            file.seek(begin)
+            return file.read(self.rows.end - begin)
 
     @functools.cached_property
     def text(self) -> str:

@@ -7,6 +7,7 @@ import scipy.io
 from heli_jax.errors import InputError
 from heli_jax.flights import describe_log
 from heli_jax.flights.convert import Selection, convert_log
+from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
 
@@ -177,3 +178,19 @@ def test_convert_spreads_neither_marks_nor_turns(tmp_path):
     assert np.nanmax(np.abs(got.columns["p"])) < 1.1
     assert "unwrapped" in " ".join(got.notes)
     assert "5 samples of -9999" in " ".join(got.notes)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_a_last_line_that_is_cut_off_is_left_out_and_told(tmp_path, monkeypatch, large):
+    if large:
+        monkeypatch.setattr("heli_jax.flights.csv_on_disk._LARGE", 1)
+    rows = "".join(f"{0.01 * k:.2f},{k % 7},0.5\n" for k in range(100))
+    path = tmp_path / "cut.csv"
+    path.write_text(f"t,a,b\n{rows}1.00,3")
+    table = open_csv(path)
+    assert any("the last line is cut off (2 of 3 cells)" in note for note in table.notes)
+    assert len(table.numbers(["t", "a", "b"])["b"]) == 100
+    path.write_text(f"t,a,b\n{rows}1.00,3,0.5")
+    whole = open_csv(path)
+    assert whole.notes == ()
+    assert len(whole.numbers(["t"])["t"]) == 101
