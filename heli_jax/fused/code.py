@@ -91,17 +91,23 @@ class Code:
         """A line as it is."""
         self.lines.append(f"  {line}")
 
+    def pointer(self, table: str, i: int) -> str:
+        """The i-th of a table of pointers."""
+        place, pointer = self.register(), self.register()
+        self.write(f"{place} = getelementptr ptr, ptr {table}, i64 {i}")
+        self.write(f"{pointer} = load ptr, ptr {place}")
+        return pointer
+
     def made(self, right: str, dtype: np.dtype, shared: bool) -> Value:
         """The value of an instruction."""
         name = self.register()
         self.write(f"{name} = {right}")
         return Value(name, np.dtype(dtype), shared)
 
-    def begin(self, kind: str) -> str:
-        """A new block of lines, by its name; the one before has to end with a branch to it."""
+    def new_label(self, kind: str) -> str:
+        """The name of a block that is yet to be written."""
         self._count += 1
-        self.block = f"{kind}{self._count}"
-        return self.block
+        return f"{kind}{self._count}"
 
     def label(self, name: str) -> None:
         """Here begins a block."""

@@ -1,7 +1,6 @@
 """A program for whole runs of many vehicles: from the first sample to the last."""
 
 import ctypes
-import functools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -91,7 +90,8 @@ class Kernel:
         # Kept until the call is over: the program has pointers to them.
         given = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
-        tables = [_pointers(part, count, self._arguments(i)) for i, part in enumerate(given)]
+        kinds = (self._run.stays, self._run.stored, self._run.carry)
+        tables = [_pointers(v, count, kind) for v, kind in zip(given, kinds, strict=True)]
         ends = _pointers(results, count, self._results)
         blocks = count // self.lanes
         shares = np.linspace(0, blocks, min(threads, blocks) + 1).astype(int) * self.lanes
@@ -106,9 +106,6 @@ class Kernel:
             with ThreadPoolExecutor(len(shares) - 1) as pool:
                 list(pool.map(part, range(len(shares) - 1)))
         return results
-
-    def _arguments(self, part: int) -> Sequence[Argument]:
-        return (self._run.stays, self._run.stored, self._run.carry)[part]
 
 
 def _pointers(arrays: Sequence[np.ndarray], count: int, arguments: Sequence[Argument]) -> Any:
@@ -145,10 +142,7 @@ def _assembly(run: Run, lanes: int) -> tuple[str, list[Argument]]:
     given = [elements(code, v) for v in results]
     kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in given]
     for i, value in enumerate(v for array in given for v in array.ravel()):
-        place = code.register()
-        code.write(f"{place} = getelementptr ptr, ptr %results, i64 {i}")
-        row = code.made(f"load ptr, ptr {place}", np.dtype(np.int64), True).operand
-        _store(code, value, row)
+        _store(code, value, code.pointer("%results", i))
     code.write("br label %done")
     code.label("done")
     code.write(f"%following = add i64 %b, {lanes}")
@@ -179,10 +173,7 @@ def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
     for i, argument in enumerate(arguments):
         if len(argument.shape) != 1:
             raise UnsupportedError(f"a record of shape {argument.shape}")
-        place = code.register()
-        code.write(f"{place} = getelementptr ptr, ptr %stored, i64 {i}")
-        pointer = code.register()
-        code.write(f"{pointer} = load ptr, ptr {place}")
+        pointer = code.pointer("%stored", i)
         made.append(
             Stored(
                 argument.shape,
@@ -204,11 +195,7 @@ def _tables(
         size = int(np.prod(argument.shape))
         pointers = []
         for _ in range(1 if argument.shared else size):
-            at = code.register()
-            code.write(f"{at} = getelementptr ptr, ptr {name}, i64 {place}")
-            pointer = code.register()
-            code.write(f"{pointer} = load ptr, ptr {at}")
-            pointers.append(pointer)
+            pointers.append(code.pointer(name, place))
             place += 1
         if not argument.shared:
             rows.append((argument, pointers))
@@ -253,8 +240,8 @@ def _store(code: Code, value: Value, row: str) -> None:
     code.write(f"store {vector} {operand}, ptr {place}, align {size}")
 
 
-@functools.cache
-def _target() -> Any:
+def _machine() -> Any:
+    """The processor at hand, for LLVM."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
@@ -268,14 +255,12 @@ def _compiled(assembly: str) -> Any:
     """The engine that holds the machine code, which goes with it."""
     import llvmlite.binding as llvm
 
-    target = _target()
+    target = _machine()
     module = llvm.parse_assembly(assembly)
     module.verify()
     builder = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=3))
     builder.getModulePassManager().run(module, builder)
-    machine = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3
-    )
-    engine = llvm.create_mcjit_compiler(module, machine)
+    # One of its own: the engine takes it over.
+    engine = llvm.create_mcjit_compiler(module, _machine())
     engine.finalize_object()
     return engine

@@ -23,19 +23,21 @@ def loop(
         body: of the pass's number (int32) and what is carried, what is carried on.
     """
     starts = [elements(code, v) for v in carry]
-    varies = [np.vectorize(lambda v: not v.shared, otypes=[bool])(v) for v in starts]
+    varies = [_vary(v) for v in starts]
     # What starts the same for all vehicles may not stay so: tried until nothing changes.
     while True:
         mark = code.mark()
         results = _tried(code, until, starts, varies, body)
-        changed = [
-            old | np.vectorize(lambda v: not v.shared, otypes=[bool])(new)
-            for old, new in zip(varies, results[1], strict=True)
-        ]
+        changed = [old | _vary(new) for old, new in zip(varies, results[1], strict=True)]
         if all(np.array_equal(a, b) for a, b in zip(varies, changed, strict=True)):
             return list(results[0])
         varies = changed
         code.back_to(mark)
+
+
+def _vary(values: Elements) -> np.ndarray:
+    """Of each whether vehicles have numbers of their own."""
+    return np.vectorize(lambda v: not v.shared, otypes=[bool])(values)
 
 
 def _tried(
@@ -49,7 +51,7 @@ def _tried(
         [code.of(v, not bool(w)) for v, w in zip(s.ravel(), each.ravel(), strict=True)]
         for s, each in zip(starts, varies, strict=True)
     ]
-    entry, inside = code.block, code.begin("loop")
+    entry, inside = code.block, code.new_label("loop")
     code.write(f"br label %{inside}")
     code.label(inside)
     # The phi nodes are written when what comes round is known; their place is kept.
@@ -72,7 +74,7 @@ def _tried(
     else:
         again = until(list(results))
     end = code.block
-    after = code.begin("after")
+    after = code.new_label("after")
     phis = [f"{index.operand} = phi i32 [ 0, %{entry} ], [ {following.operand}, %{end} ]"]
     for values, first, then in zip(carried, before, around, strict=True):
         for v, a, b in zip(values.ravel(), first, then, strict=True):

@@ -82,7 +82,7 @@ def _equation(code: Code, equation: Any, inputs: list[Operand]) -> list[Operand]
         return translate(
             code, inner.jaxpr if closed else inner, inner.consts if closed else (), inputs
         )
-    if name in ("optimization_barrier", "copy", "copy_p", "stop_gradient", "reduce_precision"):
+    if name in ("optimization_barrier", "copy"):
         return list(inputs)
     if name == "scan":
         return _scan(code, params, inputs)
@@ -224,7 +224,8 @@ def _while(code: Code, params: dict[str, Any], inputs: list[Operand]) -> list[Op
     entered = holds(carry)
     results = loop(
         code,
-        holds,
+        # Never again where it should not have been entered: such a loop may have no end.
+        lambda carried: code.operation("and", entered, holds(carried)),
         carry,
         lambda _, carried: translate(code, body.jaxpr, body.consts, [*of_body, *carried]),
     )

@@ -70,16 +70,7 @@ def signals_of(e: Evaluation, flights: tuple[Flight, ...]) -> tuple[Signals, ...
         for innovations in e.innovations
     ] or [None] * len(flights)
     return tuple(
-        Signals(
-            label,
-            f.hold_out,
-            f.times,
-            dict(f.inputs),
-            dict(f.outputs),
-            {n: np.asarray(v) for n, v in by_name.items()},
-            error,
-            None if f.source is None else f.window[0],
-        )
+        _signals(label, f, {n: np.asarray(v) for n, v in by_name.items()}, error)
         for label, f, by_name, error in zip(
             labels(flights), flights, e.simulated, errors, strict=True
         )
@@ -91,16 +82,26 @@ def free_runs(
 ) -> tuple[Signals, ...]:
     """The flights held out as simulated in one piece."""
     return tuple(
-        Signals(
-            label,
-            f.hold_out,
-            f.times,
-            dict(f.inputs),
-            dict(f.outputs),
-            run,
-            log_start=None if f.source is None else f.window[0],
-        )
+        _signals(label, f, run)
         for label, f, run in zip(labels(flights), flights, runs or (), strict=runs is not None)
+    )
+
+
+def _signals(
+    label: str,
+    flight: Flight,
+    simulated: dict[str, np.ndarray],
+    error: dict[str, np.ndarray] | None = None,
+) -> Signals:
+    return Signals(
+        label,
+        flight.hold_out,
+        flight.times,
+        dict(flight.inputs),
+        dict(flight.outputs),
+        simulated,
+        error,
+        None if flight.source is None else flight.window[0],
     )
 
 

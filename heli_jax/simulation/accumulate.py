@@ -102,7 +102,6 @@ def accumulated(
             option that only `simulate` has.
         TypeError: a keyword that is no option.
     """
-    # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
     options = keywords.pop("options", DEFAULT).changed(keywords)
     reducer, run, x0 = _prepared(model, params, flight, update, limits, options)
     _, args, _, _ = run
@@ -185,6 +184,7 @@ def _prepared(
     options: SimulationOptions,
 ) -> "tuple[_Reducer, _Stepping, Record]":
     """What is done at a sample, how it is stepped from one to the next, and the first State."""
+    # Refused rather than ignored: a run that is not kept cannot show that they did nothing.
     for name in _NOT_HERE:
         if getattr(options, name) is not getattr(DEFAULT, name):
             raise ValueError(f"accumulate: expected no {name}, which only simulate has")

@@ -114,10 +114,7 @@ def of_samples(
         reduced: the running values after the last sample, the State there, and by name whether a
             limit was left.
     """
-    value, state, outside = reduced
-    n = jax.tree.leaves(numbers.inputs)[0].shape[0]
-    results = _finished(plan, numbers, value, n)
-    return _concluded(plan, numbers, values, trim, (results, {}, state, list(outside.values())))
+    return _concluded(plan, numbers, values, trim, _of_reduced(plan, numbers, *reduced))
 
 
 def _concluded(
@@ -284,9 +281,15 @@ def _streamed(plan: Plan, numbers: FlightNumbers, params: Any, state: Any, input
         limits=True,
         options=options,
     )
-    n = jax.tree.leaves(inputs)[0].shape[0]
-    results = _finished(plan, numbers, reduced.value, n)
-    return results, {}, reduced.state, list(reduced.outside.values())
+    return _of_reduced(plan, numbers, reduced.value, reduced.state, reduced.outside)
+
+
+def _of_reduced(
+    plan: Plan, numbers: FlightNumbers, value: Any, state: Any, outside: dict[str, Any]
+) -> _Run:
+    """What is left of a run that was not kept."""
+    n = jax.tree.leaves(numbers.inputs)[0].shape[0]
+    return _finished(plan, numbers, value, n), {}, state, list(outside.values())
 
 
 def _whole(

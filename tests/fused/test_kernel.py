@@ -206,3 +206,22 @@ def test_a_random_expression(expression):
         return jnp.where(k == 0, value, x)
 
     agree(step, rtol=1e-9)
+
+
+def test_a_loop_that_is_not_entered_ends():
+    def step(stays, u, x, k):
+        # Counted down to zero, from which it would go on for ever.
+        return jax.lax.while_loop(
+            lambda c: c[1] != 0, lambda c: (0.5 * c[0], c[1] - 1), (x, jnp.where(k == 2, 0, 2))
+        )[0]
+
+    agree(step)
+
+
+def test_reduced_precision_is_not_passed_over():
+    with pytest.raises(UnsupportedError, match="reduce_precision"):
+        compiled(
+            lambda s, u, x, k: jax.lax.reduce_precision(x, 5, 10),
+            [np.ones(LANES), 1.0],
+            np.ones(LANES),
+        )
