@@ -8,8 +8,8 @@ only adds. Ours counts the discretisation of every vehicle, where C is handed it
 
     .venv/bin/python experiments/benchmarks/sweeps.py [--quick] [--out runs/benchmarks]
 
-Takes three minutes on two cores of their own, nine where they are shared. Where JAX finds a GPU it
-is measured as well.
+Takes three minutes on two cores of their own, nine where they are shared. GPUs have a benchmark of
+their own, `gpu_sweeps.py`.
 """
 
 import argparse
@@ -418,40 +418,11 @@ def ours_at(flight: Flight, n: int) -> float:
     return 1e6 * seconds(run) / n
 
 
-def on_gpu(sizes: Sizes) -> tuple[list[tuple[str, str, str]], dict[str, Any]]:
-    """The compiled part alone on a GPU, whole batches at once, and what a step of it takes."""
-    from heli_jax.sweeps.program import Program, arguments
-    from heli_jax.sweeps.spec import RunOptions, job
-
-    flight, rows, drawn = record(6000), [], {}
-    for precision in ("float64", "float32"):
-        for solver in ("exact", "rk4"):
-            for n in (1000, 10_000, 100_000, 1_000_000):
-                described = job(
-                    models.roll_on_stand, VEHICLE, flight, design(n), REDUCE,
-                    RunOptions(solver, SUBSTEPS, precision),
-                )  # fmt: skip
-                program = Program(described, 0, jax.local_devices()[:1], n)
-                values = arguments(described, described.design.values(0, n))
-                jax.block_until_ready(program(values, n))
-                best = min(
-                    seconds(lambda p=program, v=values, n=n: jax.block_until_ready(p(v, n)))
-                    for _ in range(3)
-                )
-                steps = 6000 / 4 if solver == "exact" else 6000
-                rows.append((
-                    f"GPU, {solver}, {precision}, {n} vehicles",
-                    f"{1e6 * best / n:.3f} us, {1e6 * best / steps:.1f} us a step", "",
-                ))  # fmt: skip
-                drawn[(precision, solver, n)] = 1e6 * best / n
-    return rows, drawn
-
-
-def draw(path: Path, drawn: dict[str, Any], gpu: dict[Any, float]) -> None:
+def draw(path: Path, drawn: dict[str, Any]) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots(2, 2).ravel()
+    figure = Figure(figsize=(14, 4), layout="constrained")
+    axes = figure.subplots(1, 3)
     names = sorted(drawn.get("throughput", {}), key=lambda n: drawn["throughput"][n])
     axes[0].barh(names, [drawn["throughput"][n] for n in names])
     axes[0].set(xscale="log", xlabel="a vehicle of 6000 samples [µs]")
@@ -461,14 +432,6 @@ def draw(path: Path, drawn: dict[str, Any], gpu: dict[Any, float]) -> None:
         ax.loglog(list(points), list(points.values()), "o-")
         ax.set(xlabel=text, ylabel="a vehicle [µs]")
         ax.grid(alpha=0.3)
-    for kind in sorted({k[:2] for k in gpu}):
-        points = {n: v for (p, s, n), v in gpu.items() if (p, s) == kind}
-        axes[3].loglog(list(points), list(points.values()), "o-", label=" ".join(kind))
-    axes[3].set(xlabel="vehicles of 6000 samples", ylabel="a vehicle [µs]", title="GPU")
-    if gpu:
-        axes[3].legend()
-    else:
-        axes[3].text(0.5, 0.5, "no GPU here", ha="center", transform=axes[3].transAxes)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     print(f"figure: {path}")
@@ -485,16 +448,11 @@ def main() -> None:
         return
     sizes = QUICK if options.quick else FULL
     print(f"jax {jax.__version__}, {jax.local_devices()[0].device_kind}, 6000 samples")
-    gpu: dict[Any, float] = {}
-    if jax.default_backend() == "cpu":
-        rows, drawn = on_cpu(sizes)
-    else:
-        rows, gpu = on_gpu(sizes)
-        drawn = {}
+    rows, drawn = on_cpu(sizes)
     table(rows)
     if options.quick:
         print("quick: so small that start-up counts; only a whole run gives figures")
-    draw(Path(options.out) / "sweeps.png", drawn, gpu)
+    draw(Path(options.out) / "sweeps.png", drawn)
 
 
 if __name__ == "__main__":

@@ -100,4 +100,4 @@ class SweepConfig(DesignConfig):
     """batch size: design points computed side by side on a device"""
     backend: Literal["auto", "xla", "fused"] = "auto"
     """what computes each run over time: xla, sample by sample for a batch; fused, one program of
-    machine code for a whole run, on CPUs; auto, fused where it can be"""
+    machine code for a whole run; auto, fused on CPUs where it can be"""

@@ -1,6 +1,7 @@
 """LLVM assembly, line by line: scalars that all vehicles share, and vectors over vehicles."""
 
 import struct
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,20 @@ class Value(NamedTuple):
     dtype: np.dtype
     shared: bool
     """the same for all vehicles: a scalar, no vector"""
+
+
+class Target(NamedTuple):
+    """What a program is written for."""
+
+    lanes: int
+    """vehicles in flight at once in one thread: vectors of so many; with one, plain numbers"""
+    threads: bool = False
+    """whether each thread has a place of its own among many, as on a GPU"""
+    memory: str = ""
+    """LLVM's address space of arrays"""
+    functions: Callable[[str, str], str | None] = lambda name, kind: None
+    """of LLVM's name of a function and the kind of number (`float`, `double`): another that is
+    called instead; None for LLVM's own"""
 
 
 _TYPES = {
@@ -64,14 +79,17 @@ class Code:
     stands for all that comes after.
     """
 
-    def __init__(self, lanes: int) -> None:
-        self.lanes = lanes
+    def __init__(self, target: Target) -> None:
+        self.target, self.lanes = target, target.lanes
+        self.memory = f"ptr{target.memory}"
+        """the type of a pointer to an array"""
         self.lines: list[str] = []
         self.block = "entry"
         self.declared: dict[str, str] = {}
         self.globals: dict[str, str] = {}
         self._count = 0
         self._spread: dict[tuple[str, str], str] = {}
+        self._whole: dict[str, Value] = {}
 
     def register(self) -> str:
         """A name that is new."""
@@ -94,9 +112,14 @@ class Code:
     def pointer(self, table: str, i: int) -> str:
         """The i-th of a table of pointers."""
         place, pointer = self.register(), self.register()
-        self.write(f"{place} = getelementptr ptr, ptr {table}, i64 {i}")
-        self.write(f"{pointer} = load ptr, ptr {place}")
+        self.write(f"{place} = getelementptr ptr, {self.memory} {table}, i64 {i}")
+        self.write(f"{pointer} = load {self.memory}, {self.memory} {place}{self.unchanging}")
         return pointer
+
+    @property
+    def unchanging(self) -> str:
+        """Behind a load of what no thread writes: a GPU reads it by a shorter way."""
+        return ", !invariant.load !0" if self.target.threads else ""
 
     def made(self, right: str, dtype: np.dtype, shared: bool) -> Value:
         """The value of an instruction."""
@@ -116,12 +139,15 @@ class Code:
 
     def typed(self, dtype: np.dtype, shared: bool) -> str:
         """The type of a number, or of one a vehicle."""
-        kind = type_of(np.dtype(dtype))
-        return kind if shared else f"<{self.lanes} x {kind}>"
+        return self.vector(type_of(np.dtype(dtype)), shared)
+
+    def vector(self, kind: str, shared: bool = False) -> str:
+        """LLVM's type of one number, or of one a vehicle."""
+        return kind if shared or self.lanes == 1 else f"<{self.lanes} x {kind}>"
 
     def of(self, value: Value, shared: bool) -> str:
         """The operand for a shared number or, spread over the vehicles, for one each."""
-        if shared or not value.shared:
+        if shared or not value.shared or self.lanes == 1:
             return value.operand
         kind = type_of(value.dtype)
         if not value.operand.startswith("%"):
@@ -155,17 +181,22 @@ class Code:
         kind = self.typed(values[0].dtype, shared)
         suffix = {"double": "f64", "float": "f32"}.get(type_of(values[0].dtype))
         suffix = suffix or type_of(values[0].dtype)
-        full = f"@llvm.{name}.{suffix if shared else f'v{self.lanes}{suffix}'}"
+        own = self.target.functions(name, type_of(values[0].dtype))
+        full = f"@llvm.{name}.{self.many(shared)}{suffix}" if own is None else f"@{own}"
         self.declared[full] = f"declare {kind} {full}({', '.join([kind] * len(values))})"
         operands = ", ".join(f"{kind} {self.of(v, shared)}" for v in values)
         return self.made(f"call {kind} {full}({operands})", values[0].dtype, shared)
+
+    def many(self, shared: bool) -> str:
+        """What stands before a type in an intrinsic's name."""
+        return "" if shared or self.lanes == 1 else f"v{self.lanes}"
 
     def choose(self, which: Value, yes: Value, no: Value) -> Value:
         """One of two."""
         shared = which.shared and yes.shared and no.shared
         kind = self.typed(yes.dtype, shared)
         # One truth value for whole vectors is a scalar to LLVM too.
-        of_which = f"i1 {which.operand}" if which.shared else f"<{self.lanes} x i1> {which.operand}"
+        of_which = f"{self.vector('i1', which.shared)} {which.operand}"
         operands = f"{kind} {self.of(yes, shared)}, {kind} {self.of(no, shared)}"
         return self.made(f"select {of_which}, {operands}", yes.dtype, shared)
 
@@ -175,13 +206,22 @@ class Code:
         target = self.typed(dtype, value.shared)
         return self.made(f"{name} {source} {value.operand} to {target}", dtype, value.shared)
 
+    def remember_whole(self, value: Value, integer: Value) -> None:
+        """That a number with digits behind the point was made of an integer."""
+        self._whole[value.operand] = integer
+
+    def whole(self, value: Value) -> Value | None:
+        """The integer that a number was made of, so that its way back costs nothing."""
+        return self._whole.get(value.operand)
+
     def load(self, pointer: str, index: Value, dtype: np.dtype) -> Value:
         """The element of an array that all vehicles share."""
         at, kind = self.register(), type_of(np.dtype(dtype))
         stored = "i8" if kind == "i1" else kind
         place = f"{type_of(index.dtype)} {index.operand}"
-        self.write(f"{at} = getelementptr {stored}, ptr {pointer}, {place}")
-        value = self.made(f"load {stored}, ptr {at}", np.dtype(dtype), True)
+        self.write(f"{at} = getelementptr {stored}, {self.memory} {pointer}, {place}")
+        right = f"load {stored}, {self.memory} {at}{self.unchanging}"
+        value = self.made(right, np.dtype(dtype), True)
         if kind != "i1":
             return value
         return self.made(f"trunc i8 {value.operand} to i1", np.dtype(dtype), True)
@@ -192,7 +232,9 @@ class Code:
         if kind == "i1":
             kind, values = "i8", values.astype(np.uint8)
         each = ", ".join(f"{kind} {constant(v, values.dtype).operand}" for v in values.ravel())
-        text = f"private unnamed_addr constant [{values.size} x {kind}] [{each}]"
+        text = (
+            f"private unnamed_addr{self.target.memory} constant [{values.size} x {kind}] [{each}]"
+        )
         name = next((n for n, t in self.globals.items() if t == text), None)
         if name is None:
             name = f"@table{len(self.globals)}"

@@ -74,6 +74,8 @@ def _negative(code: Code, a: Value, **_: Any) -> Value:
 
 
 def _rounded(code: Code, a: Value, *, rounding_method: Any, **_: Any) -> Value:
+    if code.whole(a) is not None:
+        return a
     nearest_even = int(rounding_method) == 1
     return code.intrinsic("roundeven" if nearest_even else "round", a)
 
@@ -149,11 +151,18 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
     if source == "f" and to == "f":
         wider = target.itemsize > a.dtype.itemsize
         return code.cast("fpext" if wider else "fptrunc", a, target)
+    integer = code.whole(a)
+    if integer is not None and to == "i" and target.itemsize >= integer.dtype.itemsize:
+        return converted(code, integer, new_dtype=target)
     if source == "f":
         # Saturating, as XLA has it: `fptosi` of a number past the type's range is anything.
         return _saturated(code, a, target)
     if to == "f":
-        return code.cast("sitofp" if source == "i" else "uitofp", a, target)
+        made = code.cast("sitofp" if source == "i" else "uitofp", a, target)
+        if source == "i" and a.shared:
+            # The sample's number, which the simulation takes for a time and rounds to an index.
+            code.remember_whole(made, a)
+        return made
     if source == "b":
         return code.cast("zext", a, target)
     if type_of(a.dtype) == type_of(target):
@@ -166,7 +175,7 @@ def converted(code: Code, a: Value, *, new_dtype: Any, **_: Any) -> Value:
 def _saturated(code: Code, a: Value, target: np.dtype) -> Value:
     kind = "fptosi" if target.kind == "i" else "fptoui"
     f, i = {"double": "f64", "float": "f32"}[type_of(a.dtype)], type_of(target)
-    lanes = "" if a.shared else f"v{code.lanes}"
+    lanes = code.many(a.shared)
     name = f"@llvm.{kind}.sat.{lanes}{i}.{lanes}{f}"
     source, result = code.typed(a.dtype, a.shared), code.typed(target, a.shared)
     code.declared[name] = f"declare {result} {name}({source})"

@@ -57,8 +57,8 @@ def split_for(
         devices: of JAX; those of this process unless given.
         chunk: elements written at a time; taken as it is where it is given.
         lanes: elements computed side by side on a device; likewise.
-        backend: "xla", "fused" (a run as one program of machine code, on CPUs), or "auto": fused
-            where it can be.
+        backend: "xla", "fused" (a run as one program of machine code), or "auto": fused on
+            CPUs where it can be.
         shares: how many processes take chunks side by side; each shall have several.
         memory: a file that keeps what was measured.
         say: called with a sentence where measuring takes a while, or a run has no fused program.
@@ -87,6 +87,7 @@ def split_for(
 def _fused_or_xla(
     job: Job, devices: tuple[Any, ...], lanes: int, backend: str, say: Callable[[str], None]
 ) -> str:
+    # On a GPU it was never timed: there only who asks for it gets it.
     if devices[0].platform != "cpu" and backend == "auto":
         return "xla"
     # Here, since it loads another compiler.

@@ -1,4 +1,4 @@
-"""A chunk whose runs are one program of machine code each, with XLA before and behind them."""
+"""A chunk whose runs are one program of machine code, with XLA before and behind it."""
 
 import functools
 import importlib.util
@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.kernel import Argument, Kernel, Run, lanes_for
+from heli_jax.fused.cuda_driver import CudaError, Gpu
+from heli_jax.fused.gpu_kernel import GpuKernel
+from heli_jax.fused.kernel import Kernel, lanes_for
+from heli_jax.fused.program import Argument, Run
 from heli_jax.numerics.hoist import hoisted
 from heli_jax.sweeps.design_point import ElementResults, of_samples, samples_of
 from heli_jax.sweeps.flight_numbers import (
@@ -23,13 +27,17 @@ from heli_jax.sweeps.flight_numbers import (
 from heli_jax.sweeps.program import arguments, filled_up, spread, trims_of
 from heli_jax.sweeps.spec import Job, Plan
 
+_NVIDIA = ("gpu", "cuda")
+_COMPARED = 32
+"""elements that a GPU and the processor both compute, before the GPU is believed"""
+
 # `Any` below: trees of arrays, jaxprs, the functions that JAX compiles and its devices.
 
 
 class _Parts(NamedTuple):
     """A plan's program for flights of one shape."""
 
-    kernel: Kernel
+    kernel: Kernel | GpuKernel
     begin: Any
     """of (numbers, (values, trim)): what is carried before the first sample, and what stays"""
     shared: Any
@@ -52,19 +60,63 @@ def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
         devices: of JAX, that would compute it.
         lanes: as a program takes it.
     """
-    if any(d.platform != "cpu" for d in devices):
-        return "it is for CPUs"
+    on_gpu = devices[0].platform != "cpu"
+    if on_gpu and (devices[0].platform not in _NVIDIA or len(devices) > 1):
+        return "it is for CPUs, or for one GPU of NVIDIA's"
     if not job.streamed or not job.simulated:
         return "its runs are kept whole, or none is made"
+    if on_gpu and not _has_processor():
+        return "JAX_PLATFORMS leaves no processor to compare a GPU's numbers with"
     if importlib.util.find_spec("llvmlite") is None:
         return "llvmlite is not installed"
     try:
         # What it compiles is remembered, for the sweep that follows.
         for index in range(len(job.flights)):
-            FusedProgram(job, index, devices, lanes)
+            program = FusedProgram(job, index, devices, lanes)
+            if on_gpu and not _agrees(job, index, program):
+                return "the GPU gives other numbers than the processor"
     except UnsupportedError as e:
         return f"there is no translation of {e}"
+    except CudaError as e:
+        return str(e)
     return None
+
+
+def _has_processor() -> bool:
+    try:
+        return len(jax.devices("cpu")) > 0
+    except RuntimeError:
+        return False
+
+
+def run_of(job: Job, index: int) -> Run:
+    """What the program of one of the job's flights is translated from.
+
+    Raises:
+        UnsupportedError: a part of it has no translation.
+    """
+    return _traced(*_example(job, index)).run
+
+
+def _agrees(job: Job, index: int, program: "FusedProgram") -> bool:
+    """Whether a GPU gives what the processor gives, for a few elements.
+
+    The driver compiles the program, and JAX knows nothing of it: a wrong number would be seen by
+    nobody.
+    """
+    count = min(_COMPARED, job.design.size)
+    values = arguments(job, job.design.values(0, count))
+    here = FusedProgram(job, index, jax.devices("cpu")[:1], count)
+    own, expected = (
+        [np.asarray(v)[:count] for v in jax.tree.leaves(p(values, count))] for p in (program, here)
+    )
+    tolerance = np.sqrt(np.finfo(job.precision).eps)
+    close = [
+        np.isclose(a, b, tolerance, tolerance * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)
+        for a, b in zip(own, expected, strict=True)
+    ]
+    # Of most: a run that leaves its steady flight by itself magnifies any rounding.
+    return all(np.mean(c) >= 0.5 for c in close)
 
 
 class FusedProgram:
@@ -73,6 +125,7 @@ class FusedProgram:
     def __init__(self, job: Job, index: int, devices: Sequence[Any], lanes: int) -> None:
         plan, numbers, values, trim = _example(job, index)
         self._numbers, self._threads = numbers, len(devices)
+        self._on_gpu = devices[0].platform != "cpu"
         leaves, structure = jax.tree.flatten((numbers, values, trim))
         kinds = tuple((np.shape(v), np.asarray(v).dtype) for v in leaves)
         self._parts = _compiled(plan, structure, kinds, tuple(devices), lanes)
@@ -87,19 +140,31 @@ class FusedProgram:
         mapped = jax.device_put((filled, trims), parts.split)
         carry, own = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        shared, own = iter(parts.shared(numbers, *first)), iter(own)
-        stays = [_rows(next(own)) if v else np.asarray(next(shared)) for v in parts.varies]
-        stored = jax.tree.leaves(_records(numbers))
-        samples = stored[0].shape[0]
-        carry = [_rows(v) for v in carry]
-        results = parts.kernel(stays, stored, carry, samples, self._threads)
+        shared = iter(parts.shared(numbers, *first))
+        carry, own = _rows((carry, own)) if self._on_gpu else _rows_here((carry, own))
+        own = iter(own)
+        stays = [next(own) if v else next(shared) for v in parts.varies]
+        results = self._run(stays, jax.tree.leaves(_records(numbers)), carry)
         reduced = jax.tree.unflatten(parts.reduced, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
 
+    def _run(self, stays: Any, stored: Any, carry: Any) -> Any:
+        kernel = self._parts.kernel
+        if isinstance(kernel, GpuKernel):
+            return kernel(stays, stored, carry)
+        stays, stored, carry = ([np.asarray(v) for v in p] for p in (stays, stored, carry))
+        return kernel(stays, stored, carry, self._threads)
 
-def _rows(v: Any) -> np.ndarray:
+
+@jax.jit
+def _rows(tree: Any) -> Any:
     """With the elements as the last dimension."""
-    return np.moveaxis(np.asarray(v), 0, -1)
+    return jax.tree.map(lambda v: jnp.moveaxis(v, 0, -1), tree)
+
+
+def _rows_here(tree: Any) -> Any:
+    """The same, where it takes no copy."""
+    return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), tree)
 
 
 def _records(numbers: FlightNumbers) -> Any:
@@ -188,6 +253,7 @@ def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> _
         ),
         tuple(Argument(v.shape, v.dtype, True) for v in jax.tree.leaves(records)),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
+        jax.tree.leaves(records)[0].shape[0],
     )
     return _Traced(closed, run, found["reduced"])
 
@@ -229,7 +295,10 @@ def _compiled(
 
     before, split = spread(own, devices, lanes)
     conclude, _ = spread(functools.partial(of_samples, plan), devices, lanes)
-    kernel = Kernel(run, lanes_for(np.dtype(plan.precision)))
+    if devices[0].platform == "cpu":
+        kernel = Kernel(run, lanes_for(np.dtype(plan.precision)))
+    else:
+        kernel = GpuKernel(run, Gpu(devices[0].local_hardware_id), devices[0])
     return _Parts(
         kernel, before, jax.jit(shared), conclude, split, trims_of(plan, lanes), varies, reduced
     )

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from heli_jax.fused.code import UnsupportedError
-from heli_jax.fused.kernel import Argument, Kernel, Run
+from heli_jax.fused.kernel import Kernel
+from heli_jax.fused.program import Argument, Run
 
 LANES, N = 8, 5
 RECORD = np.array([0.3, -0.7, 1.1, 0.2, -0.4])
@@ -36,8 +37,9 @@ def compiled(step, stays, carry, dtype=np.float64, vehicles=LANES, lanes=LANES):
         ),
         (Argument((N,), np.dtype(dtype), True),),
         (Argument((), np.dtype(dtype), False),),
+        N,
     )
-    found = Kernel(run, lanes)(stays, [record], [carry], N, 1)
+    found = Kernel(run, lanes)(stays, [record], [carry], 1)
 
     def alone(i):
         own = [v[..., i] if v.ndim else v for v in stays]
@@ -164,12 +166,13 @@ def test_threads_share_the_vehicles():
         (Argument((), np.dtype(float), False), Argument((), np.dtype(float), True)),
         (Argument((N,), np.dtype(float), True),),
         (Argument((), np.dtype(float), False),),
+        N,
     )
     kernel = Kernel(run, 16)
     for threads in (1, 2, 3, 9):
-        given = ([gains, np.asarray(1.0)], [RECORD], [carry], N, threads)
-        np.testing.assert_array_equal(kernel(*given)[0], kernel(*given[:-1], 1)[0])
-        np.testing.assert_allclose(kernel(*given)[0], expected, rtol=1e-13)
+        given = ([gains, np.asarray(1.0)], [RECORD], [carry])
+        np.testing.assert_array_equal(kernel(*given, threads)[0], kernel(*given, 1)[0])
+        np.testing.assert_allclose(kernel(*given, threads)[0], expected, rtol=1e-13)
 
 
 _SMOOTH = ("sin", "cos", "tanh", "arctan", "where", "clip", "sqrt", "log", "square", "abs")

@@ -112,3 +112,44 @@ def test_whole_helicopters(name):
     found = agree(1e-8, model, vehicle, flight, design, reduce, trimmed=trimmed)
     if trimmed is not None:
         assert (found["status"] == 0).any()
+
+
+def by_thread(model, vehicle, flight, design, reduce, monkeypatch, **options):
+    """The results as a GPU's program gives them, run on the processor, and as XLA does."""
+    import jax
+
+    from heli_jax.fused import gpu_kernel
+    from heli_jax.fused.gpu_kernel import GpuKernel
+    from heli_jax.sweeps import fused_program
+    from heli_jax.sweeps.program import Program, arguments
+    from heli_jax.sweeps.spec import RunOptions, job
+    from tests.fused.emulated_gpu import EmulatedGpu, as_text
+
+    monkeypatch.setattr(gpu_kernel, "ptx", as_text)
+    wanted = job(model, vehicle, flight, design, reduce, RunOptions(**options))
+    devices, n = jax.devices("cpu")[:1], design.size
+    program = fused_program.FusedProgram(wanted, 0, devices, n)
+    kernel = GpuKernel(fused_program.run_of(wanted, 0), EmulatedGpu(), devices[0])
+    monkeypatch.setattr(program, "_parts", program._parts._replace(kernel=kernel))
+    monkeypatch.setattr(program, "_on_gpu", True)
+    values = arguments(wanted, design.values(0, n))
+    # Whole blocks are computed, and what is past the design belongs to nobody.
+    both = program(values, n), Program(wanted, 0, devices, n)(values, n)
+    return [jax.tree.map(lambda v: np.asarray(v)[:n], r) for r in both]
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_a_program_for_a_gpu(bench30, record, solver, precision, monkeypatch):
+    design = paired(
+        {"Ixx": [0.02, 0.024, 0.03, 0.036, 0.04, 0.05], "kappa": [0.0, -1e5, 0, 0, 0, 0]}
+    )
+    reduce = BOTH | {"rmse": Reduce("rmse", "roll")}
+    found, expected = by_thread(
+        STAND, bench30, record, design, reduce, monkeypatch, solver=solver, precision=precision
+    )
+    rtol = 1e-11 if precision == "float64" else 1e-4
+    np.testing.assert_array_equal(found.status, expected.status)
+    assert found.status.tolist() == [0, 1, 0, 0, 0, 0]
+    for name, value in expected.results.items():
+        np.testing.assert_allclose(found.results[name], value, rtol=rtol, atol=rtol)

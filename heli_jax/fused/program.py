@@ -1,0 +1,208 @@
+"""The text of a program for whole runs of many vehicles: from the first sample to the last."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax.fused.code import Code, Target, UnsupportedError, Value, constant, type_of
+from heli_jax.fused.loops import loop
+from heli_jax.fused.operands import INDEX, Elements, Operand, Stored, elements
+from heli_jax.fused.translate import translate
+
+
+class Argument(NamedTuple):
+    """An array that the program is given: one for all vehicles, or a row of each vehicle's own."""
+
+    shape: tuple[int, ...]
+    """without the vehicles"""
+    dtype: np.dtype
+    shared: bool
+
+
+class Run(NamedTuple):
+    """What is compiled; jaxprs as `jax.make_jaxpr` gives them."""
+
+    step: Any
+    """of (what stays, what is stored, carry, the sample, int32): the carry a sample later"""
+    last: Any
+    """of (what stays, what is stored, carry): the results"""
+    stays: tuple[Argument, ...]
+    """what does not change over the samples"""
+    stored: tuple[Argument, ...]
+    """arrays (N, ...) that all vehicles share, read by the sample"""
+    carry: tuple[Argument, ...]
+    samples: int
+    """N, two at least"""
+
+
+class Text(NamedTuple):
+    """A program in LLVM's language: of one function, `run`.
+
+    Its arguments are four tables of pointers (what stays, what is stored, the carry, the results:
+    one for each array that is shared, one for each row of the others, where a row has a number of
+    each vehicle), and between which vehicles it is to compute.
+    """
+
+    assembly: str
+    results: list[Argument]
+
+
+def write(run: Run, target: Target) -> Text:
+    """Write the program of a run.
+
+    Args:
+        run: what is computed.
+        target: for what.
+
+    Raises:
+        UnsupportedError: an operation that has no translation.
+    """
+    code = Code(target)
+    stored = _stored(code, run.stored)
+    rows, shared = _tables(code, "%stays", run.stays)
+    starts, _ = _tables(code, "%carry", run.carry)
+    first, stride = _first_vehicle(code)
+    entry = code.block
+    code.label("vehicles")
+    code.write(f"%b = phi i64 [ {first}, %{entry} ], [ %following, %done ]")
+    stays = [_of_row(code, *v) if v[1] else shared[i] for i, v in enumerate(rows)]
+    carry = [_of_row(code, *v) for v in starts]
+    # The last sample has no step behind it. How many there are is known: an index that cannot leave
+    # the record need not be clipped to it.
+    steps = constant(run.samples - 1, INDEX)
+
+    def step(index: Value, carried: list[Operand]) -> list[Operand]:
+        return translate(
+            code, run.step.jaxpr, run.step.consts, [*stays, *stored, *carried, _single(index)]
+        )
+
+    carried = loop(code, steps, carry, step)
+    results = translate(code, run.last.jaxpr, run.last.consts, [*stays, *stored, *carried])
+    given = [elements(code, v) for v in results]
+    kinds = [Argument(v.shape, v.ravel()[0].dtype, False) for v in given]
+    for i, value in enumerate(v for array in given for v in array.ravel()):
+        _store(code, value, code.pointer("%results", i))
+    code.write("br label %done")
+    code.label("done")
+    code.write(f"%following = add i64 %b, {stride}")
+    code.write("%more = icmp slt i64 %following, %end")
+    code.write("br i1 %more, label %vehicles, label %out")
+    code.label("out")
+    code.write("ret void")
+    head = [f"{name} = {text}" for name, text in code.globals.items()]
+    head += code.declared.values()
+    tables = ", ".join(f"{code.memory} %{n}" for n in ("stays", "stored", "carry", "results"))
+    arguments = f"{tables}, i64 %begin, i64 %end"
+    body = "\n".join(code.lines)
+    # Without the attributes LLVM would take half of AVX-512's width.
+    attributes = '"prefer-vector-width"="512" "min-legal-vector-width"="512"'
+    convention, attributes = ("ptx_kernel ", "") if target.threads else ("", attributes)
+    function = (
+        f"define {convention}void @run({arguments}) nounwind {attributes} {{\nentry:\n{body}\n}}"
+    )
+    return Text("\n".join([*head, function, "!0 = !{}", ""]), kinds)
+
+
+def _first_vehicle(code: Code) -> tuple[str, str]:
+    """The first vehicle that this thread computes, and how far on the next one is."""
+    if not code.target.threads:
+        code.write("br label %vehicles")
+        return "%begin", str(code.lanes)
+    read = {}
+    for name in ("tid", "ctaid", "ntid", "nctaid"):
+        function = f"@llvm.nvvm.read.ptx.sreg.{name}.x"
+        code.declared[function] = f"declare i32 {function}()"
+        narrow, read[name] = code.register(), code.register()
+        code.write(f"{narrow} = call i32 {function}()")
+        code.write(f"{read[name]} = zext i32 {narrow} to i64")
+    before, own, first, stride = (code.register() for _ in range(4))
+    code.write(f"{before} = mul i64 {read['ctaid']}, {read['ntid']}")
+    code.write(f"{own} = add i64 {before}, {read['tid']}")
+    code.write(f"{first} = add i64 %begin, {own}")
+    code.write(f"{stride} = mul i64 {read['nctaid']}, {read['ntid']}")
+    # More threads than vehicles: the last ones have none.
+    some = code.register()
+    code.write(f"{some} = icmp slt i64 {first}, %end")
+    code.write(f"br i1 {some}, label %vehicles, label %out")
+    return first, stride
+
+
+def _single(value: Value) -> Elements:
+    single = np.empty((), object)
+    single[()] = value
+    return single
+
+
+def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
+    made = []
+    for i, argument in enumerate(arguments):
+        if len(argument.shape) != 1:
+            raise UnsupportedError(f"a record of shape {argument.shape}")
+        pointer = code.pointer("%stored", i)
+        made.append(
+            Stored(
+                argument.shape,
+                argument.dtype,
+                lambda at, p=pointer, d=argument.dtype: code.load(p, at[0], d),
+            )
+        )
+    return made
+
+
+def _tables(
+    code: Code, name: str, arguments: Sequence[Argument]
+) -> tuple[list[tuple[Argument, list[str]]], dict[int, Elements]]:
+    """Pointers to the rows of what is not shared, and the elements of what is."""
+    rows: list[tuple[Argument, list[str]]] = []
+    shared: dict[int, Elements] = {}
+    place = 0
+    for i, argument in enumerate(arguments):
+        size = int(np.prod(argument.shape))
+        pointers = []
+        for _ in range(1 if argument.shared else size):
+            pointers.append(code.pointer(name, place))
+            place += 1
+        if not argument.shared:
+            rows.append((argument, pointers))
+            continue
+        rows.append((argument, []))
+        values = np.empty(argument.shape, object)
+        for k, at in enumerate(np.ndindex(argument.shape)):
+            index = Value(str(k), INDEX, True)
+            values[at] = code.load(pointers[0], index, argument.dtype)
+        shared[i] = values
+    return rows, shared
+
+
+def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
+    """The vehicles' own numbers, a vector each."""
+    values = np.empty(argument.shape, object)
+    kind = type_of(argument.dtype)
+    kept = "i8" if kind == "i1" else kind
+    for pointer, at in zip(pointers, np.ndindex(argument.shape), strict=True):
+        place = code.register()
+        code.write(f"{place} = getelementptr {kept}, {code.memory} {pointer}, i64 %b")
+        size = 1 if kind == "i1" else argument.dtype.itemsize
+        vector = code.vector(kept)
+        value = code.made(
+            f"load {vector}, {code.memory} {place}, align {size}", argument.dtype, False
+        )
+        if kind == "i1":
+            wide = f"trunc {vector} {value.operand} to {code.vector('i1')}"
+            value = code.made(wide, argument.dtype, False)
+        values[at] = value
+    return values
+
+
+def _store(code: Code, value: Value, row: str) -> None:
+    kind = type_of(value.dtype)
+    vector, operand = code.vector(kind), code.of(value, False)
+    if kind == "i1":
+        wide = code.vector("i8")
+        operand = code.made(f"zext {vector} {operand} to {wide}", value.dtype, False).operand
+        kind, vector = "i8", wide
+    place = code.register()
+    code.write(f"{place} = getelementptr {kind}, {code.memory} {row}, i64 %b")
+    size = 1 if kind == "i8" else value.dtype.itemsize
+    code.write(f"store {vector} {operand}, {code.memory} {place}, align {size}")
