@@ -24,7 +24,7 @@ class Loader(Protocol):
     """such as 90 for 9.0"""
     processors: int
 
-    def load(self, ptx: str) -> Callable[[int, int, Sequence[int]], None]: ...
+    def load(self, ptx: str, /) -> Callable[[int, int, Sequence[int]], None]: ...
 
 
 class GpuKernel:
