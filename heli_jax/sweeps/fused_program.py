@@ -8,18 +8,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 
 from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.cuda_driver import CudaError, Gpu
 from heli_jax.fused.gpu_kernel import GpuKernel
 from heli_jax.fused.kernel import Kernel, lanes_for
-from heli_jax.fused.program import Argument, Run
-from heli_jax.numerics.hoist import hoisted
+from heli_jax.fused.program import Run
+from heli_jax.fused.traced import Traced, traced
+from heli_jax.simulation.accumulate import Samples
 from heli_jax.sweeps.design_point import ElementResults, of_samples, samples_of
 from heli_jax.sweeps.flight_numbers import (
     FlightNumbers,
-    InitialTrim,
     Scalars,
     flight_numbers,
     steady,
@@ -38,18 +37,15 @@ class _Parts(NamedTuple):
     """A plan's program for flights of one shape."""
 
     kernel: Kernel | GpuKernel
+    run: Traced
     begin: Any
-    """of (numbers, (values, trim)): what is carried before the first sample, and what stays"""
-    shared: Any
+    """of (numbers, (values, trim)): what an element begins with, `Traced.own`"""
+    common: Any
     """of (numbers, values, trim) of any element: what stays and is the same for all"""
     conclude: Any
     """of (numbers, (values, trim, reduced)): the results"""
     split: Any
     trims: Any
-    varies: tuple[bool, ...]
-    """of what stays"""
-    reduced: Any
-    """the structure of what the kernel gives"""
 
 
 def refusal(job: Job, devices: Sequence[Any], lanes: int) -> str | None:
@@ -140,12 +136,10 @@ class FusedProgram:
         mapped = jax.device_put((filled, trims), parts.split)
         carry, own = parts.begin(numbers, mapped)
         first = jax.tree.map(lambda v: v[0], (filled, trims))
-        shared = iter(parts.shared(numbers, *first))
         carry, own = _rows((carry, own)) if self._on_gpu else _rows_here((carry, own))
-        own = iter(own)
-        stays = [next(own) if v else next(shared) for v in parts.varies]
+        stays = parts.run.stays(own, parts.common(numbers, *first))
         results = self._run(stays, jax.tree.leaves(_records(numbers)), carry)
-        reduced = jax.tree.unflatten(parts.reduced, results)
+        reduced = jax.tree.unflatten(parts.run.results, results)
         return parts.conclude(numbers, (*mapped, jax.device_put(reduced, parts.split)))
 
     def _run(self, stays: Any, stored: Any, carry: Any) -> Any:
@@ -196,76 +190,28 @@ def _example(job: Job, index: int) -> tuple[Plan, FlightNumbers, Scalars, Any]:
     return plan, numbers, values, trim
 
 
-class _Traced(NamedTuple):
-    begin: Any
-    """the jaxpr of (numbers, values, trim): what is carried before the first sample, then what
-    stays"""
-    run: Run
-    reduced: Any
+class _Elements(NamedTuple):
+    """An element's run in steps whose results are what `of_samples` takes."""
 
+    samples: Samples
 
-def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> _Traced:
-    """The run of an element, taken apart: what is computed once, and what at every sample.
+    @property
+    def carry(self) -> Any:
+        return self.samples.carry
 
-    Raises:
-        UnsupportedError: a part of it has no translation.
-    """
-    records = _records(numbers)
-    sample = np.zeros((), np.int32)
+    def step(self, carry: Any, k: Any, /) -> Any:
+        return self.samples.step(carry, k)
 
-    def step(own: Any, records: Any, carry: Any, k: Any) -> Any:
-        bare, values, trim = own
-        return samples_of(plan, _with(bare, records), values, trim).step(carry, k)
-
-    def last(own: Any, records: Any, carry: Any) -> Any:
-        bare, values, trim = own
-        left = samples_of(plan, _with(bare, records), values, trim).last(carry)
+    def last(self, carry: Any, /) -> Any:
+        left = self.samples.last(carry)
         return left.value, left.state, left.outside
 
-    found: dict[str, Any] = {}
 
-    def begin(numbers: FlightNumbers, values: Scalars, trim: InitialTrim | None) -> Any:
-        """What is carried before the first sample, and what stays."""
-        carry = samples_of(plan, numbers, values, trim).carry
-        own = (_without(numbers), values, trim)
-        of_step, a_step = hoisted(step, own, _records(numbers), carry, sample)
-        of_last, the_last = hoisted(last, own, _records(numbers), carry)
-        both, n = [*of_step, *of_last], len(of_step)
-        # Traced here, where the values that they stay with are at hand.
-        found["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
-            both, records, carry, sample
-        )
-        found["last"], shape = jax.make_jaxpr(
-            lambda v, *rest: the_last(v[n:], *rest), return_shape=True
-        )(both, records, carry)
-        found["reduced"] = jax.tree.structure(shape)
-        return carry, both
+def _traced(plan: Plan, numbers: FlightNumbers, values: Scalars, trim: Any) -> Traced:
+    def making(bare: FlightNumbers, records: Any, element: Any) -> _Elements:
+        return _Elements(samples_of(plan, _with(bare, records), *element))
 
-    closed, shape = jax.make_jaxpr(begin, return_shape=True)(numbers, values, trim)
-    carried, stay = (jax.tree.leaves(part) for part in shape)
-    varies = _vary(closed.jaxpr, len(jax.tree.leaves(numbers)))[len(carried) :]
-    run = Run(
-        found["step"],
-        found["last"],
-        tuple(
-            Argument(v.shape, np.dtype(v.dtype), not own)
-            for v, own in zip(stay, varies, strict=True)
-        ),
-        tuple(Argument(v.shape, v.dtype, True) for v in jax.tree.leaves(records)),
-        tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
-        jax.tree.leaves(records)[0].shape[0],
-    )
-    return _Traced(closed, run, found["reduced"])
-
-
-def _vary(jaxpr: Any, n_shared: int) -> list[bool]:
-    """Of each result whether it depends on more than the first arguments."""
-    own = set(jaxpr.invars[n_shared:])
-    for equation in jaxpr.eqns:
-        # A literal has no hash, and depends on nothing.
-        if any(not hasattr(v, "val") and v in own for v in equation.invars):
-            own |= set(equation.outvars)
-    return [not hasattr(v, "val") and v in own for v in jaxpr.outvars]
+    return traced(making, _without(numbers), _records(numbers), (values, trim))
 
 
 @functools.lru_cache(maxsize=32)
@@ -278,27 +224,19 @@ def _compiled(
 ) -> _Parts:
     """The program, remembered as `program` does it."""
     example = jax.tree.unflatten(structure, [np.zeros(*kind) for kind in kinds])
-    begin, run, reduced = _traced(plan, *example)
-    evaluate = core.jaxpr_as_fun(begin)
-    varies = tuple(not argument.shared for argument in run.stays)
-
-    n_carry = len(run.carry)
+    run = _traced(plan, *example)
 
     def own(numbers: FlightNumbers, *element: Any) -> Any:
-        outputs = evaluate(*jax.tree.leaves((numbers, *element)))
-        stay = zip(outputs[n_carry:], varies, strict=True)
-        return outputs[:n_carry], [v for v, varying in stay if varying]
+        return run.own(_without(numbers), _records(numbers), element)
 
-    def shared(numbers: FlightNumbers, *element: Any) -> Any:
-        outputs = evaluate(*jax.tree.leaves((numbers, *element)))
-        return [v for v, varying in zip(outputs[n_carry:], varies, strict=True) if not varying]
+    @jax.jit
+    def common(numbers: FlightNumbers, *element: Any) -> Any:
+        return run.common(_without(numbers), _records(numbers), element)
 
     before, split = spread(own, devices, lanes)
     conclude, _ = spread(functools.partial(of_samples, plan), devices, lanes)
     if devices[0].platform == "cpu":
-        kernel = Kernel(run, lanes_for(np.dtype(plan.precision)))
+        kernel = Kernel(run.run, lanes_for(np.dtype(plan.precision)))
     else:
-        kernel = GpuKernel(run, Gpu(devices[0].local_hardware_id), devices[0])
-    return _Parts(
-        kernel, before, jax.jit(shared), conclude, split, trims_of(plan, lanes), varies, reduced
-    )
+        kernel = GpuKernel(run.run, Gpu(devices[0].local_hardware_id), devices[0])
+    return _Parts(kernel, run, before, common, conclude, split, trims_of(plan, lanes))
