@@ -27,6 +27,10 @@ def main() -> None:
     a, b, ratio = consistent.in_turn(lambda: ours(Ixx), theirs, 5)
     print(f"ours {1e3 * a:.0f} ms, in C {1e3 * b:.0f} ms, ratio {ratio:.2f} (target <= 1.6)")
     print(f"compilation {seconds:.1f} s")
+    as_one = consistent.fused(run, MODEL)
+    np.testing.assert_allclose(as_one(), theirs(), rtol=1e-8)
+    a, b, ratio = consistent.in_turn(as_one, theirs, 5)
+    print(f"as one program {1e3 * a:.0f} ms, in C {1e3 * b:.0f} ms, {ratio:.2f} (target <= 1)")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,11 @@ from scipy.integrate import solve_ivp
 
 from heli_jax import accumulate, load_vehicle, models, simulate, trim
 from heli_jax.dynamics.model import Model
+from heli_jax.fused.kernel import Kernel, lanes_for
+from heli_jax.fused.traced import traced
 from heli_jax.naming import asdict, replace
+from heli_jax.simulation.accumulate import Samples, sample_by_sample
+from heli_jax.simulation.options import SimulationOptions
 
 jax.config.update("jax_enable_x64", True)
 VEHICLE = load_vehicle(Path(__file__).parents[2] / "configs" / "vehicles" / "x-cell-60.yaml")
@@ -113,6 +117,37 @@ def batch(run: Run, model: Model = MODEL) -> Callable[[Array], Array]:
         return total
 
     return lambda Ixx: jax.lax.map(vehicle, Ixx, batch_size=BLOCK)
+
+
+def fused(run: Run, model: Model = MODEL) -> Callable[[], np.ndarray]:
+    """The same batch as one program, as sweeps run it."""
+
+    def steps(vehicle: Any, inputs: Any, Ixx: Any) -> Samples:
+        options = SimulationOptions(
+            dt=jnp.asarray(DT), initial_state=run.start, solver="rk4", substeps=SUBSTEPS
+        )
+        return sample_by_sample(
+            model,
+            replace(vehicle, Ixx=Ixx),
+            inputs,
+            lambda total, out, _: total + out.roll**2,
+            jnp.zeros(()),
+            options=options,
+        )
+
+    vehicle, Ixx = jax.tree.map(jnp.asarray, VEHICLE), jnp.asarray(IXX)
+    whole = traced(steps, vehicle, run.inputs, Ixx[0])
+    kernel = Kernel(whole.run, lanes_for(np.dtype(float)))
+    begin = jax.jit(jax.vmap(lambda x: whole.own(vehicle, run.inputs, x)))
+    common = whole.common(vehicle, run.inputs, Ixx[0])
+    records = [np.asarray(u) for u in jax.tree.leaves(run.inputs)]
+
+    def call() -> np.ndarray:
+        carry, own = jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), begin(Ixx))
+        stays = [np.asarray(v) for v in whole.stays(own, common)]
+        return jax.tree.unflatten(whole.results, kernel(stays, records, carry, 1)).value
+
+    return call
 
 
 def in_c(
@@ -308,6 +343,11 @@ def main() -> None:
     theirs = in_c(run)
     np.testing.assert_allclose(ours(Ixx), theirs(), rtol=1e-9)
     rows.append((f"{size} / C", in_turn(lambda: ours(Ixx), theirs, 9), "<= 3"))
+    begin = time.process_time()
+    as_one = fused(run)
+    seconds[f"{size}, one program"] = time.process_time() - begin
+    np.testing.assert_allclose(as_one(), theirs(), rtol=1e-9)
+    rows.append((f"{size}, one program / C", in_turn(as_one, theirs, 9), "<= 1"))
 
     check_right_hand_side(run)
     for name, alone in (("a sample", by_samples), ("a run", by_one_call)):
