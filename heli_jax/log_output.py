@@ -1,5 +1,7 @@
 """What `heli-jax info` prints of a log, as text of at most 80 columns or as JSON.
 
+On a terminal of fewer columns tables leave some of theirs out, and sentences go on a line below.
+
 Apart from `output.py`, which imports JAX: a look at a log need not wait for it.
 """
 
@@ -8,6 +10,8 @@ import fnmatch
 import json
 import math
 import re
+import shutil
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,13 +20,17 @@ from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.rotor_lines import LEAST, RotorLines
 from heli_jax.flights.vibration import SMALLEST, line_words
 
-# The width of a terminal that nobody has widened.
-_WIDTH = 80
+# The width of a terminal that nobody has widened, and one below which nothing is narrowed.
+_WIDTH, _NARROWEST = 80, 44
+_ROOM = 12
+"""columns of the screen for a channel's name at least, before a number more is shown"""
 _MOST_CHANNELS = 150
 """that are listed without being asked for: a PX4 log has a thousand"""
 _MOST_LINES = 10
 """of gaps, and of notes"""
 _MOST_FILTERS = 40
+_MOST_OF_BURST, _BURST = 200, 0.02
+"""messages, and seconds within which they came, that are no signal with a rate"""
 _MOST_VIBRATIONS = 3
 """of a channel"""
 _NUMBER = 10
@@ -40,11 +48,13 @@ def print_flights(flights: Sequence[LogInfo], pattern: str | None = None) -> Non
     rows = "" if log.topics else f", {log.n_rows} rows"
     words = f"{log.format}, {log.size} bytes{rows}"
     name = _plain(log.path)
-    # A path has no end that could be left out.
-    print(f"{name}: {words}" if len(name) + len(words) + 2 <= _WIDTH else f"{name}\n{words}")
+    width = min(_WIDTH, max(_NARROWEST, shutil.get_terminal_size((_WIDTH, 24)).columns))
+    # A path has no end that could be left out, and a hash is copied whole.
+    print(f"{name}: {words}" if len(name) + len(words) + 2 <= width else f"{name}\n{words}")
     print(f"sha256 {log.sha256}")
     for flight in flights:
-        print("\n".join(_line(line) for line in _flight_lines(flight, len(flights), pattern)))
+        for line in _flight_lines(flight, len(flights), pattern, width):
+            print("\n".join(_lines(line, width)))
 
 
 def as_json(flights: Sequence[LogInfo]) -> str:
@@ -94,12 +104,12 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[str]:
+def _flight_lines(flight: LogInfo, count: int, pattern: str | None, width: int) -> Iterator[str]:
     # A table has one clock and no firmware, so most of the lines below would be empty.
     if not flight.topics:
         yield from _clock_lines(flight.time)
         yield from (f"! {note}" for note in flight.notes[:_MOST_LINES])
-        yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
+        yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern, width)
         return
     number, of = flight.flight
     if of > 1:
@@ -117,8 +127,8 @@ def _flight_lines(flight: LogInfo, count: int, pattern: str | None) -> Iterator[
     yield from _vibration_lines(flight.vibration)
     # Who asks for channels of a name has not asked for the topics.
     if pattern is None:
-        yield from _topic_lines(flight.topics)
-    yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern)
+        yield from _topic_lines(flight.topics, width)
+    yield from _channel_lines(_asked(flight.columns, pattern), flight.columns, pattern, width)
     if pattern is None:
         yield from _setting_lines(flight)
 
@@ -185,23 +195,46 @@ def _vibration_content(found: RotorLines | None) -> dict[str, Any] | None:
     return found._asdict() | {"signals": signals}
 
 
-def _topic_lines(topics: Sequence[TopicInfo]) -> Iterator[str]:
+def _topic_lines(topics: Sequence[TopicInfo], width: int) -> Iterator[str]:
     yield ""
-    head = f"{'topic':30} {'channels':>8} {'rows':>7} {'rate Hz':>8} {'jitter':>7} {'gaps':>5}"
-    yield f"{head} {'longest':>8}"
+    # How many channels, and how long the longest gap is, say least.
+    wide = width >= _WIDTH
+    room = 30 if wide else width - 32
+
+    def start(name: str, channels: int | str, rows: int | str) -> str:
+        count = f" {channels:>8}" if wide else ""
+        return f"{_squeezed(name, room):{room}}{count} {rows:>7}"
+
+    head = f"{start('topic', 'channels', 'rows')} {'rate Hz':>8} {'jitter':>7} {'gaps':>5}"
+    yield f"{head} {'longest':>8}" if wide else head
     for topic in topics:
         clock = topic.time
-        start = f"{_cut(topic.name, 30):30} {len(topic.columns):>8} {topic.n_rows:>7}"
+        line = start(topic.name, len(topic.columns), topic.n_rows)
         if clock is None:
-            yield f"{start} no times, only an order"
+            yield f"{line} no times" if not wide else f"{line} no times, only an order"
         elif clock.problem:
-            yield f"{start} {clock.problem}"
+            yield _cut(f"{line} {clock.problem}", width)
+        elif _is_burst(clock, topic.n_rows):
+            yield f"{line} all within {_short_time(clock.duration)}"
         else:
             # The longest says whether a rate can bridge them; the number alone does not.
             gaps = max((gap.length for gap in clock.gaps), default=0.0)
-            longest = f"{gaps:.3g} s" if gaps else ""
+            longest = f" {_short_time(gaps) if gaps else '':>8}" if wide else ""
             jitter = _percent(clock.jitter)
-            yield f"{start} {clock.rate:>8.4g} {jitter:>7} {len(clock.gaps):>5} {longest:>8}"
+            yield f"{line} {clock.rate:>8.4g} {jitter:>7} {len(clock.gaps):>5}{longest}"
+
+
+def _is_burst(clock: TimeInfo, rows: int) -> bool:
+    """Whether a few messages were written at once, as those of a mission: they have no rate."""
+    return rows <= _MOST_OF_BURST and clock.duration < _BURST
+
+
+def _short_time(seconds: float) -> str:
+    """A length of time in at most eight columns."""
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "us")):
+        if seconds * factor >= 0.1:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds * 1e6:.1g} us"
 
 
 def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInfo]:
@@ -214,7 +247,7 @@ def _asked(columns: Sequence[ColumnInfo], pattern: str | None) -> list[ColumnInf
 
 
 def _channel_lines(
-    shown: list[ColumnInfo], columns: Sequence[ColumnInfo], pattern: str | None
+    shown: list[ColumnInfo], columns: Sequence[ColumnInfo], pattern: str | None, width: int
 ) -> Iterator[str]:
     yield ""
     if not shown:
@@ -227,17 +260,22 @@ def _channel_lines(
     # need the room.
     units = max((len(_cut(c.unit, 8)) for c in shown), default=0)
     units = max(units, 4) if units else 0
-    name = _WIDTH - 3 * (_NUMBER + 1) - 6 - (units + 1 if units else 0)
+    words = ["min", "max", "mean"]
+    left = width - 6 - (units + 1 if units else 0)
+    if left - len(words) * (_NUMBER + 1) < _ROOM:
+        words.pop()
+    name = left - len(words) * (_NUMBER + 1)
     name = min(name, max(7, *(len(_plain(c.name)) for c in shown)))
     unit = f" {'unit':{units}}" if units else ""
-    heads = "".join(f" {word:>{_NUMBER}}" for word in ("min", "max", "mean"))
+    heads = "".join(f" {word:>{_NUMBER}}" for word in words)
     yield f"{'channel':{name}}{unit}{heads} {'NaN %':>5}"
     for channel in shown:
         unit = f" {_cut(channel.unit, 8):{units}}" if units else ""
         if channel.kind == "text":
-            yield f"{_squeezed(channel.name, name):{name}}{unit} text in {channel.count} rows"
+            content = channel.strays or f"text in {channel.count} rows"
+            yield f"{_squeezed(channel.name, name):{name}}{unit} {content}"
             continue
-        numbers = (channel.min, channel.max, channel.mean)
+        numbers = (channel.min, channel.max, channel.mean)[: len(words)]
         cells = "".join(f" {_number(v):>{_NUMBER}}" for v in numbers)
         yield f"{_squeezed(channel.name, name):{name}}{unit}{cells} {_share(channel):>5}"
 
@@ -292,6 +330,11 @@ def _squeezed(text: str, width: int) -> str:
     return text if len(text) <= width else f"{text[:half]}...{text[half + 3 - width :]}"
 
 
-def _line(text: str) -> str:
-    """A line of at most 80 columns, of which an end too long is left out."""
-    return _cut(text, _WIDTH).rstrip()
+def _lines(text: str, width: int) -> list[str]:
+    """Lines no wider than the screen: a setting without its end, a sentence going on below."""
+    text = _plain(text).rstrip()
+    if len(text) <= width:
+        return [text]
+    if re.match(r"  \S+ = ", text):
+        return [_cut(text, width)]
+    return textwrap.wrap(text, width, subsequent_indent="  ", break_on_hyphens=False)

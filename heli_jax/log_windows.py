@@ -145,7 +145,8 @@ def print_ranking(ranking: Ranking) -> None:
     print_table(head, rows)
     unshown = len(rest) - max(_MOST - len(taken), 0)
     if unshown > 0:
-        print(f"{unshown} further windows that say less are not shown.")
+        words = "window that says less is" if unshown == 1 else "windows that say less are"
+        print(f"{unshown} further {words} not shown.")
     for w in ranking.windows:
         if w.excluded:
             print(f"left out: {w.label}, {w.start:.4g} s to {w.end:.4g} s: {w.excluded}")

@@ -8,6 +8,7 @@ import pytest
 from heli_jax import cli, load_config, yaml_file
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
+from heli_jax.new_config import _names
 from heli_jax.new_config.guess import Series, by_motion, by_name, may_be, scaled, words_of
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 
@@ -175,6 +176,10 @@ def test_names_of_a_log_cannot_leave_their_place(tmp_path: Path) -> None:
         ("Roll (deg)", ("roll",)),
         ("log.roll_rad", ("log", "roll")),
         ("p", ("p",)),
+        ("q_dps_meas", ("q", "meas")),
+        ("RollAngleDeg", ("roll", "angle")),
+        ("gyro_x_rad_s", ("gyro", "x")),
+        ("rollDegree", ("roll", "degree")),
     ],
 )
 def test_the_words_of_a_name_are_without_its_unit(name: str, words: tuple[str, ...]) -> None:
@@ -184,6 +189,36 @@ def test_the_words_of_a_name_are_without_its_unit(name: str, words: tuple[str, .
 def test_a_whole_name_goes_before_one_that_holds_it_and_commands_are_no_measurements() -> None:
     names = ["roll_setpoint", "log.roll", "roll", "roll_sp", "rolling"]
     assert by_name(["phi", "roll"], names) == ["roll", "log.roll"]
+
+
+@pytest.mark.parametrize(
+    ("name", "called"),
+    [
+        *((n, "roll_rate") for n in ("RollRate", "gyroX", "wx", "omega_x", "p_meas", "phi_dot")),
+        *((n, "pitch_rate") for n in ("PitchRate", "q_dps_meas", "rates.y", "GyroY_radps")),
+        *((n, "roll") for n in ("rollDeg", "phi_meas_deg", "RollAngle_rad")),
+    ],
+)
+def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
+    found = [k for k, words in _names()["outputs"].items() if by_name(words, [name])]
+    assert found == [called]
+
+
+@pytest.mark.parametrize(
+    ("name", "stick"),
+    [
+        *((n, "roll") for n in ("Roll_Cmd", "roll_cmd_deg", "aileron_cmd", "cmdRoll", "ail_us")),
+        *((n, "pitch") for n in ("elevatorCmd", "pitch_command", "delta_e")),
+    ],
+)
+def test_names_of_sticks_as_people_write_them(name: str, stick: str) -> None:
+    names = _names()
+    found = [
+        k for k, words in names["inputs"].items() if by_name(words, [name], names["commands"][k])
+    ]
+    assert found == [stick]
+    # A stick itself goes before what is commanded by it.
+    assert by_name(names["inputs"]["roll"], ["roll_cmd", "aileron"], ["roll"])[0] == "aileron"
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from heli_jax.config.onboard import FROM_LOG
 from heli_jax.config.opened_logs import OpenedLogs
 from heli_jax.config.schema import FlightConfig, OutputConfig
 from heli_jax.dynamics.model import Model
-from heli_jax.dynamics.onboard.filters import Filter, with_filters
+from heli_jax.dynamics.onboard.filters import Filter, cutoff, with_filters
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
@@ -139,7 +139,7 @@ def filter_cautions(source: Source | None, outputs: Mapping[str, OutputConfig]) 
 def _not_modelled(name: str, logged: LoggedFilters) -> str:
     filters = logged.filters
     lowpasses = [f for f in filters if f.kind != "notch"]
-    what = f"low-passed at {min(f.hz for f in lowpasses):.4g} Hz" if lowpasses else "notched"
+    what = f"low-passed at {cutoff(lowpasses):.3g} Hz" if lowpasses else "notched"
     late = 1e3 * sum(f.delay for f in filters)
     # The inputs were not: were both filtered alike, the machine would look the same.
     return (

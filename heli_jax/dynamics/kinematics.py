@@ -256,16 +256,23 @@ def _position_output(p: KinematicErrors, s: PositionState, u: RatesAndForces) ->
     return Positions(**_velocities(p, s, u), N=s.N + north, E=s.E + east, D=s.D + down)
 
 
-def _attitude_noise(p: AttitudeErrors) -> Attitude:
+def _angle_noise(p: Record) -> Vector:
     # A random walk's sd after one second is, in other units, the root of its spectral density. As
-    # at level flight, where the angles turn about the gyros' axes; equal on all three.
-    return Attitude(p.noise_gyro, p.noise_gyro, p.noise_gyro)
+    # at level flight, where the angles turn about the gyros' axes; equal on all three sensors, and
+    # corrected as their readings are.
+    over = (1.0 + p.lambda_p, 1.0 + p.lambda_q, 1.0 + p.lambda_r)
+    return p.noise_gyro / over[0], p.noise_gyro / over[1], p.noise_gyro / over[2]
+
+
+def _attitude_noise(p: AttitudeErrors) -> Attitude:
+    return Attitude(*_angle_noise(p))
 
 
 def _velocity_noise(p: KinematicErrors) -> VelocityState:
-    # Equal on all axes of the accelerometer, it is so along the ground's axes too.
-    gyro, accel = p.noise_gyro, p.noise_accel
-    return VelocityState(gyro, gyro, gyro, accel, accel, accel)
+    # Equal on all axes of the accelerometer, it is so along the ground's axes too, but for the
+    # scales: level, and ahead and right at any heading alike.
+    level = p.noise_accel / jnp.sqrt(jnp.abs((1.0 + p.lambda_ax) * (1.0 + p.lambda_ay)))
+    return VelocityState(*_angle_noise(p), level, level, p.noise_accel / (1.0 + p.lambda_az))
 
 
 def _position_noise(p: KinematicErrors) -> PositionState:
@@ -273,6 +280,8 @@ def _position_noise(p: KinematicErrors) -> PositionState:
     return PositionState(*_velocity_noise(p), none, none, none)
 
 
+_GYRO_SCALES = tuple(f"lambda_{n}" for n in RATES)
+_IMU_SCALES = (*_GYRO_SCALES, *(f"lambda_{n}" for n in FORCES))
 _GYRO = tuple((n, "delay_gyro") for n in RATES)
 _IMU = (*_GYRO, *((n, "delay_accel") for n in FORCES))
 
@@ -287,6 +296,7 @@ attitude = Model(
     noise_intensity=_attitude_noise,
     axes=(),
     delays=_GYRO,
+    input_scales=_GYRO_SCALES,
     positive=("noise_gyro",),
     explicit=True,
 )
@@ -303,6 +313,7 @@ velocity = Model(
     noise_intensity=_velocity_noise,
     axes=(),
     delays=_IMU,
+    input_scales=_IMU_SCALES,
     positive=("noise_gyro", "noise_accel", "g"),
     explicit=True,
 )
@@ -319,6 +330,7 @@ position = Model(
     noise_intensity=_position_noise,
     axes=(),
     delays=_IMU,
+    input_scales=_IMU_SCALES,
     positive=("noise_gyro", "noise_accel", "g"),
     explicit=True,
 )

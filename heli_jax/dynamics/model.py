@@ -126,6 +126,9 @@ class Model(eqx.Module):
     explicit: bool = eqx.field(static=True, default=False, kw_only=True)
     """whether no mode of it is fast against the samples of a log, as of kinematics: a filter may
     then go by explicit steps"""
+    input_scales: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    """the scale errors of sensors whose readings are inputs, of which the noise is process noise:
+    `noise_intensity` is that of the readings over 1 + scale. Filter error keeps them unbiased"""
     disturbances: tuple[Disturbance, ...] = eqx.field(static=True, default=(), kw_only=True)
     """what `with_disturbance` added; filter error estimates its parameters by itself"""
     body_rates: Callable[[Any], dict[str, Any]] | None = eqx.field(

@@ -217,7 +217,8 @@ def _missing(columns: Mapping[str, np.ndarray]) -> list[str]:
     by_count.pop(0, None)
     size = columns[TIME].size
     return [
-        f"{count} of {size} samples are missing, in {', '.join(names[:6])}"
+        f"{count} of {size} samples {'is' if count == 1 else 'are'} missing, in "
+        + ", ".join(names[:6])
         + (f" and {len(names) - 6} more" if len(names) > 6 else "")
         for count, names in by_count.items()
     ]

@@ -10,12 +10,9 @@ from heli_jax.flights.time_units import time_unit
 
 MISSING = ("NA", "N/A", "n/a", "null", "NULL", "None", "-", "#N/A")
 """cells that say that there is no value, beside NaN, which is a number"""
-# What counts as a number. float() would also take 1_000, and digits of any script.
-_NUMBER = re.compile(
-    r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?"
-    r"|[+-]?(?:nan|inf|infinity)",
-    re.IGNORECASE,
-)
+NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eEdD][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)"
+"""what counts as a number, in any case; float() would also take 1_000, and digits of any script"""
+_NUMBER = re.compile(NUMBER, re.IGNORECASE)
 _DATE = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)\s?(Z|UTC|[+-]\d\d:?\d\d)?"
 )

@@ -11,15 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heli_jax.flights import progress
-from heli_jax.flights.csv_arrow import floats, likely_numbers, number_columns, text_columns
-from heli_jax.flights.csv_cells import (
-    MISSING,
-    is_date,
-    is_number,
-    number,
-    row_of_units,
-    seconds_of_dates,
-)
+from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
+from heli_jax.flights.csv_cells import is_date, is_number, row_of_units, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
 from heli_jax.flights.csv_text import (
@@ -33,6 +26,13 @@ from heli_jax.flights.csv_text import (
     is_of_blanks,
     require_short_lines,
     tabs_for_blanks,
+)
+from heli_jax.flights.csv_texts import (
+    CELLS_AT_ONCE,
+    compute,
+    few_strays,
+    filled_cells,
+    text_floats,
 )
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.table import (
@@ -55,7 +55,6 @@ _LARGEST = 16 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
 _LARGEST_TEXT = 2 * 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
-_CELLS_AT_ONCE = 1 << 16
 
 
 def open_csv(path: Path) -> "CsvTable":
@@ -211,8 +210,15 @@ class CsvTable:
         # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
         except _TwoDecimalSigns:
             values = 0
-        filled = len(text) - _filled(text).null_count
-        return Survey(name, None if isinstance(values, int) else values, filled)
+        filled = len(text) - filled_cells(text).null_count
+        if not isinstance(values, int):
+            return Survey(name, values, filled)
+        count = few_strays(text)
+        if not count:
+            return Survey(name, None, filled)
+        words = "is no number" if count == 1 else "are no numbers, the first"
+        place = f"{self.cell_text(name, values)} in {self.place(values)}"
+        return Survey(name, None, filled, f"{count} of {filled} {words}: {place}")
 
     def place(self, row: int) -> str:
         """`line 12`, counted from the top of the file, comments and blank lines included."""
@@ -231,10 +237,10 @@ class CsvTable:
 
     def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
         """A column's numbers (N,), or the first row that holds none."""
-        values = _floats(text)
+        values = text_floats(text)
         if not isinstance(values, int) or not is_date(text[values].as_py().strip()):
             return values
-        dates = seconds_of_dates(_filled(text).to_pylist())
+        dates = seconds_of_dates(filled_cells(text).to_pylist())
         if not isinstance(dates, int):
             self._dates.add(name)
         return dates
@@ -311,18 +317,11 @@ class CsvTable:
 
     @property
     def _rows_at_once(self) -> int:
-        return max(1, _CELLS_AT_ONCE // len(self.names))
+        return max(1, CELLS_AT_ONCE // len(self.names))
 
 
 def _count(n: int) -> str:
     return "1 cell" if n == 1 else f"{n} cells"
-
-
-def _compute() -> Any:
-    """pyarrow's functions on columns; they are made at run time, so no checker knows them."""
-    import pyarrow.compute
-
-    return pyarrow.compute
 
 
 class _TwoDecimalSigns(Exception):
@@ -335,7 +334,7 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
     Raises:
         _TwoDecimalSigns: so that no thousands separator passes for a decimal sign.
     """
-    pc = _compute()
+    pc = compute()
     # Over all columns that are read, not one by one: a file has one decimal sign, and a column of
     # 1.500 beside one of 1,5 holds thousands.
     signs = {}
@@ -356,45 +355,3 @@ def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.
         problem = f"got {both}, expected one decimal sign"
         raise _TwoDecimalSigns(problem)
     return [pc.replace_substring(text, ",", ".") for text in texts]
-
-
-def _filled(text: "pa.ChunkedArray") -> "pa.ChunkedArray":
-    """Cells without the blanks around them, null where nothing or a mark for it is left."""
-    import pyarrow as pa
-
-    pc = _compute()
-    trimmed = pc.utf8_trim_whitespace(text)
-    # Not compared with "": pyarrow imports pandas, a fifth of a second, to take a value of Python.
-    nothing = pa.nulls(1, trimmed.type)[0]
-    marks = pa.array(MISSING, trimmed.type)
-    is_filled = pc.and_(
-        pc.cast(pc.utf8_length(trimmed), pa.bool_()),
-        pc.invert(pc.is_in(trimmed, value_set=marks)),
-    )
-    return pc.if_else(is_filled, trimmed, nothing)
-
-
-def _floats(text: "pa.ChunkedArray") -> np.ndarray | int:
-    """Cells as float64 (N,), NaN where empty; or the first row that holds no number."""
-    import pyarrow as pa
-
-    filled = _filled(text)
-    try:
-        numbers = filled.cast(pa.float64())
-    except pa.ArrowInvalid:  # it does not say which row
-        return _floats_one_by_one(filled)
-    return floats(numbers)
-
-
-def _floats_one_by_one(filled: "pa.ChunkedArray") -> np.ndarray | int:
-    # In pieces: as objects of Python all cells at once take many times the file's size.
-    values = np.full(len(filled), np.nan)
-    pieces = (filled.slice(at, _CELLS_AT_ONCE) for at in range(0, len(filled), _CELLS_AT_ONCE))
-    for row, cell in enumerate(cell for piece in pieces for cell in piece.to_pylist()):
-        if cell is None:
-            continue
-        value = number(cell)
-        if value is None:
-            return row
-        values[row] = value
-    return values

@@ -24,7 +24,15 @@ from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.marks import mark_notes
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.rotor_lines import RotorLines, rotor_lines
-from heli_jax.flights.table import Survey, Table, column, require_columns, shown, wrong
+from heli_jax.flights.table import (
+    Survey,
+    Table,
+    column,
+    require_columns,
+    sample_count,
+    shown,
+    wrong,
+)
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
 _TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
@@ -54,6 +62,8 @@ class ColumnInfo:
     sd: float
     unit: str = ""
     """as the log states it; empty where it does not"""
+    strays: str = ""
+    """of text that is numbers but for some cells, which these are"""
 
 
 @dataclass(frozen=True)
@@ -246,7 +256,7 @@ def _other_lengths(surveys: list[Survey]) -> tuple[str, ...]:
             by_size.setdefault(each.values.size, []).append(shown(each.name))
     rows = _n_rows(surveys)
     return tuple(
-        f"{size} samples, not {rows}: {', '.join(names[:6])}"
+        f"{sample_count(size)}, not {rows}: {', '.join(names[:6])}"
         + (f" and {len(names) - 6} more" if len(names) > 6 else "")
         for size, names in by_size.items()
         if size != rows
@@ -262,7 +272,8 @@ def _n_rows(surveys: list[Survey]) -> int:
 def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     nan = float("nan")
     if survey.values is None:
-        return ColumnInfo(survey.name, "text", survey.n_filled, 0, nan, nan, nan, nan, unit)
+        empty = (nan, nan, nan, nan)
+        return ColumnInfo(survey.name, "text", survey.n_filled, 0, *empty, unit, survey.strays)
     # Infinite cells are not counted as missing, but the numbers are over finite ones, or a single
     # one would make mean and spread infinite.
     n_nan = int(np.count_nonzero(np.isnan(survey.values)))

@@ -92,7 +92,8 @@ def _missing_notes(request: Request, signals: Mapping[Key, Timed]) -> list[str]:
         count = int(missing.sum())
         if count:
             name = shown(request.signals[key].name)
-            words = f"{count} of {missing.size} samples of {name} are missing"
+            are = "is" if count == 1 else "are"
+            words = f"{count} of {missing.size} samples of {name} {are} missing"
             notes.append(f"{words}, {_where(signal.seconds[missing], missing)}")
     return notes
 

@@ -29,7 +29,7 @@ from heli_jax.flights.onto_grid import (
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.slower import Timed, is_slower
-from heli_jax.flights.table import shown, wrong
+from heli_jax.flights.table import sample_count, shown, wrong
 
 _MOST_GAPS = 20
 """times the samples that there are"""
@@ -185,7 +185,7 @@ def topic_clock(
     if seconds.size < FEWEST:
         where = "" if window is None else f" from {window[0]:g} s to {window[1]:g} s"
         span = f"; it goes from {elapsed[0]:.6g} s to {elapsed[-1]:.6g} s" if elapsed.size else ""
-        problem = f"holds {seconds.size} samples{where}, expected at least {FEWEST}{span}"
+        problem = f"holds {sample_count(seconds.size)}{where}, expected at least {FEWEST}{span}"
         raise wrong(path, problem, place)
     steps = np.diff(seconds)
     back = np.flatnonzero(steps <= 0)

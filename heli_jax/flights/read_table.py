@@ -43,8 +43,8 @@ from heli_jax.flights.read_channels import ClockedSignal, TopicClock
 from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.slower import Timed
-from heli_jax.flights.table import Table, column, shown, wrong
-from heli_jax.flights.time_units import split_unit
+from heli_jax.flights.table import Table, column, sample_count, shown, wrong
+from heli_jax.flights.time_units import require_likely, split_unit
 
 _MANY = 0.1
 """part of the stamps that are not later than the one before, which no hand takes out"""
@@ -240,6 +240,8 @@ def _clock(table: Table, time: Signal, stamps: np.ndarray) -> _Clock:
         problem = f"the time {fault}, got {now} after {after}, expected increasing times"
         remedy = _remedy(table, stamps, row)
         raise wrong(table.path, f"{problem}; {remedy}", table.place(row), place)
+    if said and not stated:
+        require_likely(table.path, time.name, time.unit, stamps)
     return _Clock(stamps, scale, (*notes, *said), said)
 
 
@@ -300,7 +302,7 @@ def _rows(
         last = int(np.searchsorted(elapsed, end + 1e-3 * step, side="right"))
     if last - first < FEWEST:
         count = max(last - first, 0)
-        raise wrong(path, f"{where} holds {count} samples, expected at least {FEWEST}")
+        raise wrong(path, f"{where} holds {sample_count(count)}, expected at least {FEWEST}")
     return slice(first, last), notes
 
 

@@ -32,7 +32,7 @@ from heli_jax.flights.read_table import (
     table_window_note,
 )
 from heli_jax.flights.request import Also, ReadOptions, Request
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import Table, sample_count, shown, wrong
 
 
 class Beside(NamedTuple):
@@ -203,7 +203,7 @@ def _within(signal: ClockedSignal, request: Request) -> ClockedSignal:
     rows = slice(*np.searchsorted(seconds, [window[0] - 1e-9, window[1] + 1e-9]))
     seconds = seconds[rows]
     if seconds.size < FEWEST:
-        problem = f"holds {seconds.size} samples from {window[0]:g} s to {window[1]:g} s"
+        problem = f"holds {sample_count(seconds.size)} from {window[0]:g} s to {window[1]:g} s"
         raise wrong(request.path, f"{problem}, expected at least {FEWEST}", signal.clock.topic)
     clock = TopicClock(signal.clock.topic, seconds, rows)
     return dataclasses.replace(signal, clock=clock, values=signal.values[rows])

@@ -12,11 +12,13 @@ from heli_jax.errors import InputError, nearest
 
 @dataclass(frozen=True)
 class Survey:
-    """One column of a file: `values` (N,), NaN where empty, or None where it is text."""
+    """One column of a file: `values` (N,), NaN where empty, or None where it is text; `strays` says
+    which cells are no numbers where most are."""
 
     name: str
     values: np.ndarray | None
     n_filled: int
+    strays: str = ""
 
 
 class Table(Protocol):
@@ -76,6 +78,11 @@ def shown(text: str) -> str:
 def column(name: str) -> str:
     """`column 'phi'`, as a place."""
     return f"column {shown(name)}"
+
+
+def sample_count(count: int) -> str:
+    """`1 sample`, `2 samples`."""
+    return "1 sample" if count == 1 else f"{count} samples"
 
 
 MOST_COLUMNS = 10_000

@@ -4,6 +4,8 @@ import re
 
 import numpy as np
 
+from heli_jax.flights.table import column, wrong
+
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 """of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
 _WORDS = {
@@ -37,6 +39,26 @@ def split_unit(name: str) -> tuple[str, str]:
     match = _AT_END.fullmatch(name)
     unit = time_unit(match[3]) if match else None
     return (match[1], unit) if match and unit else (name, "")
+
+
+def require_likely(path: str, name: str, unit: str, stamps: np.ndarray) -> None:
+    """Refuse stamps in seconds that are a flight's only in the unit that their name says.
+
+    Args:
+        path: for the message.
+        name: of the column.
+        unit: in which the stamps are taken.
+        stamps: (N,)
+
+    Raises:
+        InputError: with what to state.
+    """
+    named = split_unit(name)[1]
+    if unit == "s" and named and likely_unit(stamps) == named != unit:
+        step = float(np.median(np.diff(stamps)))
+        problem = f"taken in s its stamps are {step:.4g} s apart, and its name says {named}"
+        remedy = f"expected its unit: {{signal: {name}, unit: {named}}}"
+        raise wrong(path, f"{problem}; {remedy}", column(name))
 
 
 def likely_unit(stamps: np.ndarray | None) -> str:

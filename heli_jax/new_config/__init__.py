@@ -36,6 +36,8 @@ _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
 _GRAVITY = ("g", "gravity", "g0")
 _FEWEST = 8
 """samples of a signal"""
+_FULL_TRAVEL = 1.5
+"""of a stick in parts of it, which radios let exceed 1"""
 
 
 class Written(NamedTuple):
@@ -232,19 +234,22 @@ def _by_what_moves(log: _Log, path: str) -> str:
     names, called = tuple(log.series), _names()
     moving = {}
     for stick, (model, measured) in _AXES.items():
-        by_name = guess.by_name(called["inputs"][stick], names)
+        by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
         sticks = _moving(log, [n for n in by_name if not guess.is_excitation(n)])
         outputs = [n for m in measured for n in _outputs(log, called["outputs"][m], _UNITS[m])]
         if sticks and _moving(log, outputs):
-            size = np.nanstd(log.series[sticks[0]].values)
-            moving[model] = float(size / (np.nanmax(np.abs(log.series[sticks[0]].values)) or 1.0))
+            moving[model] = log.series[sticks[0]].values
     if fitting_presets(log.format, names):
         return "roll-flybarless"
     if not moving:
         listed = ", ".join(map(shown, names[:12]))
         problem = "found no stick beside a rate or an angle of its axis by their names, expected"
         raise wrong(path, f"{problem} --model and then the signals by hand; it holds {listed}")
-    return max(moving, key=lambda m: moving[m])
+    most = {model: float(np.nanmax(np.abs(values))) for model, values in moving.items()}
+    # Parts of full travel are compared as they are; of other numbers nobody knows full travel.
+    alike = max(most.values()) <= _FULL_TRAVEL
+    size = {m: np.nanstd(values) / (1.0 if alike else most[m]) for m, values in moving.items()}
+    return max(size, key=lambda model: size[model])
 
 
 def _moving(log: _Log, names: Sequence[str]) -> list[str]:
@@ -269,10 +274,12 @@ def _signals(model: Any, log: _Log) -> text.Signals:
     for name in naming.names(model.Inputs):
         own = model_inputs().get(name)
         known = called["rotor_speed"] if name == "Omega" else []
+        commands: list[str] = []
         if own is not None and name != "Omega":
-            known = called["inputs"][own.command.removeprefix("cyclic_").replace("tail", "yaw")]
+            stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
+            known, commands = called["inputs"][stick], called["commands"][stick]
         unit, known = naming.unit(model.Inputs, name) or "1", [_own(name), *known]
-        inputs[name] = _found(log, guess.by_name(known, sticks), unit, taken)
+        inputs[name] = _found(log, guess.by_name(known, sticks, commands), unit, taken)
         for channel in _moving(log, guess.excitations(known, tuple(log.series)))[:1]:
             excitations[name] = channel
     taken += excitations.values()

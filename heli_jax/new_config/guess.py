@@ -18,10 +18,18 @@ _UNIT_WORDS = {
     "knots": "kt", "fps": "ft/s", "ft/s": "ft/s", "kmh": "km/h", "km/h": "km/h", "volt": "V",
     "volts": "V", "amp": "A", "amps": "A", "degc": "degC", "hz": "Hz",
 }  # fmt: skip
+# Where a name has no mark between the unit and what is before it: rollDeg.
+_JOINED_UNIT = re.compile(
+    r"(.*[a-z0-9XYZ])(Deg|Rad|Dps|Degs|Rads|Radps|Rpm|Mps|Pct|Percent)((?:_?[A-Z]?[a-z]+)?)"
+)
+_PER_SECOND = re.compile(r"(.*)[_ .](deg|rad|m)_?(?:p|per)?[_ .](?:s|sec)", re.IGNORECASE)
 # As people write them: a small v or a is a speed or an acceleration.
 _LETTERS = ("V", "A", "%")
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
-_COMMANDS = {"cmd", "command", "des", "desired", "sp", "setpoint", "ref", "target", "err", "error"}
+_STICK_COMMANDS = {"cmd", "command", "commanded"}
+_COMMANDS = _STICK_COMMANDS | {
+    *("des", "desired", "sp", "setpoint", "ref", "target", "err", "error"),
+}
 # What may stand behind a name and change nothing; roll_rate is no roll.
 _FILLERS = {
     "pwm",
@@ -35,6 +43,9 @@ _FILLERS = {
     "norm",
     "in",
     "input",
+    "body",
+    "imu",
+    "est",
 }
 # Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
 _OTHER = {
@@ -106,24 +117,45 @@ def without_unit(name: str) -> tuple[str, str]:
     for letter in _LETTERS:
         if name.endswith((f"_{letter}", f" {letter}")):
             return name[:-2], letter
+    if match := _PER_SECOND.fullmatch(name):
+        return match[1], f"{match[2].lower()}/s"
     for word, unit in _UNIT_WORDS.items():
         for mark in ("_", " ", "."):
             if name.lower().endswith(mark + word):
                 return name[: -len(word) - 1], unit
+    match = _JOINED_UNIT.fullmatch(name)
+    # rollDegFilt, but not rollDegree: what stands behind has to be a word by itself.
+    if match and match[3].strip("_").lower() in {"", *_FILLERS}:
+        return match[1], _UNIT_WORDS[match[2].lower()]
+    # q_dps_meas: behind the unit a word that changes nothing.
+    stem, _, last = name.rpartition("_")
+    if stem and last.lower() in _FILLERS:
+        before, unit = without_unit(stem)
+        return (f"{before}_{last}", unit) if unit else (name, "")
     return name, ""
 
 
-def by_name(called: Sequence[str], names: Sequence[str]) -> list[str]:
+def by_name(
+    called: Sequence[str], names: Sequence[str], commanded: Sequence[str] = ()
+) -> list[str]:
     """The channels that may be a signal, the likeliest first.
 
     Args:
         called: what people call it, words by blanks.
         names: of the log's channels.
+        commanded: what else a command of it may name, as `roll` in roll_cmd.
     """
     forms = [tuple(c.split()) for c in called]
+    commands = {*forms, *(tuple(c.split()) for c in commanded)} if commanded else set()
     scored = []
     for place, name in enumerate(names):
         words = words_of(name)
+        # Behind the sticks themselves: what a stick commands may have passed through a controller.
+        if commands and _STICK_COMMANDS & set(words):
+            left = tuple(w for w in words if w not in _STICK_COMMANDS | _FILLERS)
+            if left in commands:
+                scored.append((3, 0, place, name))
+            continue
         if not words or _COMMANDS & set(words):
             continue
         # The whole name, before a name that ends so, as of a path: log.roll.
@@ -237,6 +269,10 @@ def scaled(channel: str, series: Series, si: str) -> Guess:
     elif si == "rad/s":
         # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.
         unit = "deg/s" if max(-low, high) > _FASTEST_TURN else "rad/s"
+    elif si == "1" and stated:
+        # A command in degrees: of an angle, or of the swashplate.
+        remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 over what full travel is in it"
+        return Guess(channel, "1", EDIT, remarks=(remark,))
     elif si == "1":
         return _of_stick(channel, low, high)
     elif _fits("m", si):

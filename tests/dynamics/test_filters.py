@@ -9,7 +9,7 @@ import scipy.signal
 from heli_jax import linear_model, models, naming, simulate
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.dynamics.model import linear_misfit
-from heli_jax.dynamics.onboard.filters import line_order, line_rate
+from heli_jax.dynamics.onboard.filters import cutoff, line_order, line_rate
 from heli_jax.models import Filter, with_filters
 from heli_jax.simulation.simulate import substeps_for
 
@@ -41,6 +41,17 @@ def test_low_passes_are_three_decibels_down_where_they_say():
     num, den = scipy.signal.butter(2, 2 * math.pi * 40, analog=True)
     _, expected = scipy.signal.freqs(num, den, W)
     np.testing.assert_allclose(by_filter([Filter("biquad", 40.0)]), expected, rtol=1e-9)
+
+
+def test_low_passes_in_a_row_are_three_decibels_down_together():
+    # A Bessel filter of the fourth order is two of the second, each with a corner of its own.
+    _, poles, _ = scipy.signal.besselap(4, norm="mag")
+    pairs = poles[poles.imag > 0]
+    bessel = [Filter("biquad", 250 * abs(p), abs(p) / (-2 * p.real)) for p in pairs]
+    assert cutoff(bessel) == pytest.approx(250, rel=2e-3)
+    assert cutoff([Filter("pt2", 30.0)]) == pytest.approx(30, rel=2e-3)
+    # Two first-order lags at 40 Hz are what a cascade of two is stated for, corrected.
+    assert cutoff([Filter("pt1", 40.0)] * 2) == pytest.approx(40 * (2**0.5 - 1) ** 0.5, rel=2e-3)
 
 
 def test_a_notch_takes_its_centre_and_its_width():

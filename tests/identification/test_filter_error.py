@@ -10,8 +10,8 @@ import pytest
 from heli_jax import Flight, Free, Nuisance, Problem, fit, models, simulate
 from heli_jax.dynamics.disturbance import with_disturbance
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.disturbed_records import disturbed_records
 from heli_jax.identification.estimation.evaluation import evaluate
-from heli_jax.identification.estimation.filter_error import _disturbed
 from heli_jax.identification.estimation.noise_covariance import first_noise
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Solution, layout_of, unpack
@@ -304,7 +304,7 @@ def test_records_of_the_bootstrap_begin_with_a_stationary_disturbance(bench30):
     z = start_vector(layout, data, problem)
     at = Solution(layout, data, first_noise(problem, problem.training), z)
     u = unpack(layout, data, z)
-    made_ = _disturbed(at, u, 0, jax.random.split(jax.random.key(0), 4000))
+    made_ = disturbed_records(at, u, 0, jax.random.split(jax.random.key(0), 4000))
     first = np.stack([made_["roll"][:, 0], made_["roll_rate"][:, 0]])
     sigma = float(u.noise["sigma_w"])
     np.testing.assert_allclose(

@@ -74,6 +74,26 @@ class Filter(NamedTuple):
         return sum(section.delay for section in _sections(self))
 
 
+def cutoff(filters: Sequence[Filter]) -> float:
+    """Where low-passes one behind the other are 3 dB down together [Hz].
+
+    Args:
+        filters: low-passes, at least one.
+    """
+    sections = [section for f in filters for section in _sections(f)]
+    # Equal steps of the logarithm, 0.1 % apart: more digits than are shown. A section of high
+    # quality rises before it falls, so the last crossing counts.
+    hz = np.geomspace(0.01, 3.0, 5700) * min(f.hz for f in filters)
+    size = np.ones_like(hz)
+    for section in sections:
+        ratio = 2.0 * np.pi * hz / section.omega
+        passed = 1.0 + ratio**2
+        if section.order == 2:
+            passed = (1.0 - ratio**2) ** 2 + (ratio / section.q) ** 2
+        size /= np.sqrt(passed)
+    return float(hz[np.flatnonzero(size >= np.sqrt(0.5))[-1]])
+
+
 class _Section(NamedTuple):
     """A part of first or second order."""
 

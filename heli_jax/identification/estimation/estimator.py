@@ -214,13 +214,14 @@ class Estimator(abc.ABC):
             sd[i][name] = np.asarray(size, np.asarray(y).dtype)
         return z, Noise(tuple(sd), noise.log_variance_ratio)
 
-    def noise_matters(self, problem: Problem, layout: Layout, fall: float) -> bool:
+    def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
         """Whether the optimum moves with the noise, so that it has to be searched again.
 
         Args:
             problem: what is fitted.
             layout: what the unknowns are.
-            fall: of the noise's level in the last relaxation.
+            before: the noise that the optimum was found with.
+            after: as relaxed there.
         """
         return True
 

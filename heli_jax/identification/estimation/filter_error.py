@@ -5,7 +5,7 @@ intensity and correlation time are estimated beside the parameters, the scale of
 noise is concentrated out of the likelihood unless it is given.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,7 +15,9 @@ from jaxtyping import Array, Float
 
 from heli_jax import naming
 from heli_jax.dynamics.disturbance import disturbances_of, only_disturbed
-from heli_jax.dynamics.model import Model, correlation_of, initial_sd_of
+from heli_jax.dynamics.model import Model
+from heli_jax.flights.flight import Flight
+from heli_jax.identification.estimation.disturbed_records import disturbed_records
 from heli_jax.identification.estimation.estimator import Estimator, Evaluation, Residuals
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.kalman import SMALL, Innovations, innovations
@@ -24,8 +26,14 @@ from heli_jax.identification.estimation.measured_signals import (
     measured_signals,
     signals,
 )
+from heli_jax.identification.estimation.noisy_scales import (
+    free_scales,
+    not_attenuating,
+    slopes_at,
+    slopes_changed,
+)
 from heli_jax.identification.estimation.shared_covariance import innovations_together
-from heli_jax.identification.estimation.simulated_flights import Drive, driven
+from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -37,7 +45,6 @@ from heli_jax.identification.unknowns.layout import (
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.simulation.options import SimulationOptions
-from heli_jax.simulation.simulate import simulate
 
 _FLOOR = 1e-3
 """The likelihood's row stays real however far the noise falls; the next round has another level."""
@@ -49,8 +56,8 @@ for what the measurement says of the state."""
 _TOLERANCE = 1e-6
 _FELL = 0.9
 """fall of the noise (in the log of the variance) past which the likelihood's row shows no more"""
-_BATCH = 8
-"""records that are drawn side by side"""
+_ATTENUATES = 0.02
+"""part by which the derivatives by scale errors change, from which on these move with them"""
 
 
 class FilterError(Estimator):
@@ -69,7 +76,7 @@ class FilterError(Estimator):
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """The innovations over their sd, and what makes their Jacobian Fisher's information."""
         by_flight = filtered_flights(layout, data, noise, u)
-        return Residuals(_likelihood_rows(layout, data, noise, by_flight), None, by_flight)
+        return Residuals(_likelihood_rows(layout, data, noise, u, by_flight), None, by_flight)
 
     def one_program(self, layout: Layout) -> bool:
         """A filter takes longer to evaluate than a step to be called for."""
@@ -88,6 +95,13 @@ class FilterError(Estimator):
         outputs = tuple(sorted({n for f in problem.training for n in f.outputs}))
         return outputs[concentrated:], concentrated
 
+    def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
+        """With a derivative by each scale error that is free, which no relaxation has found yet."""
+        scales = free_scales(problem.model.input_scales, problem.free)
+        if not scales:
+            return noise
+        return noise._replace(scale_slopes=np.zeros(len(scales), noise.log_variance_ratio.dtype))
+
     def with_level(self, data: Data, e: Evaluation, noise: Noise) -> Noise:
         """The noise with the level that the innovations show."""
         level = innovation_sums(e, noise)[1] / measured_count(data)
@@ -105,7 +119,8 @@ class FilterError(Estimator):
         squares, logs = innovation_sums(e, noise)
         level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
-            return z, noise._replace(log_variance_ratio=level)
+            slopes = slopes_at(layout, noise, e, self.row_signals(layout, data).size)
+            return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes)
         # The scale of the greatest likelihood, and what the unknowns took from the squares.
         factor = np.sqrt(squares / n * freedom)
         for name in layout.sigmas:
@@ -119,12 +134,13 @@ class FilterError(Estimator):
         )
         return z, Noise(sd, level)
 
-    def noise_matters(self, problem: Problem, layout: Layout, fall: float) -> bool:
-        """Only where priors are weighed against a scale that is concentrated out, or where the
-        noise fell past what the likelihood's row can show."""
+    def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
+        """Only where priors are weighed against a scale that is concentrated out, where the noise
+        fell past what the likelihood's row can show, or where it attenuates scale errors."""
         if layout.concentrated:
             return any(f.prior for f in problem.free.values())
-        return fall > _FELL
+        fell = before.log_variance_ratio - after.log_variance_ratio
+        return bool(fell > _FELL) or slopes_changed(before, after) > _ATTENUATES
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Of the innovations (Schweppe, 1965), at the scale of the greatest likelihood where that
@@ -159,7 +175,7 @@ class FilterError(Estimator):
     def records(self, reached: Solution, u: Unknowns, runs: int, seed: int) -> Sequence[dict]:
         """Each run with a disturbance drawn anew."""
         return [
-            _disturbed(
+            disturbed_records(
                 reached, u, i, jax.random.split(jax.random.fold_in(jax.random.key(seed), i), runs)
             )
             for i in range(len(reached.data.flights))
@@ -295,7 +311,7 @@ def filter_arguments(
 
 
 def _likelihood_rows(
-    layout: Layout, data: Data, noise: Noise, by_flight: tuple[Innovations, ...]
+    layout: Layout, data: Data, noise: Noise, u: Unknowns, by_flight: tuple[Innovations, ...]
 ) -> Array:
     r"""Rows whose sum of squares is minus twice the log-likelihood but for a constant; zero where
     nothing is measured.
@@ -327,6 +343,7 @@ def _likelihood_rows(
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
         # N mean(log s) as a square: the 1 keeps it above zero, where the root has a derivative.
+        above -= not_attenuating(layout, noise, u) / count
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
     log_s = jnp.where(seen, log_s - mean, 0.0)
     # The last rows are zero themselves, with the derivative of what is subtracted left out.
@@ -348,46 +365,6 @@ def _root_mean_square(y: Array | np.ndarray) -> float:
     """Of what is measured (N,), never zero."""
     y = np.asarray(y)
     return max(float(np.sqrt(np.nanmean(np.square(y)))), 1e-300)
-
-
-def _disturbed(reached: Solution, u: Unknowns, i: int, keys: Array) -> dict[str, Array]:
-    """By name the outputs (runs, N) with a disturbance drawn for each key."""
-    layout, drive = reached.layout, driven(reached.layout, reached.data, u, i)
-    drawn_state = _random_first_state(layout, drive, reached.z.dtype)
-
-    @jax.jit
-    def run(key: Array) -> Any:
-        of_first, of_noise = jax.random.split(key)
-        return simulate(
-            layout.model,
-            drive.params,
-            drive.inputs,
-            dt=drive.dt,
-            initial_state=drawn_state(of_first),
-            solver=layout.solver,
-            substeps=layout.substeps,
-            key=of_noise,
-            hold=layout.hold(i),
-        ).outputs
-
-    return naming.asdict(jax.lax.map(run, keys, batch_size=_BATCH))
-
-
-def _random_first_state(layout: Layout, drive: Drive, dtype: np.dtype) -> Callable[[Array], Any]:
-    """Of a key the State at the first sample, with what is random there drawn."""
-    model, params = layout.model, drive.params
-    first = drive.state if drive.state is not None else model.initial_state(params)
-    names = naming.names(model.State)
-    sds = initial_sd_of(model, params, dtype)
-    # Factored without the sds, which may be zero.
-    factor = sds[:, None] * jnp.linalg.cholesky(correlation_of(model, params, dtype))
-
-    def draw(key: Array) -> Any:
-        drawn = jnp.sum(factor * jax.random.normal(key, (1, len(names)), dtype), axis=1)
-        values = {n: getattr(first, n) + drawn[names.index(n)] for n in model.random_states}
-        return naming.replace(first, **values)
-
-    return draw
 
 
 ESTIMATOR = FilterError()

@@ -11,6 +11,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
+from heli_jax.identification.estimation.noisy_scales import slopes_changed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
@@ -136,16 +137,18 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
             for sd, before in zip(new.sd, noise.sd, strict=True)
             for n in before
         )
+        change += slopes_changed(noise, new)
         # Residuals that overflowed show no noise.
         if not np.isfinite(change):
             break
+        moves = estimator.noise_matters(search.problem, layout, noise, new)
         # The noise first and the parameters after it: the parameters of one round are the best for
         # the noise of the round before, and where both stay they are so for each other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
         if change < _UNCHANGED or not bool(best.converged):
             break
-        if not estimator.noise_matters(search.problem, layout, fall):
+        if not moves:
             break
         [best] = search.run(noise, best.z[None, :])
         trace.append((int(best.steps), float(best.cost)))

@@ -23,6 +23,7 @@ from heli_jax.flights.signal_facts import (
     quantum,
 )
 from heli_jax.flights.strays import stray_words
+from heli_jax.flights.table import sample_count
 from heli_jax.identification.validation.finding import Finding
 
 __all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "strays", "stuck"]
@@ -237,7 +238,7 @@ def _coarse_output(
         )
     # Hardly a value twice: there are few values because there are few samples.
     if facts.levels < _COARSE and facts.levels > 0.5 * facts.size:
-        return f"the record has only {facts.size} samples of {name}."
+        return f"the record has only {sample_count(facts.size)} of {name}."
     if facts.levels < _COARSE:
         return f"{name} has only {facts.levels} distinct values: it moves by few steps of the log."
     return ""
