@@ -37,8 +37,10 @@ def _column(values: Any) -> Any:
 
     # `pa.array` looks whether it was given something of pandas, which it loads for that: a fifth of
     # a second.
-    if isinstance(values, list) and values and all(isinstance(v, str) for v in values):
-        return _texts(values)
+    if isinstance(values, list):
+        cells: list[Any] = values
+        only = cells and all(isinstance(v, str) for v in cells)
+        return _texts(cells) if only else pa.array(cells)
     numbers = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "iuf"
     if not (numbers and values.dtype.isnative):
         return pa.array(values)
