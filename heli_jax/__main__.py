@@ -7,6 +7,8 @@ from types import FrameType
 
 _COLLECT_AFTER = 100_000
 """new objects between two searches for garbage"""
+_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""what says how many threads NumPy's linear algebra has"""
 
 
 def main() -> int:
@@ -18,6 +20,10 @@ def main() -> int:
     # Imports and what JAX traces make millions of objects that stay: to look through them for
     # garbage as often as Python does by itself takes a tenth of a command.
     gc.set_threshold(_COLLECT_AFTER)
+    # Before NumPy is imported. Its matrices here are tall and a few columns wide: further threads
+    # wait for each other at full speed, and double what a fit takes. XLA has threads of its own.
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
     from heli_jax import cli
 
     # From here on the command line listens itself.

@@ -293,7 +293,7 @@ def _simulate(options: argparse.Namespace) -> int:
     if out is not None:
         options.say(f"wrote {len(next(iter(simulated.columns.values())))} samples to {out}")
     if view is not None:
-        simulation_output.write_view(view, experiment, simulated)
+        simulation_output.write_view(view, experiment, simulated, out)
         whole = "" if simulated.whole else ", figures only: 3D needs the whole helicopter"
         options.say(f"wrote {view}{whole}")
     return DONE

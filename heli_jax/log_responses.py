@@ -18,7 +18,7 @@ from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.logs import read_flights
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
-from heli_jax.numbers import number
+from heli_jax.numbers import number, plain_words
 
 COHERENT = 0.6
 """as in `analysis.response_curves`, from which on a response is taken for the input's"""
@@ -114,12 +114,13 @@ def run_responses(
     with run_directory.whole(out) as temporary:
         title = Path(experiment.path).stem
         written = found._replace(notes=(*found.notes, *gaps))
-        write_responses(temporary, written, units_of(experiment), title, handling)
+        units, png = units_of(experiment), experiment.config.report.png
+        write_responses(temporary, written, units, title, handling, png=png)
     for note in found.notes:
         say(note)
     print_responses(found)
     for line in handling_lines(handling):
-        print(line)
+        print(plain_words(line))
     for sentence in (*handling_sentences(handling), *gaps):
         print(f"! {sentence}")
     say(f"wrote {out / 'responses.html'}")

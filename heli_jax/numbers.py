@@ -1,6 +1,9 @@
 """Numbers as text: no more digits than their standard deviation allows."""
 
 import math
+import re
+from collections.abc import Sequence
+from decimal import Decimal
 
 NOTHING = "–"
 _LONG = 1e5
@@ -51,22 +54,60 @@ _FAR = 10.0
 """standard deviations, or times the value, past which an end of an interval is on its own"""
 
 
-# Two functions round to the digits of a standard deviation, for two readers. `measured` is for
-# pages: a value and the ends of its interval share a power of ten and have true minus signs, so
-# that a column can be compared by eye. `rounded` is for the terminal and for programs that read
-# it: ASCII, an exponent as Python writes it, so that a number can be pasted into a vehicle file.
+# One rule for pages and terminal: `measured` and `number` decide on digits and rounding, and
+# `plain` writes what they give in ASCII, with an exponent as Python writes it, so that a number
+# can be pasted into a vehicle file.
 
 
 def rounded(value: float, sd: float) -> tuple[str, str]:
-    """A value to the second digit of its standard deviation, and that deviation, in ASCII."""
-    if not (sd > 0 and math.isfinite(sd) and math.isfinite(value)):
-        return f"{value:.6g}", f"{sd:.2g}"
-    # Significant digits of the value: two, and one for each decade that it is above its sd.
-    digits = 2
-    if value != 0:
-        digits += max(0, math.floor(math.log10(abs(value))) - math.floor(math.log10(sd)))
-    # At most nine: a parameter at a bound may have an sd of 1e-15, and its digits are noise.
-    return f"{value:#.{min(digits, 9)}g}".rstrip("."), f"{sd:.2g}"
+    """A value to the second digit of its standard deviation, and that deviation, for the terminal:
+    `measured` in ASCII."""
+    return plain(measured(sd, value)[0]), plain(measured(sd, value)[1])
+
+
+def terse(value: float | None, digits: int = 4) -> str:
+    """A number to some significant digits for the terminal: `number` in ASCII."""
+    return plain(number(value, digits))
+
+
+_WORDS = {"∞": "inf", "−∞": "-inf", NOTHING: "-", "−": "-"}
+_DOWN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
+def plain(text: str) -> str:
+    """A number of a page in ASCII, with the same digits: `1.7000·10⁻⁴` as `1.7000e-04`."""
+    if text in _WORDS:
+        return _WORDS[text]
+    digits, _, power = text.replace("−", "-").partition("·10")
+    if not power:
+        return digits
+    # A power of its own: 0.0012·10⁻⁴ beside a value of 1.7000·10⁻⁴ is 1.2e-07.
+    value = Decimal(digits).scaleb(int(power.translate(_DOWN)))
+    if not value:
+        return digits
+    mantissa, _, exponent = f"{value:e}".partition("e")
+    return f"{mantissa}e{int(exponent):+03d}"
+
+
+_NUMBER = re.compile(r"[−-]?\d[\d.]*·10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+|[−-]?\d[\d.]*|−?∞|±|−|–")
+
+
+def plain_words(text: str) -> str:
+    """A sentence of a page for the terminal: its numbers as `plain` has them."""
+    return _NUMBER.sub(lambda m: "+-" if m[0] == "±" else plain(m[0]), text)
+
+
+def aligned(values: Sequence[float], step: float) -> tuple[str, ...]:
+    """Numbers that a step tells apart, as of an axis: all with one power of ten and as many places.
+
+    Args:
+        values: finite.
+        step: the least difference between two of them, above zero.
+    """
+    power = _power(max(abs(v) for v in values))
+    places = min(max(0, power - math.floor(math.log10(step) + 1e-9)), 15)
+    texts = (_signed(f"{v / 10.0**power:.{places}f}") for v in values)
+    return tuple(t + (_times(power) if t.strip("0.") else "") for t in texts)
 
 
 def measured(sd: float | None, *values: float | None) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import rounded
+from heli_jax.numbers import plain_words, rounded, terse
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
@@ -92,7 +92,7 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({m.vaf:.2g})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    worse = [f"{n} ({terse(m.vaf, 2)})" for n, m in fit.validation.items() if not m.vaf >= 0]
     held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
@@ -110,7 +110,7 @@ def _print_handling(run: FitRun) -> None:
     if run.supplementary.responses is None:
         return
     for line in handling_lines(run.supplementary.responses.handling):
-        print(line)
+        print(plain_words(line))
     logged = {n for f in run.problem.training for n in f.outputs}
     for sentence in missing_handling(run.config, logged):
         print(f"! {sentence}")
@@ -171,7 +171,7 @@ def _range(estimate: Estimate | Combination) -> str:
         assert end is not None
         # Where an interval spans powers of ten its ends have digits of their own.
         near = abs(end - value) < _NEAR * sd and abs(end) > abs(value) / _NEAR
-        shown.append(rounded(end, sd)[0] if near or end == 0 else f"{end:.3g}")
+        shown.append(rounded(end, sd)[0] if near or end == 0 else terse(end, 3))
     return f"{shown[0]} to {shown[1]}"
 
 
@@ -190,7 +190,7 @@ def _print_agreement(what: str, m: Metrics) -> None:
 
 
 def _print_baseline(b: Baseline) -> None:
-    ratios = ", ".join(f"{n} = {v:.4g}" for n, v in b.combinations.items())
+    ratios = ", ".join(f"{n} = {terse(v)}" for n, v in b.combinations.items())
     vaf = f"VAF {b.metrics.vaf:.5f}" if math.isfinite(b.metrics.vaf) else "its simulation diverges"
     print(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
     for sentence in b.sentences:
@@ -218,12 +218,12 @@ def print_check(check: Check) -> None:
         # The covariance is that of the logarithms: its root is the relative sd.
         relative = math.sqrt(verdict.covariance[i, i])
         lacking = name in verdict.undetermined or name in verdict.without_effect
-        expected = "not determined" if lacking else f"{100 * relative:.2g} %"
+        expected = "not determined" if lacking else f"{terse(100 * relative, 2)} %"
         rows.append((name, expected, f"{verdict.prior_share[name]:.2f}"))
     print_table(("parameter", "expected sd", "prior share"), rows)
     for name, sd in check.noise.items():
         guess = f" ({GUESSED})" if name in check.guessed else ""
-        print(f"noise of {name}: {sd:.3g}{guess}")
+        print(f"noise of {name}: {terse(sd, 3)}{guess}")
     follows = all(f.sentence != NOTHING_FOLLOWS for f in check.findings)
     sds = np.sqrt(np.diag(verdict.covariance))
     if sentence := too_good(sds, bool(check.guessed), nothing_follows=not follows):
@@ -247,10 +247,10 @@ _MARKS = {"ok": " ", "note": "-", "doubt": "!", "refuse": "x"}
 
 def _print_verdict(verdict: Verdict) -> None:
     print(verdict.text)
-    values = ", ".join(f"{s:.3g}" for s in verdict.singular_values)
+    values = ", ".join(terse(s, 3) for s in verdict.singular_values)
     print(
         f"rank {verdict.rank} of {len(verdict.names)} ({verdict.rank_without_priors} without "
-        f"priors), condition number {verdict.condition:.3g}, singular values {values}"
+        f"priors), condition number {terse(verdict.condition, 3)}, singular values {values}"
     )
     for direction in verdict.null_directions:
         words = ", ".join(f"{n} {v:+.4f}" for n, v in direction.items())

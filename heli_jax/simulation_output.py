@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,9 @@ import numpy as np
 from heli_jax import config as configuration
 from heli_jax import run_directory
 from heli_jax.flights import write as tables
+from heli_jax.numbers import terse
 from heli_jax.terminal_table import print_table
+from heli_jax.yaml_file import as_yaml
 
 if TYPE_CHECKING:
     from heli_jax.generate import Simulated
@@ -34,23 +37,33 @@ def write_table(out: Path | None, columns: dict[str, np.ndarray]) -> None:
         tables.write_table(temporary, columns)
 
 
-def write_view(out: Path, experiment: configuration.Experiment, simulated: "Simulated") -> None:
+def write_view(
+    out: Path,
+    experiment: configuration.Experiment,
+    simulated: "Simulated",
+    table: Path | None = None,
+) -> None:
     """The page of what was simulated at `out`, which appears whole or not at all.
 
     Args:
         out: the HTML file to write.
         experiment: the configuration, of which the page shows the vehicle.
         simulated: the runs.
+        table: the file with its samples, where one was written; the page links to it.
 
     Raises:
         InputError: the place cannot be written to.
     """
     # Imported here: no other command needs the page.
+    from heli_jax.report.origin import origin
     from heli_jax.report.view import write_view as write
 
     title, params = experiment.path.stem, experiment.vehicle.params
+    # From the page's folder on, so that both can be moved together.
+    beside = (Path(os.path.relpath(p, out.parent)) for p in (experiment.path, table) if p)
+    made = origin(as_yaml(configuration.resolved(experiment)), tuple(p.as_posix() for p in beside))
     with run_directory.whole_file(out, f"--view {out}") as temporary:
-        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes)
+        write(temporary, simulated.runs, simulated.model, params, title, simulated.notes, made)
 
 
 @contextlib.contextmanager
@@ -102,7 +115,7 @@ def _progress_words(p: "Progress", of: str) -> str:
     # The first chunk compiles: a rate that contained it would foretell hours.
     if math.isnan(p.rate):
         return words
-    words = f"{words}, {p.rate:.3g} a second"
+    words = f"{words}, {terse(p.rate, 3)} a second"
     if p.done == p.total:
         return words
     left = max(0, round(p.remaining))
@@ -123,12 +136,11 @@ def print_sweep(out: Path) -> None:
     rows = []
     for name, result in totals["results"].items():
         numbers = [
-            f"{result[k]:.4g}" if k in result else ""
-            for k in ("min", "q05", "median", "q95", "max")
+            terse(result[k]) if k in result else "" for k in ("min", "q05", "median", "q95", "max")
         ]
         error = totals.get("float32_error", {}).get(name)
         rows.append(
-            (name, *numbers, result.get("unit", ""), "" if error is None else f"{error:.1g}")
+            (name, *numbers, result.get("unit", ""), "" if error is None else terse(error, 1))
         )
     # The last column only where the sweep compared single with double precision.
     head = ("result", "min", "5 %", "median", "95 %", "max", "unit", "float32 error")
@@ -137,9 +149,9 @@ def print_sweep(out: Path) -> None:
     for words in ("worst", "best"):
         for name, elements in totals[words].items():
             element = elements[0]
-            at = ", ".join(f"{n} = {v:.4g}" for n, v in element["axes"].items())
+            at = ", ".join(f"{n} = {terse(v)}" for n, v in element["axes"].items())
             unit = totals["results"].get(name, {}).get("unit", "")
-            value = f"{element['value']:.4g} {unit if unit != '1' else ''}".rstrip()
+            value = f"{terse(element['value'])} {unit if unit != '1' else ''}".rstrip()
             print(f"{words} {name}: {value}, element {element['element']}, {at}")
     for note in totals["notes"]:
         print(f"! {note}")
@@ -156,8 +168,8 @@ def print_sweep(out: Path) -> None:
     # A sweep that was resumed when all was there has computed nothing, and has no rate.
     if timing["computed_elements"]:
         print(
-            f"{_counted(timing['computed_elements'])} in {timing['seconds']:.3g} s "
-            f"({timing['elements_per_s']:.3g} a second, with compilation)"
+            f"{_counted(timing['computed_elements'])} in {terse(timing['seconds'], 3)} s "
+            f"({terse(timing['elements_per_s'], 3)} a second, with compilation)"
         )
     print(f"store: {out / 'sweep.zarr'}")
     if (out / "report.html").is_file():

@@ -181,6 +181,16 @@ def factor(unit: str, si: str) -> float:
     raise ValueError(f"unit {unit!r} is {_kind(have)}, expected {_kind(want)} such as {si!r}")
 
 
+def turn(si: str) -> float | None:
+    """A full turn in an SI unit; None where that is no angle."""
+    if si in _COMMON:
+        return math.tau if si == "rad" else None
+    try:
+        return factor("turn", si)
+    except ValueError:
+        return None
+
+
 _SI = [
     "1",
     "rad",

@@ -362,7 +362,8 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
         sampled = sample_files(extra.intervals)
         made = origin(text, ("config.yaml", "fit.json", "signals.csv", *sampled))
         write_samples(folder, run.fit, extra.intervals, made, str(run.config.path))
-        write_page(folder, analysis, title, vehicle.constants, made)
+        png = run.config.config.report.png
+        write_page(folder, analysis, title, vehicle.constants, made, png=png)
         run.fit.timing["report"] = time.perf_counter() - started
         # fit.json comes last, since it holds how long all the rest took.
         run.fit.timing["total"] = time.perf_counter() - run.began

@@ -92,7 +92,7 @@ def test_fit_writes_a_whole_run_directory(bench, capsys):
     assert len(result["baseline_rls"]["theta"]) == 9
     assert len(result["data"][0]["sha256"]) == 64
     assert {"jax", "heli_jax", "python"} <= set(result["versions"])
-    assert {p.suffix for p in (out / "figures").iterdir()} == {".svg", ".png"}
+    assert {p.suffix for p in (out / "figures").iterdir()} == {".svg"}
     assert not list(bench.parent.glob(".run*"))
     # The resolved configuration runs again from elsewhere.
     again = bench.parent / "elsewhere"

@@ -1,5 +1,6 @@
 """The documentation site: every link and anchor holds, and nothing comes from the network."""
 
+import html
 import os
 import re
 import subprocess
@@ -95,6 +96,28 @@ def test_the_reference_has_what_the_code_has(site, pages):
     assert set(heli_jax.__all__) - described == {"models"}  # a module, told in words
     # Nothing that the build made shows where it was made.
     assert str(ROOT) not in "".join(p.read_text() for p in site.rglob("*.html"))
+
+
+def test_first_steps_show_what_the_commands_print_today(site):
+    from heli_jax.flights.describe import describe_flights
+
+    page = html.unescape(re.sub(r"<[^>]+>", "", (site / "first-steps.html").read_text("utf-8")))
+    assert "generated: first-" not in page
+    # The log is there still, as the page of the demo made it: its digest is of no code of the page.
+    [described] = describe_flights(str(site / "made/runs/demo/bench.csv"), None, None, None)
+    assert f"sha256 {described.sha256}" in page
+    for words in (
+        "look over what is marked GUESS",
+        "is still EDIT",
+        "The data determine Ixx and If.",
+        "converged: The data determine Ixx and If. adequate: yes",
+        "report: first/fit/report.html",
+    ):
+        assert words in page
+    # What the text between them says of these numbers.
+    vaf = re.search(r"roll, simulated: VAF (0\.\d+)", page)
+    assert vaf
+    assert f"VAF {float(vaf[1]):.2f}" in page
 
 
 def test_the_gates_that_the_page_names_are_those_of_the_card():

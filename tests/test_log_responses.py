@@ -109,7 +109,7 @@ def test_a_log_becomes_responses_files_and_a_transfer_function(config, tmp_path,
     page = (out / "responses.html").read_text()
     assert "lat to p" in page
     assert "Handling qualities" in page
-    assert (out / "figures/p-lat.png").exists()
+    assert (out / "figures/p-lat.svg").exists()
 
 
 def test_a_transfer_function_without_all_of_its_numbers_is_not_converged():

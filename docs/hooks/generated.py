@@ -6,6 +6,7 @@ stand the figures and the report of the demo, of which nothing is kept in the re
 
 import contextlib
 import functools
+import importlib.util
 import io
 import os
 import re
@@ -19,7 +20,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 _ROOT = Path(__file__).parents[2]
-_MARK = re.compile(r"^<!-- generated: (\S+) -->$", re.MULTILINE)
+# With the block of commands below it, if any: the site has what they print too.
+_MARK = re.compile(r"^<!-- generated: (\S+) -->$(?:\n```console\n(?:.*\n)*?```$)?", re.MULTILINE)
 _ENDS = re.compile(r"([|<>])")
 _PAGE = re.compile(r"docs/([\w-]+)\.md")
 # Of these the demo has the figures that the gallery shows; the report has all.
@@ -43,7 +45,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """The page with what it asks for."""
-    return _MARK.sub(lambda mark: _PARTS[mark[1]](), markdown)
+    return _MARK.sub(lambda mark: _part(mark[1]), markdown)
+
+
+def _part(name: str) -> str:
+    if name in _PARTS:
+        return _PARTS[name]()
+    # By path, since mkdocs loads hooks one by one, and knows no package of them.
+    place = Path(__file__).with_name("first_steps.py")
+    spec = importlib.util.spec_from_file_location("first_steps", place)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.outputs()[name]
 
 
 def on_shutdown(**_: Any) -> None:

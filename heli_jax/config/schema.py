@@ -352,6 +352,12 @@ class RLSConfig(_Strict):
     """factor by which each sample counts less than the next"""
 
 
+class ReportConfig(_Strict):
+    # Half a second of each fit, and a page shows none of them.
+    png: bool = False
+    """whether figures are PNG files too, beside SVG"""
+
+
 class Config(_Strict):
     """One experiment."""
 
@@ -382,6 +388,8 @@ class Config(_Strict):
     """random pushes: drawn by simulate, estimated by filter error"""
     frequency: FrequencyConfig | None = None
     """of `heli-jax frf` and of fit.method: frequency-response (docs/frequency.md)"""
+    report: ReportConfig = ReportConfig()
+    """files beside the page of `fit` and `frf`"""
     simulate: SimulateConfig | None = None
     """a run that `heli-jax simulate` makes"""
     sweep: SweepConfig | None = None

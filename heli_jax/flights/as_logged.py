@@ -99,7 +99,7 @@ def _as_logged(
             notes.append(f"{name} has {words}: taken as missing")
         notes += source_notes(name, {n: marked.counts for n, marked in sources.items()})
         values = np.where(at, np.nan, timed.values)
-        turn = _turn(signal)
+        turn = units.turn(signal.si)
         if turn is not None and is_wrapped(values, turn):
             values, note = unwrapped(values, turn)
             notes.append(f"{name} {note}")
@@ -167,14 +167,6 @@ def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]
 def _in_log(signal: Signal, values: np.ndarray) -> np.ndarray:
     """What stands in the log for values (N,) in SI."""
     return signal.from_si(values)
-
-
-def _turn(signal: Signal) -> float | None:
-    """A full turn in the signal's SI unit; None where it is no angle."""
-    try:
-        return units.factor("turn", signal.si)
-    except ValueError:
-        return None
 
 
 def is_wrapped(values: np.ndarray, turn: float) -> bool:

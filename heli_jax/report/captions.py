@@ -38,7 +38,7 @@ GROUPS = tuple(_CAPTIONS)
 def caption(picture: Picture) -> str:
     """What a figure shows, and the name of its files."""
     [words] = [w for group, w in _CAPTIONS.items() if picture.name.startswith(group)]
-    return f"{picture.title}. {words} (figures/{picture.name}.svg, .png)"
+    return f"{picture.title}. {words} (figures/{picture.name}.svg)"
 
 
 def alt_text(picture: Picture, analysis: Analysis) -> str:

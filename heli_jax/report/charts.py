@@ -48,6 +48,8 @@ class Panel(NamedTuple):
     """vertical lines"""
     shades: tuple[tuple[float, float], ...] = ()
     """stretches of x that are shaded"""
+    x_limits: tuple[float, float] | None = None
+    """where they are not those of the chart"""
 
 
 class Chart(NamedTuple):
@@ -89,6 +91,7 @@ def chart_of(figure: Figure) -> Chart:
 def _panel(ax: Axes, height: float) -> Panel:
     low, high = ax.get_ylim()
     flat, upright, lines = _straight(ax)
+    first, last = ax.get_xlim()
     return Panel(
         label=ax.get_ylabel(),
         limits=(float(low), float(high)),
@@ -97,6 +100,7 @@ def _panel(ax: Axes, height: float) -> Panel:
         levels=flat,
         marks=upright,
         shades=_shades(ax),
+        x_limits=(float(first), float(last)),
     )
 
 

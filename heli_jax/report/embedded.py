@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax.report.charts import Chart, Series
-from heli_jax.report.style import thinned
+from heli_jax.report.thinning import thinned
 
 _BYTES = 380_000
 """of all lines of a page together: what is longer is thinned, its peaks kept"""

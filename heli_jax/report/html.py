@@ -30,8 +30,10 @@ def write_report(
     title: str,
     vehicle_constants: Mapping[str, Constant],
     origin: Origin | None = None,
+    *,
+    png: bool = False,
 ) -> list[str]:
-    """Write report.html, figures/NAME.svg and figures/NAME.png; return the figures' names.
+    """Write report.html and figures/NAME.svg; return the figures' names.
 
     The page loads nothing from outside itself. Whatever comes from logs and configurations is
     escaped.
@@ -42,6 +44,7 @@ def write_report(
         title: of the page.
         vehicle_constants: the vehicle file's, by name.
         origin: command, configuration and files beside the page; nothing of them unless given.
+        png: whether to write figures/NAME.png too.
 
     Raises:
         OSError: the directory cannot be written to.
@@ -52,7 +55,13 @@ def write_report(
     # Drawn here, one after the other: of many flights' figures one canvas is in memory at a time.
     for name, draw in drawings(analysis).items():
         made = picture(
-            name, draw, numbers, folder=folder, logged=logged.get(name), kind=_kind(name)
+            name,
+            draw,
+            numbers,
+            folder=folder,
+            logged=logged.get(name),
+            kind=_kind(name),
+            png=png,
         )
         if made is not None:
             shown.append(made._replace(alt=alt_text(made, analysis)))

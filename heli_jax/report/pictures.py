@@ -15,6 +15,7 @@ from heli_jax.report import style
 from heli_jax.report.alt_text import described
 from heli_jax.report.charts import chart_of
 from heli_jax.report.embedded import Logged, Numbers
+from heli_jax.report.svg import chart_svg
 
 _HEAVY = 45_000
 """bytes of an SVG from which on the page has a PNG in its place: noise has no short outline"""
@@ -61,6 +62,7 @@ def picture(
     folder: Path | None = None,
     logged: Mapping[str, Logged] | None = None,
     kind: Kind = "live",
+    png: bool = False,
 ) -> Picture | None:
     """Draw a figure for a page.
 
@@ -68,10 +70,11 @@ def picture(
         name: of its files.
         draw: draws it.
         numbers: the page's, to which it is added.
-        folder: for NAME.svg and NAME.png; no files unless given.
+        folder: for NAME.svg, and NAME.png where that is asked for; no files unless given.
         logged: by signal how its log has it.
         kind: `live` is drawn anew by the page, to be zoomed, which panels of lines can be; of
             `panels` words are made alone; of an `image` the title is all.
+        png: whether the folder gets NAME.png too, and both files are Matplotlib's.
 
     Returns:
         None where there is nothing to draw.
@@ -80,16 +83,22 @@ def picture(
         drawn = draw()
         if drawn is None:
             return None
+        # Saving thins the lines: the chart is taken from them before.
         chart = None if kind == "image" else chart_of(drawn)
         title = drawn.axes[0].get_title("left")
-        # Saving thins the lines: the chart has been taken from them before.
-        svg = style.as_svg(drawn) if folder is None else style.saved(drawn, folder / name)
-        image = _address("svg+xml", svg)
-        if len(svg) > _HEAVY:
-            # The file that was written, where there is one: drawing it again would take as long.
-            file = None if folder is None else folder / f"{name}.png"
-            image = _small(style.as_png(drawn) if file is None else file.read_bytes())
-    width, height = (round(96 * v) for v in drawn.get_size_inches())
+        width, height = (round(96 * v) for v in drawn.get_size_inches())
+        if chart is None:
+            file = style.as_svg(drawn)
+            image = _of_svg(drawn, file)
+        else:
+            # From the data: Matplotlib takes ten times as long, which each fit would wait for.
+            text, (width, height) = chart_svg(chart)
+            file = text.encode("utf-8")
+            image = _address("svg+xml", file)
+        if folder is not None and png:
+            style.saved(drawn, folder / name)
+        elif folder is not None:
+            (folder / f"{name}.svg").write_bytes(file)
     return Picture(
         name,
         title,
@@ -98,6 +107,11 @@ def picture(
         title if chart is None else described(chart),
         None if chart is None or kind != "live" else numbers.add_chart(chart, dict(logged or {})),
     )
+
+
+def _of_svg(drawn: Figure, svg: bytes) -> str:
+    """A drawn figure as an address: its SVG, or a PNG where that has no short outline."""
+    return _address("svg+xml", svg) if len(svg) <= _HEAVY else _small(style.as_png(drawn))
 
 
 def _small(png: bytes) -> str:

@@ -34,6 +34,8 @@ def write_responses(
     units: Mapping[str, str],
     title: str,
     handling: Sequence[Handling] = (),
+    *,
+    png: bool = False,
 ) -> None:
     """Write responses.nc, responses.csv, transfer_functions.json, handling_qualities.json,
     figures/ and responses.html.
@@ -44,6 +46,7 @@ def write_responses(
         units: SI, of inputs and outputs by name.
         title: of the page.
         handling: what the data say of handling qualities.
+        png: whether figures are PNG files too.
     """
     write_table(directory / "responses.csv", table(found))
     _write_netcdf(directory / "responses.nc", found, units)
@@ -60,7 +63,7 @@ def write_responses(
         for input in output.pairs:
             draw = functools.partial(_draw, found, units, input, name)
             pictures.append(
-                picture(_stem(input, name), draw, numbers, folder=directory / "figures")
+                picture(_stem(input, name), draw, numbers, folder=directory / "figures", png=png)
             )
     page = filled(
         "responses.html.j2",

@@ -1,7 +1,6 @@
 """How figures look: colours, one set of rcParams, thinning of long lines, saving."""
 
 import io
-import itertools
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import ArrayLike
 
+from heli_jax.report.thinning import MOST_POINTS, thinned
 from heli_jax.report.unit_symbols import pretty
 
 # Okabe and Ito's palette: told apart with every common kind of colour blindness, and in grey.
@@ -67,8 +67,6 @@ STYLE: dict[Any, Any] = {
 
 WIDTH = 7.4
 """width of a figure [inch]"""
-MOST_POINTS = 2000
-"""points of a drawn line at most: about three for each pixel of a page's width"""
 TOP = 0.5
 """margin above the first panel [inch]: a title and a row below it"""
 ROW = 15.0 / 72.0
@@ -110,30 +108,6 @@ def place(
         bottom=bottom / height,
         hspace=gap / each,
     )
-
-
-def thinned(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most `most` points of a line: the lowest and the highest of each bin.
-
-    No peak is lost, and the first and the last point stay.
-
-    Args:
-        x: (N,), ascending.
-        y: (N,)
-        most: points to keep, 4 at least.
-    """
-    # Not every k-th sample: that aliases an oscillation and misses spikes.
-    n = y.size
-    if n <= most:
-        return x, y
-    bins = (most - 2) // 2  # two points each, and the two ends
-    edges = np.linspace(0, n, bins + 1).astype(int)
-    # A missing sample is neither the lowest nor the highest.
-    down, up = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
-    low = [a + int(np.argmin(down[a:b])) for a, b in itertools.pairwise(edges)]
-    high = [a + int(np.argmax(up[a:b])) for a, b in itertools.pairwise(edges)]
-    keep = np.unique(np.concatenate([[0, n - 1], low, high]))
-    return x[keep], y[keep]
 
 
 _LONG: "weakref.WeakSet[Line2D]" = weakref.WeakSet()

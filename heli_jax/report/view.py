@@ -16,7 +16,7 @@ from heli_jax.report.animation import scene, size_of
 from heli_jax.report.drawings import MOST_FLIGHTS
 from heli_jax.report.embedded import Numbers
 from heli_jax.report.figures import Panels
-from heli_jax.report.origin import origin
+from heli_jax.report.origin import Origin, origin
 from heli_jax.report.page import filled
 from heli_jax.report.pictures import Picture, picture
 from heli_jax.simulation.trajectory import Trajectory
@@ -46,6 +46,7 @@ def write_view(
     params: Any,
     title: str,
     notes: Sequence[str] = (),
+    made: Origin | None = None,
 ) -> None:
     """Write the page of some runs of a model, with NumPy arrays, by their names.
 
@@ -58,6 +59,7 @@ def write_view(
         params: its parameters.
         title: of the page.
         notes: sentences that stand before the figures.
+        made: command, configuration and files beside the page; the command alone unless given.
 
     Raises:
         OSError: the place cannot be written to.
@@ -81,7 +83,7 @@ def write_view(
         runs=shown,
         whole=whole,
         unshown=max(0, len(runs) - MOST_FLIGHTS),
-        origin=origin(),
+        origin=made or origin(),
         numbers=numbers.content(),
     )
     path.write_text(page, encoding="utf-8")

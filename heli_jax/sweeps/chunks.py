@@ -16,4 +16,4 @@ def chunks_of(variable: xr.DataArray) -> Iterator[tuple[slice, np.ndarray]]:
     variable = variable.transpose("element", ...)
     for start in range(0, variable.sizes["element"], _ELEMENTS):
         which = slice(start, min(start + _ELEMENTS, variable.sizes["element"]))
-        yield which, variable.isel(element=which).to_numpy()
+        yield which, variable.isel(element=which).values

@@ -7,16 +7,13 @@ Sobol sequence are computed where they are needed (a Latin hypercube and a table
 import dataclasses
 import functools
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from heli_jax.sweeps.axes import Columns, Range, axis_values, check_axes, check_range, digest
-
-if TYPE_CHECKING:
-    import scipy.stats.qmc
+from heli_jax.sweeps.sobol_points import MOST, scrambled_sobol
 
 
 class Design(Protocol):
@@ -105,8 +102,9 @@ class _Sampled:
             check_range(name, axis)
         if n < 1:
             raise ValueError(f"n must be at least 1, got {n}")
+        if kind == "sobol" and n > MOST:
+            raise ValueError(f"n must be at most {MOST} in a Sobol sequence, got {n}")
         self.axes, self._n, self.seed, self.kind = dict(axes), n, seed, kind
-        self._idle: list[Any] = []  # engines of the sequence, each somewhere along it
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -125,41 +123,15 @@ class _Sampled:
         return scipy.stats.qmc.LatinHypercube(len(self.axes), rng=rng).random(self._n)
 
     def values(self, start: int, stop: int) -> Columns:
-        points = self._hypercube[start:stop] if self.kind == "lhs" else self._sobol(start, stop)
+        if self.kind == "lhs":
+            points = self._hypercube[start:stop]
+        else:
+            points = scrambled_sobol(len(self.axes), self.seed, start, stop)
         return {n: axis.at(points[:, i]) for i, (n, axis) in enumerate(self.axes.items())}
-
-    def _sobol(self, start: int, stop: int) -> np.ndarray:
-        """Points (stop - start, axes) of the sequence."""
-        import scipy.stats.qmc
-
-        # SciPy walks through all points that it leaves out, so each slice goes on where the last
-        # ended: from the beginning, the cost of a chunk would grow with its place in the sweep.
-        # Taken out while it is used: another thread makes its own.
-        try:
-            engine = self._idle.pop()
-        except IndexError:
-            engine = None
-        if engine is None or engine.num_generated > start:
-            # It cannot walk back. The same seed makes the same scrambling, and so the same points.
-            rng = np.random.default_rng(self.seed)
-            engine = scipy.stats.qmc.Sobol(len(self.axes), rng=rng)
-        if start > engine.num_generated:
-            engine.fast_forward(start - engine.num_generated)
-        points = _quiet_random(engine, stop - start)
-        self._idle.append(engine)
-        return points
 
     def describe(self) -> dict[str, Any]:
         axes = {n: [a.lower, a.upper, a.scale] for n, a in self.axes.items()}
         return {"design": self.kind, "axes": axes, "n": self._n, "seed": self.seed}
-
-
-def _quiet_random(engine: "scipy.stats.qmc.QMCEngine", n: int) -> np.ndarray:
-    """Points of a Sobol sequence, without SciPy's warning that n is no power of two."""
-    # It is right for the sequence and wrong for a slice of it, which seldom is a power of two.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="The balance properties of Sobol")
-        return engine.random(n)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ def as_grid(dataset: xr.Dataset) -> xr.Dataset:
     axes = list(dataset.attrs["axes"])
     labels, places = {}, []
     for axis in axes:
-        labels[axis], place = np.unique(dataset[axis].to_numpy(), return_inverse=True)
+        labels[axis], place = np.unique(dataset[axis].values, return_inverse=True)
         places.append(place.reshape(-1))
     shape = tuple(values.size for values in labels.values())
     size = dataset.sizes["element"]
@@ -36,7 +36,7 @@ def as_grid(dataset: xr.Dataset) -> xr.Dataset:
     variables = {
         name: (
             (*axes, *variable.dims[1:]),
-            variable.to_numpy().reshape(*shape, *variable.shape[1:]),
+            variable.values.reshape(*shape, *variable.shape[1:]),
             variable.attrs,
         )
         for name, variable in ordered.variables.items()

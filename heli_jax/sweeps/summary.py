@@ -55,7 +55,7 @@ def summary(dataset: xr.Dataset, job: Job, timing: dict[str, Any]) -> dict[str, 
         timing: what it took, as JSON has it.
     """
     # The status of all elements is held, a byte each; results are read in pieces.
-    status = dataset["status"].to_numpy()
+    status = dataset["status"].values
     fine = status == OK
     results = {
         str(name): _quantiles(dataset[name], fine)
@@ -150,7 +150,7 @@ def best(dataset: xr.Dataset, job: Job, count: int = _WORST_COUNT) -> dict[str, 
 
 def _extreme(dataset: xr.Dataset, job: Job, count: int, sign: float) -> dict[str, np.ndarray]:
     """The worst elements of each result, or with a sign of -1 the best."""
-    fine = dataset["status"].to_numpy() == OK
+    fine = dataset["status"].values == OK
     by_result = {}
     for name, reduce in job.reduce.items():
         # Modes, margins and functions of several numbers have no variable of their own name, and
@@ -195,8 +195,8 @@ def _worst(
 def _rows(dataset: xr.Dataset, job: Job, name: str, elements: np.ndarray) -> list[dict[str, Any]]:
     """Elements with their value of a result and their axes, as JSON has it."""
     few = dataset.isel(element=elements)
-    values = few[name].transpose("element", ...).to_numpy().tolist()
-    axes = {n: few[n].to_numpy().astype(np.float64) for n in job.design.names}
+    values = few[name].transpose("element", ...).values.tolist()
+    axes = {n: few[n].values.astype(np.float64) for n in job.design.names}
     return [
         {"element": int(k), "value": v, "axes": {n: float(a[i]) for n, a in axes.items()}}
         for i, (k, v) in enumerate(zip(elements, values, strict=True))

@@ -13,6 +13,7 @@ COLUMNS = {
     "single": np.array([0.1, 0.2, 0.3, 0.4], np.float32),
     "true": np.array([True, False, True, True]),
     "words": ["a", None, "", 'b"'],
+    "texts": ["é", "", 'b"', "a,b"],
 }
 
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from heli_jax import sweeps
 from heli_jax.sweeps import Range, grid, lhs, paired, product, sobol, table, zipped
 from heli_jax.sweeps.axes import whole_seeds
+from heli_jax.sweeps.sobol_points import scrambled_sobol
 
 AXES = {"Ixx": Range(0.01, 0.1, "log"), "a": Range(4.0, 6.0)}
 
@@ -89,6 +90,15 @@ def test_samples_are_scipys(make, engine):
     np.testing.assert_allclose(found["a"], 4.0 + 2.0 * points[:, 1], rtol=1e-14)
     np.testing.assert_allclose(found["Ixx"], 0.01 * 10.0 ** points[:, 0], rtol=1e-13)
     assert not np.array_equal(found["a"], whole(make(AXES, 64, seed=12))["a"])
+
+
+@pytest.mark.filterwarnings("ignore:The balance properties")
+@pytest.mark.parametrize("axes", [1, 3, 32, 33])
+def test_points_of_a_sobol_sequence_are_scipys_to_the_last_bit(axes):
+    expected = scipy.stats.qmc.Sobol(axes, rng=np.random.default_rng(5)).random(700)
+    np.testing.assert_array_equal(scrambled_sobol(axes, 5, 0, 700), expected)
+    np.testing.assert_array_equal(scrambled_sobol(axes, 5, 311, 509), expected[311:509])
+    assert scrambled_sobol(axes, 5, 0, 0).shape == (0, axes)
 
 
 def test_a_latin_hypercube_has_one_point_in_every_row():

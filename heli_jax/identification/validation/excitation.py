@@ -69,16 +69,20 @@ def sampling(problem: Problem, values: dict[str, float]) -> list[str]:
     return aliasing(fast_modes(problem, values))
 
 
+def _both(omega: float) -> str:
+    return f"{omega:.4g} rad/s, {omega / (2.0 * np.pi):.3g} Hz"
+
+
 def aliasing(modes: Sequence[FastMode]) -> list[str]:
     """A sentence for each mode that the samples cannot show, as `fast_modes` finds them."""
     sentences = []
     for mode in modes:
         past = mode.frequency >= mode.nyquist
         sentences.append(
-            f"{mode.flight}: a mode at {mode.frequency:.4g} rad/s"
+            f"{mode.flight}: a mode at {_both(mode.frequency)}"
             f"{f' (linearised about {mode.about})' if mode.about else ''} lies "
             f"{'at or past' if past else 'near'} {ALIASED} "
-            f"({mode.nyquist:.4g} rad/s): the samples {'cannot' if past else 'hardly'} show it, "
+            f"({_both(mode.nyquist)}): the samples {'cannot' if past else 'hardly'} show it, "
             "and its aliases may be taken for slower dynamics."
         )
     return sentences

@@ -158,10 +158,13 @@
     const x0 = data[0][0], x1 = data[0].at(-1);
     list[0] = { label: last ? chart.xLabel.replace(/ \[.*/, "") : "", class: last ? "listed" : "unlisted",
       value: (u, v) => v == null ? "–" : `${text(v, u.scales.x.max - u.scales.x.min)} ${(/\[(.*)\]/.exec(chart.xLabel) ?? [])[1] ?? ""}` };
+    // What x will be: the plot itself has that only after y has been ranged, so at first nothing.
+    let across = chart.xLimits;
+    const xRange = (u, low, high) => across = low === x0 && high === x1 ? chart.xLimits : [low, high];
     // The limits of the figure while all is seen; zoomed, what is seen.
     const range = (u, low, high) => {
       const [first, last] = chart.xLimits, hair = 1e-9 * (last - first);
-      const whole = u.scales.x.min <= first + hair && u.scales.x.max >= last - hair;
+      const whole = across[0] <= first + hair && across[1] >= last - hair;
       if (whole || low == null) return panel.limits;
       // What stands still is shown with room for ticks of its own size, and not from -1 to 1.
       const margin = 0.06 * (high - low) || 0.1 * (panel.limits[1] - panel.limits[0]) || 1;
@@ -172,7 +175,7 @@
     const u = new uPlot({
       width: Math.max(260, place.clientWidth), height: panel.height + (last ? 52 : 10),
       padding: [8, 12, 0, 0], ms: 1e-3, series: list, bands,
-      scales: { x: { time: false, distr: chart.log ? 3 : 1, range: (u, low, high) => low === x0 && high === x1 ? chart.xLimits : [low, high] }, y: { range } },
+      scales: { x: { time: false, distr: chart.log ? 3 : 1, range: xRange }, y: { range } },
       axes: [{ ...axis, size: last ? 30 : 6, label: last ? chart.xLabel : undefined, labelSize: 18, labelGap: 0, labelFont: axis.font, splits: chart.log ? decades : undefined, filter: chart.log ? (u, s) => s : undefined,
         values: last ? chart.log ? (u, s) => s.map(v => `${+v.toPrecision(2)}`) : undefined : () => [] }, { ...axis, size: (u, values) => Math.max(62, 16 + 6.8 * Math.max(0, ...(values ?? []).map(v => v?.length ?? 0))), space: 16, values: (u, splits) => ticks(splits) }],
       legend: { markers: { width: 2, stroke: (u, i) => i ? u.series[i].stroke() : "transparent", fill: null } },

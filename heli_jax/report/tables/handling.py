@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from heli_jax.analysis.attitude_responses import Handling
 from heli_jax.analysis.handling_qualities import NUMBERS, UNITS, HandlingQualities, Number
 from heli_jax.numbers import number
@@ -43,7 +45,11 @@ def _sources(entries: Sequence[Handling]) -> tuple[str, ...]:
 
 def _cell(of: HandlingQualities | str | None, name: str) -> str:
     found = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
-    return NOT_DETERMINED if found is None else _shown(found)
+    if found is None:
+        return NOT_DETERMINED
+    # Pilots' criteria count in rad/s, rotors and filters in Hz.
+    hz = f", {number(found.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
+    return _shown(found) + hz
 
 
 def _shown(n: Number) -> str:
@@ -64,7 +70,7 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
 
 
 def handling_lines(entries: Sequence[Handling]) -> list[str]:
-    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5.0 to 5.3), data 5.2 (5 to 5.4)`
+    """One line each: `lat to phi: bandwidth [rad/s] model 5.1 (5 to 5.3), 0.812 Hz`
 
     Args:
         entries: what model and data say.

@@ -1,0 +1,51 @@
+"""Where an axis has its numbers, and how they are written."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.numbers import aligned
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Round numbers from low to high, 1, 2 or 5 times a power of ten apart.
+
+    Args:
+        low, high: ends of the axis, in either order.
+        most: numbers at most, 2 at least.
+    """
+    low, high = min(low, high), max(low, high)
+    if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+        return [low] if math.isfinite(low) else []
+    power = 10.0 ** math.floor(math.log10((high - low) / most))
+    for factor in (1.0, 2.0, 5.0, 10.0, 20.0):
+        step = factor * power
+        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+        if last - first < most:
+            break
+    return [k * step for k in range(first, last + 1)]
+
+
+def decades(low: float, high: float, most: int) -> list[float]:
+    """1, 2 and 5 times the powers of ten from low to high; the powers alone where that is too many.
+
+    Args:
+        low, high: ends of a logarithmic axis, both above zero.
+        most: numbers at most, roughly.
+    """
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for digits in ((1.0, 2.0, 5.0), (1.0,)):
+        every = [m * 10.0**p for p in powers for m in digits]
+        inside = [v for v in every if low * (1 - 1e-9) <= v <= high * (1 + 1e-9)]
+        if len(inside) <= most + 2:
+            break
+    return inside
+
+
+def tick_texts(values: Sequence[float]) -> list[str]:
+    """The numbers of an axis: all with one power of ten, and as many places as tell them apart."""
+    if not values:
+        return []
+    step = float(np.min(np.diff(values))) if len(values) > 1 else abs(values[0]) or 1.0
+    return list(aligned(values, step))

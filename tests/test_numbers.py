@@ -1,0 +1,67 @@
+"""Numbers on pages and on the terminal: one rule for digits and rounding."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from heli_jax import numbers
+
+VALUES = st.floats(1e-12, 1e12) | st.floats(-1e12, -1e-12) | st.just(0.0)
+
+
+def value_of(text):
+    """What a number of a page is, without any of the code under test."""
+    digits, _, power = text.replace("−", "-").partition("·10")
+    raised = "".join("-0123456789"["⁻⁰¹²³⁴⁵⁶⁷⁸⁹".index(c)] for c in power) or "0"
+    return float(f"{digits}e{raised}")
+
+
+def digits_of(text):
+    return re.sub(r"e.*|[^0-9]", "", text.partition("·")[0]).lstrip("0")
+
+
+@given(VALUES, st.integers(1, 9))
+def test_terminal_and_page_write_the_same_number(value, digits):
+    page, terminal = numbers.number(value, digits), numbers.terse(value, digits)
+    assert terminal.isascii()
+    assert float(terminal) == value_of(page)
+    assert digits_of(terminal) == digits_of(page)
+
+
+@given(VALUES, st.floats(1e-12, 1e12))
+def test_terminal_and_page_round_to_the_same_digit_of_the_standard_deviation(value, sd):
+    for page, terminal in zip(numbers.measured(sd, value), numbers.rounded(value, sd), strict=True):
+        assert terminal.isascii()
+        assert float(terminal) == value_of(page)
+        assert digits_of(terminal) == digits_of(page)
+
+
+@pytest.mark.parametrize(
+    ("value", "page", "terminal"),
+    [
+        (7.5e-6, "7.5·10⁻⁶", "7.5e-06"),
+        (-1.25e7, "−1.25·10⁷", "-1.25e+07"),
+        (0.0123, "0.0123", "0.0123"),
+        (31400.0, "31400", "31400"),
+        (float("inf"), "∞", "inf"),
+        (-float("inf"), "−∞", "-inf"),
+        (None, "–", "-"),
+    ],
+)
+def test_powers_stand_as_python_writes_them(value, page, terminal):
+    assert numbers.number(value) == page
+    assert numbers.terse(value) == terminal
+
+
+def test_each_number_on_the_terminal_has_a_power_of_its_own():
+    assert numbers.measured(1.234e-7, 1.7e-4) == ("1.7000·10⁻⁴", "0.0012·10⁻⁴")
+    assert numbers.rounded(1.7e-4, 1.234e-7) == ("1.7000e-04", "1.2e-07")
+
+
+def test_numbers_within_a_sentence_are_written_for_the_terminal():
+    sentence = "a delay of 9.72·10⁻⁵ (−7.7·10⁻⁵ to ∞) s ± 3 %, from x_roll – none"
+    words = "a delay of 9.72e-05 (-7.7e-05 to inf) s +- 3 %, from x_roll - none"
+    assert numbers.plain_words(sentence) == words
+    assert numbers.plain_words("coefficient of s^2 in 12.50") == "coefficient of s^2 in 12.50"
