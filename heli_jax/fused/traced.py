@@ -1,0 +1,134 @@
+"""A run of one element, taken apart: what is computed once, and what at every sample."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from heli_jax.fused.program import Argument, Run
+from heli_jax.numerics.hoist import hoisted
+
+# `Any` below: trees of arrays, and jaxprs.
+
+
+class Steps(Protocol):
+    """A run in its steps, as `heli_jax.simulation.accumulate.Samples` is one."""
+
+    @property
+    def carry(self) -> Any:
+        """before the first sample"""
+
+    def step(self, carry: Any, k: Any, /) -> Any:
+        """The carry a sample after the k-th."""
+
+    def last(self, carry: Any, /) -> Any:
+        """The results, from the carry at the last sample."""
+
+
+type Making = Callable[[Any, Any, Any], Steps]
+"""of (what all elements share, records (N, ...) that all share, what an element has of its own)"""
+
+
+class Traced(NamedTuple):
+    """A run as it is translated, with what comes before it."""
+
+    run: Run
+    results: Any
+    """the structure of what the run gives"""
+    begin: Any
+    """the jaxpr of (shared, records, element): the carry at first, then what stays"""
+
+    @property
+    def varies(self) -> tuple[bool, ...]:
+        """Of what stays, whether each element has its own."""
+        return tuple(not argument.shared for argument in self.run.stays)
+
+    def _before(self, *arguments: Any) -> tuple[list[Any], list[Any]]:
+        outputs = core.jaxpr_as_fun(self.begin)(*jax.tree.leaves(arguments))
+        n = len(self.run.carry)
+        return outputs[:n], outputs[n:]
+
+    def own(self, shared: Any, records: Any, element: Any) -> tuple[list[Any], list[Any]]:
+        """What an element begins with: the carry, and what stays of its own. JAX can trace it."""
+        carry, stay = self._before(shared, records, element)
+        return carry, [v for v, varying in zip(stay, self.varies, strict=True) if varying]
+
+    def common(self, shared: Any, records: Any, element: Any) -> list[Any]:
+        """What stays and is the same for all elements, of any of them."""
+        _, stay = self._before(shared, records, element)
+        return [v for v, varying in zip(stay, self.varies, strict=True) if not varying]
+
+    def stays(self, own: list[Any], common: list[Any]) -> list[Any]:
+        """Both in their order."""
+        of_own, of_common = iter(own), iter(common)
+        return [next(of_own) if varying else next(of_common) for varying in self.varies]
+
+
+def traced(making: Making, shared: Any, records: Any, element: Any) -> Traced:
+    """Trace a run.
+
+    Args:
+        making: the steps of an element.
+        shared: what all elements share, but for records.
+        records: arrays (N, ...) that all elements share, read by the sample.
+        element: an example of what an element has of its own.
+
+    Raises:
+        UnsupportedError: a part of it has no translation.
+    """
+    sample = np.zeros((), np.int32)
+
+    def step(own: Any, records: Any, carry: Any, k: Any) -> Any:
+        return making(own[0], records, own[1]).step(carry, k)
+
+    def last(own: Any, records: Any, carry: Any) -> Any:
+        return making(own[0], records, own[1]).last(carry)
+
+    found: dict[str, Any] = {}
+
+    def begin(shared: Any, given: Any, element: Any) -> Any:
+        """What is carried before the first sample, and what stays."""
+        carry = making(shared, given, element).carry
+        own = shared, element
+        of_step, a_step = hoisted(step, own, given, carry, sample)
+        of_last, the_last = hoisted(last, own, given, carry)
+        both, n = [*of_step, *of_last], len(of_step)
+        # Traced here, where the values that they stay with are at hand.
+        found["step"] = jax.make_jaxpr(lambda v, *rest: a_step(v[:n], *rest))(
+            both, records, carry, sample
+        )
+        found["last"], shape = jax.make_jaxpr(
+            lambda v, *rest: the_last(v[n:], *rest), return_shape=True
+        )(both, records, carry)
+        found["results"] = jax.tree.structure(shape)
+        return carry, both
+
+    closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
+    carried, stay = (jax.tree.leaves(part) for part in shape)
+    n_shared = len(jax.tree.leaves((shared, records)))
+    varies = _vary(closed.jaxpr, n_shared)[len(carried) :]
+    rows = [np.asarray(v) for v in jax.tree.leaves(records)]
+    run = Run(
+        found["step"],
+        found["last"],
+        tuple(
+            Argument(v.shape, np.dtype(v.dtype), not varying)
+            for v, varying in zip(stay, varies, strict=True)
+        ),
+        tuple(Argument(v.shape, v.dtype, True) for v in rows),
+        tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
+        rows[0].shape[0],
+    )
+    return Traced(run, found["results"], closed)
+
+
+def _vary(jaxpr: Any, n_shared: int) -> list[bool]:
+    """Of each result whether it depends on more than the first arguments."""
+    own = set(jaxpr.invars[n_shared:])
+    for equation in jaxpr.eqns:
+        # A literal has no hash, and depends on nothing.
+        if any(not hasattr(v, "val") and v in own for v in equation.invars):
+            own |= set(equation.outvars)
+    return [not hasattr(v, "val") and v in own for v in jaxpr.outvars]
