@@ -21,6 +21,7 @@ from frequency_error import DT, NAMES, NOISE, SAMPLES, TAU, VEHICLE, steps
 
 from heli_jax import Flight, Free, Problem, fit, models, naming
 from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.identification.result import Fit
 
 jax.config.update("jax_enable_x64", True)
 Z95 = 1.959963984540054
@@ -76,6 +77,29 @@ def whitened(s: np.ndarray, sigma: float) -> np.ndarray:
     return out
 
 
+def record(rng: np.random.Generator, u: np.ndarray, sigma: float) -> Flight:
+    """Roll of a stick u in gusts of sigma [rad/s^2]."""
+    roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
+    roll = roll + NOISE * rng.standard_normal(SAMPLES)
+    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
+
+
+def one_fit(
+    flight: Flight, method: str, window: float | None
+) -> tuple[Fit, np.ndarray, np.ndarray]:
+    """A fit from 1.3 times the truth, relative errors, and errors over the stated sd."""
+    truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
+    free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
+    options = ResponseOptions(window=window)
+    problem = Problem(
+        models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
+    )
+    found = fit(problem)
+    error = np.array([found.estimates[n].value for n in NAMES]) - truth
+    sd = np.array([found.estimates[n].sd or np.nan for n in NAMES])
+    return found, error / truth, error / sd
+
+
 def one_run(
     seed: int, move: Callable, sigma: float, window: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, float]]:
@@ -83,26 +107,16 @@ def one_run(
     chi-squared lies in the interval that is expected of it (NaN where there is none)."""
     rng = np.random.default_rng(seed)
     u = move(rng)
-    roll = response(VEHICLE, u, DT, sigma, TAU, rng)[:, 0]
-    roll = roll + NOISE * rng.standard_normal(SAMPLES)
-    flight = Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
-    truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
+    flight = record(rng, u, sigma)
     least, out = bound(u, sigma), []
     for method in METHODS:
-        free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
-        options = ResponseOptions(window=window if method == METHODS[0] else None)
-        problem = Problem(
-            models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
-        )
         began = time.perf_counter()
-        found = fit(problem)
+        found, error, z = one_fit(flight, method, window if method == METHODS[0] else None)
         took = time.perf_counter() - began
-        error = np.array([found.estimates[n].value for n in NAMES]) - truth
-        sd = np.array([found.estimates[n].sd or np.nan for n in NAMES])
         inside = np.nan
         if (responses := found.responses) is not None:
             inside = responses.lower95 < responses.chi_squared < responses.upper95
-        out.append((error / truth, error / sd, least, took, float(inside)))
+        out.append((error, z, least, took, float(inside)))
     return out
 
 

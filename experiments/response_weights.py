@@ -11,11 +11,10 @@ from unittest import mock
 
 import jax
 import numpy as np
-from coverage_cases.disturbed import response
-from frequency_error import DT, NAMES, NOISE, SAMPLES, TAU, VEHICLE, steps
-from frequency_response import Z95, bound
+from frequency_error import DT, NAMES, SAMPLES, steps
+from frequency_response import Z95, bound, one_fit, record
 
-from heli_jax import Flight, Free, Problem, fit, models
+from heli_jax import Flight
 from heli_jax.analysis import response_errors
 from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.analysis.windowed import windowed
@@ -26,37 +25,16 @@ SIGMA, RECORDS = 1.04, 150
 MODULES = (frequency_response, response_weights)
 
 
-def record(rng: np.random.Generator, u: np.ndarray) -> Flight:
-    """Roll of a stick u in gusts."""
-    roll = response(VEHICLE, u, DT, SIGMA, TAU, rng)[:, 0]
-    roll = roll + NOISE * rng.standard_normal(SAMPLES)
-    return Flight(dt=DT, inputs={"x_roll": u}, outputs={"roll": roll})
-
-
 def density(window: float) -> np.ndarray:
     """(k, 1, 1) of gusts and noise in windows."""
     rng, power = np.random.default_rng(12345), np.zeros((1, 1))
     for _ in range(RECORDS):
-        still = record(rng, np.zeros(SAMPLES))
+        still = record(rng, np.zeros(SAMPLES), SIGMA)
         # Windows of a stick that moves: it moves nothing here.
         moved = Flight(dt=DT, inputs={"x_roll": np.arange(SAMPLES) % 7.0}, outputs=still.outputs)
         Y = windowed([moved], ResponseOptions(window=window)).Y
         power = power + np.mean(np.abs(Y) ** 2, axis=0)
     return (power / RECORDS)[:, :, None].astype(complex)
-
-
-def one_fit(flight: Flight, window: float) -> tuple[np.ndarray, np.ndarray]:
-    """Relative errors, and errors over the stated sd."""
-    truth = np.array([float(getattr(VEHICLE, n)) for n in NAMES])
-    free = {n: Free(1.3 * t) for n, t in zip(NAMES, truth, strict=True)}
-    options = ResponseOptions(window=window)
-    method = "frequency-response"
-    problem = Problem(
-        models.roll_on_stand, VEHICLE, [flight], free, method=method, frequency=options
-    )
-    found = fit(problem)
-    error = np.array([found.estimates[n].value for n in NAMES]) - truth
-    return error / truth, error / np.array([found.estimates[n].sd or np.nan for n in NAMES])
 
 
 def main(runs: int, window: float) -> None:
@@ -76,11 +54,11 @@ def main(runs: int, window: float) -> None:
         for seed in range(runs):
             rng = np.random.default_rng(seed)
             u = steps(rng)
-            flight = record(rng, u)
+            flight = record(rng, u, SIGMA)
             for patch in patches:
                 patch.start()
             try:
-                error, z = one_fit(flight, window)
+                _, error, z = one_fit(flight, "frequency-response", window)
             finally:
                 for patch in patches:
                     patch.stop()

@@ -14,8 +14,12 @@ Intervals rest on each number's derivative by all that the response hangs on (th
 it the parameters of a fit or the random errors of a measured response; those of frequencies are
 where the response's own interval holds the level that defines them.
 
-See also Ham, Gardner and Tischler (1993), Flight testing and frequency domain analysis for
-rotorcraft handling qualities characteristics, of whom the least-squares line is too.
+Compared with what others say of the standard, not with its own text: Ham, Gardner and Tischler
+(1993), Flight testing and frequency domain analysis for rotorcraft handling qualities
+characteristics: the attitude's response to the stick, a rate's over s in its place, the phase delay
+by two points or by least squares from the neutral stability frequency to its double (CIFER weighs
+that line by coherence, here it is not weighed); Frost and others (2002), AIAA 2002-4869: 45 deg of
+phase margin for attitude command, the lesser of that and 6 dB of gain margin for rate responses.
 """
 
 from typing import Literal, NamedTuple

@@ -32,8 +32,9 @@ def unnoticeable(omega: Float[np.ndarray, " k"]) -> Envelope:
 
     Source: Wood and Hodgkinson (1980), Definition of acceptable levels of mismatch for equivalent
     systems of augmented CTOL aircraft, MDC A6792, as MIL-STD-1797A and Tischler and Remple (2012)
-    have them; the coefficients as the function LoesBound of C. Regan (2006) lists them, not
-    compared with the reports themselves. A lead and a lag of the phase's envelopes by a few
+    have them; the coefficients are those that the function LoesBound of C. Regan (2006, 'based on
+    Stoliker's routines') lists, number by number, which itself asks for them to be checked: they
+    were not compared with the reports. A lead and a lag of the phase's envelopes by a few
     milliseconds, which some give beside them, are left out, so that these are the narrower ones.
     """
     s = 1j * omega

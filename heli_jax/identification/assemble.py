@@ -184,7 +184,7 @@ def assemble(
     moved = moved_by_feedback(solution, e.J) if bool(best.converged) else {}
     stays = bool(moved) and held_upright(solution)
     by_instrument = data.flights[0].by_instrument is not None
-    weak = weak_by_instrument(problem, solution) if bool(best.converged) else ()
+    weak = weak_by_instrument(problem, solution, e.J) if bool(best.converged) else ()
     responses = layout.estimator.response_agreement(layout, data, noise, best.z)
     instruments = _instruments(problem, by_instrument, responses)
     in_time = (problem, params, signals, white, against, layout.determined)

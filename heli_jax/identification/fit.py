@@ -4,6 +4,8 @@ import dataclasses
 import time
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import naming
@@ -15,6 +17,7 @@ from heli_jax.identification.estimation import multistart as starting
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.delay_starts import delay_starts
 from heli_jax.identification.estimation.disturbance_search import disturbance_or_none
+from heli_jax.identification.estimation.drawn_starts import draw
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import StartRow
@@ -200,7 +203,7 @@ def _starts(
     """Where the optimiser begins, as `fit` says of its argument."""
     if starts is None:
         return delay_starts(guess.layout, problem, guess.z, seed)
-    return starting.draw(guess.layout, problem, guess.z, starts, seed)
+    return draw(guess.layout, problem, guess.z, starts, seed)
 
 
 def fit(
@@ -267,7 +270,10 @@ def _search(
     search = starting.Search(
         problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
     )
-    optima = search.run(noise, points, report)
+    # Residuals at the first start are those of the first guess.
+    same = bool(np.array_equal(points[0], guess.z))
+    known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
+    optima = search.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)

@@ -41,7 +41,7 @@ def test_a_search_that_has_not_moved_did_not_converge(monkeypatch):
     found = fit(problem)
     assert found.status == "converged"
 
-    def stays(layout, data, noise, z0, max_steps=200, *, held=None):
+    def stays(layout, data, noise, z0, max_steps=200, **_):
         # The optimiser's word is that it arrived, at its start.
         at = multistart.residual_and_jacobian(layout, data, noise, z0)
         cost = np.mean(np.square(np.asarray(at.r)))

@@ -72,6 +72,25 @@ def test_errors_of_gusts_through_an_integration_and_a_mode_are_whitened():
     assert np.max(plain) > 2.0
 
 
+def test_a_state_that_no_output_shows_takes_no_part_in_the_spectrum():
+    """What rounding leaves of such a state passed for the way of a huge gust: the whitening then
+    changed by a tenth with the last digit of the parameters."""
+    Ad, _ = discrete([[-2.0, 0, 0.3], [1, 0, 0], [0.7, 0.1, -1.0]], [[0], [0], [0]])
+    Ad[:2, 2] = 0.0
+    rng = np.random.default_rng(0)
+    K = (N - 1) // 2
+    f = np.arange(1, K + 1) / K
+    colour = 1e-3 / (0.02 + f[:, None])
+    errors = [
+        colour * (rng.standard_normal((K, 2)) + 1j * rng.standard_normal((K, 2))) for _ in range(2)
+    ]
+    alone = whitening_by(Machine(Ad[:2, :2], np.eye(2)), errors)[0]
+    for rounding in (0.0, 1e-17, -1e-16):
+        Ad[:2, 2] = rounding
+        by = whitening_by(Machine(Ad, np.eye(3)[:2]), errors)[0]
+        assert np.max(np.abs(by - alone)) < 1e-9 * np.max(np.abs(alone))
+
+
 def one_run(of_file, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Relative errors, and those in stated standard deviations, in gusts and without feedback."""
     rng = np.random.default_rng(seed)

@@ -25,6 +25,7 @@ from heli_jax.identification.estimation.measured_signals import (
     signals,
 )
 from heli_jax.identification.estimation.simulated_flights import Run
+from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution, Unknowns
 
@@ -94,6 +95,8 @@ class Estimator(abc.ABC):
     """whether the noise is relaxed from the rows: else nobody evaluates them for that"""
     least_squares: ClassVar[bool] = True
     """whether the sum of squared rows is the misfit itself, weighed by the noise of each output"""
+    nearing: ClassVar[Nearing | None] = None
+    """how a search ends after which the noise is relaxed; None: as near as it gets"""
     by_instrument: ClassVar[bool] = False
     """whether it can take inputs by their instrument (`Problem.instrument`)"""
 

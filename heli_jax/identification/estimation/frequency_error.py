@@ -51,6 +51,7 @@ from heli_jax.identification.estimation.in_time import in_time
 from heli_jax.identification.estimation.linearisation_doubts import linearisation_notes
 from heli_jax.identification.estimation.linearised_flights import cannot_linearise, condition_of
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import (
     Data,
@@ -72,6 +73,9 @@ class FrequencyError(Estimator):
     least_squares = False
     errors = "residuals"
     by_instrument = True
+    # Evaluations are what a fit costs, and a spectrum is nearly the same half of a standard
+    # deviation away.
+    nearing = Nearing(0.3)
 
     def residuals(self, layout: Layout, data: Data, noise: Noise, u: Unknowns) -> Residuals:
         """A row for each unknown of interest, and one for what is left of the errors.

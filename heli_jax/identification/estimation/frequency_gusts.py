@@ -47,6 +47,8 @@ _STEPS = 24
 """towards the largest likelihood: what they leave is for the mean over lines"""
 _NOTHING = 1e-9
 """of an output's power, below which none of it is noise"""
+_UNSEEN = 1e-10
+"""part of the largest effect of a state below which outputs do not show one"""
 
 
 class Machine(NamedTuple):
@@ -150,7 +152,11 @@ def _cells(
     n = len(Ad)
     z = np.exp(2j * np.pi * f)[:, None, None]
     H = (C / size[:, None]) @ np.linalg.inv(z * np.eye(n) - Ad)
-    return _Cells(f, H, power, count * len(errors))
+    # What rounding leaves of a state that no output shows would pass for the way of a huge gust,
+    # and the spectrum would jump with the last digit of the parameters.
+    effects = np.max(np.where(np.isfinite(H), np.abs(H), 0.0), axis=(0, 1))
+    seen = effects > _UNSEEN * np.max(effects)
+    return _Cells(f, np.where(seen, H, 0.0), power, count * len(errors))
 
 
 def _corners(f: Float[np.ndarray, " c"]) -> Float[np.ndarray, " b"]:

@@ -142,22 +142,20 @@ class Strength(NamedTuple):
     """of a regression with that coherence; below 16.4 an instrument is weak"""
 
 
-def strengths(at: Solution) -> dict[str, Strength]:
+def strengths(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Strength]:
     """By unknown of interest what the instruments tell of it.
 
     Args:
         at: where a fit by instrument ended.
+        J: the whitened rows' derivative there, by instrument.
     """
     layout, data, noise, z = at
-
-    def sds(by: float) -> np.ndarray:
-        # The same program either way, and the same weights.
-        weighed = noise._replace(by_instrument=np.asarray(by))
-        J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)
-        return deviations(J)[: len(layout.of_interest)]
-
+    # The same program, and the same weights.
+    direct = noise._replace(by_instrument=np.zeros(()))
+    of_inputs = np.asarray(residual_and_jacobian(layout, data, direct, z).J)
+    sds, at_best = (deviations(v)[: len(layout.of_interest)] for v in (J, of_inputs))
     with np.errstate(all="ignore"):
-        shares = np.clip(np.nan_to_num((sds(0.0) / sds(1.0)) ** 2), 0.0, 1.0)
+        shares = np.clip(np.nan_to_num((at_best / sds) ** 2), 0.0, 1.0)
     # Each instrument takes its part of them.
     n = AVERAGES * len(data.flights) / max(len(inputs_by_instrument(data)), 1)
     return {

@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from heli_jax import stages
 from heli_jax.identification.estimation.measured_signals import measured_count
 from heli_jax.identification.estimation.optimiser_step import (
-    BATCHED,
     SINGLE,
     Compiled,
     Constants,
@@ -33,7 +32,8 @@ from heli_jax.identification.estimation.scaling import (
     scaling,
     trusted_columns,
 )
-from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
+from heli_jax.identification.estimation.trust_region import Nearing
+from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
 
 class Optimum(NamedTuple):
@@ -46,15 +46,15 @@ class Optimum(NamedTuple):
     steps: Array | np.ndarray
     converged: Array | np.ndarray
     """the optimiser's own word, and everything finite"""
+    moved: Array | np.ndarray = np.asarray(np.inf)
+    """squared distance from the start in joint standard deviations; inf where it was not asked"""
 
 
 _SHOWN = 0.3
 """s between two words of how far a run is: what that costs is then a few thousandths of it"""
-_MANY_STEPS = 60
-"""steps after which a run among many, which began near its optimum, is given up"""
 
 
-def _descend(
+def descend(
     evaluate: Callable[[Array], tuple[Array, Array]],
     constants: Constants,
     first: tuple[Array, Array],
@@ -131,7 +131,7 @@ def _optimise_in_one_program(
     until: np.ndarray,
     trusted: np.ndarray,
 ) -> _End:
-    """`_descend` from one start as one program, up to `until` steps in all; with one step it
+    """`descend` from one start as one program, up to `until` steps in all; with one step it
     evaluates z0 and nothing else."""
 
     def more(now: _Loop) -> Array:
@@ -176,7 +176,8 @@ def _not_begun(q: int, dtype: np.dtype) -> _Standing:
     def shapes() -> _Standing:
         zeros = jnp.zeros(q, dtype)
         units, none = Scaling(zeros, jnp.ones((), dtype)), jnp.zeros(q, bool)
-        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True))
+        one = jnp.ones((), dtype)
+        constants = Constants(zeros, units, zeros, none, zeros, jnp.asarray(True), one, one)
         return _Standing(jnp.asarray(0), units, begin(constants))
 
     # Of NumPy: nothing is compiled for it.
@@ -236,10 +237,11 @@ def residual_and_jacobian(
 
 def _optimum(residual_norm: Array, state: State, z: Array, count: np.ndarray | int) -> Optimum:
     rows = state.solver.f_info.residual
-    cost = jnp.sum(jnp.square(rows), axis=-1) * residual_norm**2
+    cost = (jnp.sum(jnp.square(rows), axis=-1) - state.ahead) * residual_norm**2
     cost = cost / jnp.asarray(count, cost.dtype)
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(z), axis=-1)
-    return Optimum(z, cost, state.solver.num_steps, state.arrived & finite)
+    moved = jnp.full_like(cost, jnp.inf)
+    return Optimum(z, cost, state.solver.num_steps, state.arrived & finite, moved)
 
 
 def optimise(
@@ -250,6 +252,8 @@ def optimise(
     max_steps: int = 200,
     *,
     held: np.ndarray | None = None,
+    nearing: Nearing | None = None,
+    known: tuple[Array, Array] | None = None,
 ) -> Optimum:
     """The least-squares optimum from z0.
 
@@ -260,6 +264,8 @@ def optimise(
         z0: where to begin.
         max_steps: after which it is given up.
         held: (q,) whether an unknown stays at its start; none unless given.
+        nearing: how to end where another search follows; as near as it gets unless given.
+        known: residuals and Jacobian at z0, where they are at hand.
     """
     free = np.ones(layout.size, bool) if held is None else ~held
 
@@ -269,7 +275,9 @@ def optimise(
 
     trusted, steps, at, stayed = nothing_trusted(layout), 0, z0, layout.size + 1
     while True:
-        run = _run(layout, data, noise, at, (max_steps - steps, trusted, held))
+        limits = _Limits(max_steps - steps, trusted, held, nearing)
+        run = _run(layout, data, noise, at, limits, known)
+        known = None
         steps, at = steps + int(run.optimum.steps), run.optimum.z
         stay = (np.asarray(run.unit) == 0) & free
         # Each further run has to move an unknown more, so that there are few of them.
@@ -281,7 +289,22 @@ def optimise(
         trusted = trusted | trusted_columns(layout, evaluate, at, run.r, run.J)
         if not (awakened(np.asarray(run.unit), np.asarray(run.J), trusted) & free).any():
             break
-    return run.optimum._replace(steps=np.asarray(steps))
+    optimum = run.optimum._replace(steps=np.asarray(steps))
+    if nearing is None:
+        return optimum
+    return optimum._replace(moved=np.sum((np.asarray(run.J) @ np.asarray(at - z0)) ** 2))
+
+
+class _Limits(NamedTuple):
+    """Of one run."""
+
+    steps: int
+    """that are left"""
+    trusted: np.ndarray
+    """(q,) the unknowns that may move however small their column is"""
+    held: np.ndarray | None
+    """(q,) those that stay"""
+    nearing: Nearing | None
 
 
 def _run(
@@ -289,7 +312,8 @@ def _run(
     data: Data,
     noise: Noise,
     z0: Float[Array, " q"],
-    limits: tuple[int, np.ndarray, np.ndarray | None],
+    limits: _Limits,
+    known: tuple[Array, Array] | None = None,
 ) -> _Run:
     """One run, in the units of its start.
 
@@ -298,10 +322,10 @@ def _run(
         data: the numbers of the problem.
         noise: of the measurements.
         z0: where to begin.
-        limits: the steps that are left; (q,) the unknowns that may move however small their column
-            is; (q,) those that stay, or None.
+        limits: how far it may go.
+        known: residuals and Jacobian at z0, where they are at hand.
     """
-    (max_steps, trusted, held), count = limits, measured_count(data)
+    (max_steps, trusted, held, nearing), count = limits, measured_count(data)
     if layout.estimator.one_program(layout) and held is None:
         end = _in_blocks((layout, data, noise), z0, max_steps, trusted, count)
         _, units, state = end.standing
@@ -312,83 +336,18 @@ def _run(
         e = differentiate(layout, data, noise, z)
         return e.r, e.J
 
-    first = evaluate(z0)
+    first = known or evaluate(z0)
     r0, J0 = first
     if held is not None:
         # A column of zeros has no unit, and what has none stays.
         J0 = jnp.where(held[None, :], jnp.zeros_like(J0), J0)
     constants = constants_of(layout, z0, scaling(r0, J0, trusted))
+    if nearing is not None:
+        unchecked, damping = (jnp.asarray(v, z0.dtype) for v in nearing)
+        constants = constants._replace(unchecked=unchecked, damping=damping)
     stages.at_most(max_steps)
     if held is not None:
         # Initial states alone, from far off: steps that are shortened end in the next valley (a
         # pendulum near the top of its swing).
         constants = constants._replace(with_radius=jnp.asarray(False))
-    return _descend(evaluate, constants, first, count, max_steps, SINGLE)
-
-
-@eqx.filter_jit
-def _batch(
-    layout: Layout, data: Data, noise: Noise, z: Float[Array, "b q"]
-) -> tuple[Float[Array, "b n"], Float[Array, "b n q"]]:
-    """Residuals and Jacobians of a batch; all of `data` has a leading axis too."""
-
-    def single(data: Data, z: Array) -> tuple[Array, Array]:
-        e = differentiate(layout, data, noise, z)
-        return e.r, e.J
-
-    return jax.vmap(single)(data, z)
-
-
-def optimise_many(
-    reached: Solution,
-    data: Callable[[Any], Data],
-    starts: Float[Array, "k q"],
-    each: Any,
-    *,
-    hold: int | None = None,
-    batch: int = 8,
-) -> Optimum:
-    """Optima (k, ...) for many starts or records near an optimum.
-
-    Args:
-        reached: that optimum; its Jacobian gives the units of all runs.
-        data: makes the numbers of one run out of its slice of `each`.
-        starts: where each run begins.
-        each: what differs between the runs, a pytree of arrays (k, ...).
-        hold: the unknown that stays at its start, by its number.
-        batch: runs side by side, by vmap.
-    """
-    layout, noise = reached.layout, reached.noise
-    units = _units_at(reached)
-    if hold is not None:
-        # What has no unit stays, see `scaling`.
-        units = units._replace(unit=units.unit.at[hold].set(0.0))
-    k, batch = starts.shape[0], min(batch, starts.shape[0])
-    optima = []
-    for i in range(0, k, batch):
-        # The last ones again where the batch is not full: another shape would compile anew.
-        chosen = np.minimum(np.arange(i, i + batch), k - 1)
-        z0 = starts[chosen]
-        numbers = jax.vmap(data)(jax.tree.map(lambda v, chosen=chosen: v[chosen], each))
-        constants = jax.vmap(lambda z: constants_of(layout, z, units))(z0)
-
-        def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
-            return _batch(layout, numbers, noise, z)
-
-        count = measured_count(numbers) // batch
-        ends = _descend(evaluate, constants, evaluate(z0), count, _MANY_STEPS, BATCHED).optimum
-        optima.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
-        stages.advance(min(batch, k - i))
-    return jax.tree.map(lambda *v: np.concatenate(v), *optima)
-
-
-def _units_at(reached: Solution) -> Scaling:
-    """The units of runs that begin near an optimum."""
-    layout, data, noise, z = reached
-
-    def evaluate(z: Array) -> tuple[Array, Array]:
-        e = residual_and_jacobian(layout, data, noise, z)
-        return e.r, e.J
-
-    r, J = evaluate(z)
-    return scaling(r, J, trusted_columns(layout, evaluate, z, r, J))
+    return descend(evaluate, constants, first, count, max_steps, SINGLE)

@@ -1,4 +1,4 @@
-"""Where the optimiser starts and how it is run: a first guess, many starts, bounds."""
+"""Where the optimiser starts and how it is run: a first guess, several starts, bounds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,7 +18,8 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
 )
 from heli_jax.identification.estimation.noise_search import noise_guess_at
 from heli_jax.identification.estimation.simulated_flights import predict
-from heli_jax.identification.problem import MAX_TIME_SHIFT, Free, Problem
+from heli_jax.identification.estimation.trust_region import Nearing
+from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
 from heli_jax.identification.unknowns import transforms as coordinates
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, unpack, within_bounds
 
@@ -118,61 +119,6 @@ def _centred(signal: Array, seen: Array) -> Array:
     return jnp.where(seen, signal - mean, 0.0)
 
 
-def draw(
-    layout: Layout, problem: Problem, z0: Float[Array, " q"], starts: int, seed: int
-) -> Float[Array, "s q"]:
-    """Starts (s, q): the first is z0, the others differ in the free parameters.
-
-    Between two bounds of one sign the draw is uniform in log, between two of different sign
-    uniform; elsewhere log-normal about the start, a factor of three wide or as wide as the prior,
-    and of either sign where that may be any.
-
-    Args:
-        layout: what the unknowns are.
-        problem: with the free parameters' bounds and priors.
-        z0: the first start.
-        starts: how many, the first included.
-        seed: of the draw.
-    """
-    rng = np.random.default_rng(seed)
-    rows = np.tile(np.asarray(z0, dtype=np.float64), (max(starts, 1), 1))
-    dtype = z0.dtype
-    for i, (free, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True)):
-        values = jnp.asarray(_draw_values(free, rows.shape[0] - 1, rng), dtype)
-        sign = jnp.asarray(coordinates.sign_or_scale(free), dtype)
-        low, high = (jnp.asarray(b, dtype) for b in coordinates.limits(free))
-        rows[1:, i] = np.asarray(coordinates.to_coordinate(kind, values, sign, low, high))
-    return jnp.asarray(rows, dtype)
-
-
-def _draw_values(free: Free, size: int, rng: np.random.Generator) -> np.ndarray:
-    # Off the bounds, where a bounded coordinate has no slope left.
-    share = rng.uniform(0.02, 0.98, size)
-    low, high = free.lower, free.upper
-    if low is not None and high is not None:
-        if low * high > 0:
-            return low * (high / low) ** share
-        return low + (high - low) * share
-    width = 1.1  # e^1.1 is a factor of three
-    if free.prior is not None and free.prior.mean:
-        # Twice the prior: a start beyond would only be pulled back.
-        width = min(width, 2.0 * free.prior.sd / abs(free.prior.mean))
-    # Log-normal: a parameter of physics is more likely wrong by a factor than by an amount, and
-    # keeps its sign.
-    values = free.start * np.exp(width * rng.standard_normal(size))
-    if coordinates.changes_sign(free):
-        values = _either_sign(free, width, rng.standard_normal((2, size)))
-    # A single bound does not shape the draw: what lies beyond it begins at the start value instead.
-    return np.where([coordinates.inside(free, float(v)) for v in values], values, free.start)
-
-
-def _either_sign(free: Free, width: float, drawn: np.ndarray) -> np.ndarray:
-    """Values of the start's size; about the prior's mean where there is one, which knows more."""
-    if free.prior is not None:
-        return free.prior.mean + 2.0 * free.prior.sd * drawn[0]
-    return coordinates.scale(free) * np.exp(width * drawn[0]) * np.sign(drawn[1])
-
-
 class Search:
     """The optimiser over a problem: log coordinates first, bounded ones where that leaves them.
 
@@ -186,7 +132,13 @@ class Search:
         self.bounded = within_bounds(layout, problem)
 
     def run(
-        self, noise: Noise, points: Float[Array, "s q"], progress: Progress | None = None
+        self,
+        noise: Noise,
+        points: Float[Array, "s q"],
+        progress: Progress | None = None,
+        *,
+        nearing: Nearing | None = None,
+        known: tuple[Array, Array] | None = None,
     ) -> list[Optimum]:
         """An optimum for each start, all in the coordinates of `layout`.
 
@@ -194,8 +146,11 @@ class Search:
             noise: of the measurements, by which the rows are divided.
             points: the starts.
             progress: called with a sentence after each of several starts.
+            nearing: how to end where another search follows; as near as it gets unless given.
+            known: residuals and Jacobian at the first start, where they are at hand.
         """
-        runs = self._run(self.layout, noise, points, progress)
+        ends = (nearing, known)
+        runs = self._run(self.layout, noise, points, progress, ends)
         # An optimiser can arrive where nothing is explained: a gradient of zero says nothing of how
         # good a place is.
         runs = [self._better_than_nothing(run, noise) for run in runs]
@@ -205,12 +160,18 @@ class Search:
         left = [i for i, run in enumerate(runs) if not self._inside(run.z)]
         if left:
             starts = jnp.stack([self._convert(points[i], self.layout, self.bounded) for i in left])
-            for i, run in zip(left, self._run(self.bounded, noise, starts, progress), strict=True):
+            again = self._run(self.bounded, noise, starts, progress, (nearing, None))
+            for i, run in zip(left, again, strict=True):
                 runs[i] = run._replace(z=self._convert(run.z, self.bounded, self.layout))
         return runs
 
     def _run(
-        self, layout: Layout, noise: Noise, points: Array, progress: Progress | None
+        self,
+        layout: Layout,
+        noise: Noise,
+        points: Array,
+        progress: Progress | None,
+        ends: tuple[Nearing | None, tuple[Array, Array] | None],
     ) -> list[Optimum]:
         # One after another: on two cores a vmap over the starts, which goes on until the slowest
         # has converged, took four times as long as this, and had to be compiled besides.
@@ -218,7 +179,16 @@ class Search:
         for i in range(points.shape[0]):
             if points.shape[0] > 1:
                 stages.part((i + 1, points.shape[0]))
-            optimum = optimise(layout, self.data, noise, points[i], self.max_steps, held=self._held)
+            optimum = optimise(
+                layout,
+                self.data,
+                noise,
+                points[i],
+                self.max_steps,
+                held=self._held,
+                nearing=ends[0],
+                known=ends[1] if i == 0 else None,
+            )
             # z stays on the device, from where the next program takes it.
             run = jax.device_get(optimum)._replace(z=optimum.z)
             if not bool(run.converged) and layout.estimator.least_squares:

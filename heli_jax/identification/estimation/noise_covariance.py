@@ -20,6 +20,11 @@ _ROUNDS = 8
 """of the optimiser at most"""
 _UNCHANGED = 1e-3
 """change in the logarithm of every sd below which the relaxation has ended"""
+_DAMPING = 0.01
+"""of the first step of a search from an optimum with another noise, in the optimiser's units"""
+_SETTLED = 3e-3
+"""squared joint standard deviations by which another noise moved the optimum, below which the
+relaxation of a noise that is a spectrum has ended: the next would move it by a fifth of that"""
 _EXPLAINED = 2.0
 """times the noise that a record shows by itself up to which its residual is that noise"""
 _FEW_DIFFERENCES = 0.2
@@ -128,6 +133,8 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
     """
     layout, estimator = search.layout, search.layout.estimator
     trace = [(int(best.steps), float(best.cost))]
+    # Where the first search began says nothing of the noise.
+    best = best._replace(moved=np.asarray(np.inf))
     for _ in range(_ROUNDS):
         e = evaluate(layout, search.data, noise, best.z) if estimator.relaxes_rows else None
         z, new = estimator.relax(layout, search.data, e, noise, best.z)
@@ -146,13 +153,24 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
         # the noise of the round before, and where both stay they are so for each other.
         best, noise = best._replace(z=z), new
         # A search that failed with one noise is not repeated with another.
-        if change < _UNCHANGED or not bool(best.converged):
+        if change < _UNCHANGED or best.moved < _SETTLED or not bool(best.converged):
             break
         if not moves:
             break
-        [best] = search.run(noise, best.z[None, :])
+        # Near its optimum a search needs no damping, which would only take it longer.
+        nearing = estimator.nearing and estimator.nearing._replace(damping=_DAMPING)
+        [best] = search.run(noise, _without_nuisances(layout, best.z)[None, :], nearing=nearing)
         trace.append((int(best.steps), float(best.cost)))
     return RelaxedOptimum(best, noise, tuple(trace))
+
+
+def _without_nuisances(layout: Layout, z: Float[Array, " q"]) -> Float[Array, " q"]:
+    """z where a search goes by rows that nuisances have no part in, in which their weak priors
+    alone would be a misfit."""
+    # A model that is not linear is linearised where they put it.
+    if layout.estimator.nuisances_in_rows or not layout.model.linear:
+        return z
+    return z.at[layout.first_nuisance :].set(0.0)
 
 
 def relaxed_from(search: Search, noise: Noise, z: Float[Array, " q"]) -> RelaxedOptimum:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from heli_jax.identification.estimation.scaling import COLUMN, Scaling, without_size
 from heli_jax.identification.estimation.trust_region import (
+    ARRIVED,
     LevenbergMarquardt,
-    arrived,
+    gain_ahead,
     within_radius,
     within_reach,
 )
@@ -31,6 +33,10 @@ _REACH = 3.0
 """of the logarithm of a disturbance's sigma or tau, where there are several: a factor of 20"""
 
 
+_WHOLE = 0.9
+"""part of the gain that a whole step of Gauss and Newton makes at least"""
+
+
 class Constants(NamedTuple):
     """What stays the same throughout one run."""
 
@@ -44,6 +50,11 @@ class Constants(NamedTuple):
     """how far one step may go, by unknown"""
     with_radius: Bool[Array, ""]
     """whether a refused step shortens the next ones, beside what damping does"""
+    damping: Float[Array, ""]
+    """of the first step, in the optimiser's units"""
+    unchecked: Float[Array, ""]
+    """gain, in joint standard deviations squared, of a step that is taken as the last one without
+    an evaluation of where it leads"""
 
 
 class _Rows(NamedTuple):
@@ -64,6 +75,8 @@ class State(NamedTuple):
     done: Bool[Array, ""]
     arrived: Bool[Array, ""]
     """whether it is done because it arrived"""
+    ahead: Float[Array, ""]
+    """what the last step, not evaluated, took off the sum of squares in the optimiser's units"""
 
 
 def _linear(xi: Array, rows: _Rows) -> tuple[Array, None]:
@@ -111,7 +124,9 @@ def begin(constants: Constants) -> State:
     rows = _rows(constants, jnp.zeros((q + 1, q + 1), xi.dtype), xi)
     shapes = jax.eval_shape(lambda: _linear(xi, rows)[0])
     solver = _solver(constants).init(_linear, xi, rows, _OPTIONS, shapes, None, frozenset())
-    return State(xi, solver, jnp.asarray(False), jnp.asarray(False))
+    size = (1.0 / constants.damping).astype(xi.dtype)
+    solver = eqx.tree_at(lambda s: s.search_state.step_size, solver, size)
+    return State(xi, solver, jnp.asarray(False), jnp.asarray(False), jnp.zeros((), xi.dtype))
 
 
 def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State:
@@ -121,11 +136,23 @@ def advance(constants: Constants, state: State, R: Float[Array, "k k"]) -> State
     new = within_radius(new, xi, constants.with_radius)
     new = within_reach(new, xi, constants.reach, constants.scaling.unit)
     done, result = solver.terminate(_linear, xi, rows, _OPTIONS, new, frozenset())
-    done |= arrived(new.f_info, constants.scaling.residual_norm)
     fine = result == optx.RESULTS.successful
-    stepped = State(xi, new, done | ~fine, done & fine)
+    gain = gain_ahead(new.f_info, constants.scaling.residual_norm)
+    foreseen = _fall(new.f_info, new.y_eval - xi)
+    # Damped or shortened, a step says that the parabola is not to be relied on.
+    whole = foreseen * constants.scaling.residual_norm**2 > _WHOLE * gain
+    last = (gain < constants.unchecked) & whole & fine
+    done |= (gain < ARRIVED) | last
+    xi = jnp.where(last, new.y_eval, xi)
+    stepped = State(xi, new, done | ~fine, done & fine, jnp.where(last, foreseen, 0.0))
     # Side by side a run that is done stays, while the slowest goes on.
     return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), stepped, state)
+
+
+def _fall(f_info: Any, step: Float[Array, " q"]) -> Float[Array, ""]:
+    """What a step takes off the sum of squares, as the linear residuals have it."""
+    moved = f_info.jac.mv(step)
+    return -jnp.sum((2.0 * f_info.residual + moved) * moved)
 
 
 def point(constants: Constants, xi: Array) -> Array:
@@ -169,4 +196,5 @@ def constants_of(layout: Layout, z0: Array, units: Scaling) -> Constants:
     )
     reach = np.where(noises & (len(layout.sigmas) > 1), _REACH, np.inf)
     reach = jnp.asarray(reach, z0.dtype)
-    return Constants(z0, units, tikhonov, jnp.asarray(mask), reach, jnp.asarray(True))
+    one, none = jnp.ones((), z0.dtype), jnp.zeros((), z0.dtype)
+    return Constants(z0, units, tikhonov, jnp.asarray(mask), reach, jnp.asarray(True), one, none)

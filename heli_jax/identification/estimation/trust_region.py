@@ -17,9 +17,19 @@ _ROUNDING = 1e-12
 
 _GROWTH = 3.0
 """times the change of the residuals by a step that did as predicted may the next one make"""
-_ARRIVED = 1e-4
+ARRIVED = 1e-4
 """of joint standard deviations, squared: no interval shows a hundredth of one, and steps that
 shrink by a fifth each take ten more to come to a thousandth"""
+
+
+class Nearing(NamedTuple):
+    """How a search ends after which the noise is estimated anew, and another one begins."""
+
+    unchecked: float
+    """gain in joint standard deviations squared below which a whole step is the last, taken without
+    an evaluation of where it leads: the next search begins with that"""
+    damping: float = 1.0
+    """of the first step, in the optimiser's units: little near an optimum"""
 
 
 class _Region(NamedTuple):
@@ -158,8 +168,8 @@ def within_radius(state: Any, y: Float[Array, " q"], wanted: Bool[Array, ""] | b
     return eqx.tree_at(lambda s: s.y_eval, state, jnp.where(size > radius, nearer, state.y_eval))
 
 
-def arrived(f_info: Any, residual_norm: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a full Gauss-Newton step would take next to nothing off the sum of squares.
+def gain_ahead(f_info: Any, residual_norm: Float[Array, ""]) -> Float[Array, ""]:
+    """What a full Gauss-Newton step would take off the sum of squares, as the parabola has it.
 
     That gain, g' F^-1 g, is the squared distance from the optimum in joint standard deviations.
     Unlike the length of a step it asks for no unit, and a direction that the data leave all but
@@ -177,7 +187,7 @@ def arrived(f_info: Any, residual_norm: Float[Array, ""]) -> Bool[Array, ""]:
     order = jnp.argsort(~moves)
     R = jnp.linalg.qr(jnp.concatenate([J[:, order], f_info.residual[:, None]], axis=1), mode="r")
     gain = jnp.sum(jnp.where(moves[order], jnp.square(R[:-1, -1]), 0.0))
-    return gain * residual_norm**2 < _ARRIVED
+    return gain * residual_norm**2
 
 
 def _norm2(v: Float[Array, " k"]) -> Float[Array, ""]:

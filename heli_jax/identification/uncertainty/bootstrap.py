@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from heli_jax.identification.estimation.levenberg_marquardt import optimise_many
+from heli_jax.identification.estimation.many_runs import optimise_many
 from heli_jax.identification.result import Fit
 from heli_jax.identification.uncertainty.autocorrelated_residuals import drawn
 from heli_jax.identification.unknowns.layout import Data, Solution, unpack, value_of

@@ -101,13 +101,14 @@ def moved_by_feedback(at: Solution, J: Float[np.ndarray, "n q"]) -> dict[str, Mo
     lines = _lines(at)
     if not any(lines.direct):
         return {}
-    shares, chances, n = _coherent_with_residual(lines)
-    n = n if all(lines.direct) else 0.0
     q = len(layout.of_interest)
     mean = mean_share(J[:q, :q].T @ J[:q, :q])
-    by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
+    by = np.zeros(q)
+    if all(lines.direct):
+        shares, chances, n = _coherent_with_residual(lines)
+        by = np.sqrt(n * mean(information(at, shares) - information(at, chances)))
     may_be = mean(information(at, _room_for_feedback(lines)))
-    held = mean(information(at, _where_held(at, shares)))
+    held = mean(information(at, _where_held(at)))
     each = zip(layout.of_interest, by, may_be, held, strict=True)
     return {n: Moved(float(b), float(m), float(h)) for n, b, m, h in each}
 
@@ -195,15 +196,13 @@ def _held_poles(at: Solution) -> list[float]:
     return held
 
 
-def _where_held(
-    at: Solution, like: Sequence[Float[np.ndarray, " K"]]
-) -> list[Float[np.ndarray, " K"]]:
+def _where_held(at: Solution) -> list[Float[np.ndarray, " K"]]:
     """By record and frequency 1 up to where the loop that holds an unstable mode has to reach, and
     0 above: nothing tells test from correction there."""
     held, inside = _held_poles(at), []
-    for record, part in zip(records_of(at.layout), like, strict=True):
+    for record in records_of(at.layout):
         dt = float(at.data.flights[record.flight].dt)
-        omega = 2.0 * np.pi * np.arange(1, len(part) + 1) / (record.samples * dt)
+        omega = 2.0 * np.pi * np.arange(1, record.lines + 1) / (record.samples * dt)
         inside.append((omega <= _REACHES * held[record.flight]).astype(float))
     return inside
 
@@ -350,6 +349,9 @@ def information(
 ) -> Float[np.ndarray, "q q"]:
     """Of the unknowns of interest, each frequency by its weight."""
     layout, data, noise, z = at
+    q = len(layout.of_interest)
+    if not any(np.any(w) for w in weights):
+        return np.zeros((q, q))
     weighed: Noise = noise._replace(
         whitening=tuple(
             np.asarray(W) * np.sqrt(w)[:, None, None]
@@ -357,7 +359,6 @@ def information(
         )
     )
     # The program of the fit, with other weights; the priors' rows are no information of these.
-    q = len(layout.of_interest)
     J = np.asarray(residual_and_jacobian(layout, data, weighed, z).J)[:q, :q]
     return J.T @ J
 

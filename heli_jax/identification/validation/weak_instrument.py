@@ -37,12 +37,15 @@ _MOST = 0.25
 weak"""
 
 
-def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
+def weak_by_instrument(
+    problem: Problem, at: Solution, J: Float[np.ndarray, "n q"]
+) -> tuple[str, ...]:
     """The unknowns of interest of which instruments tell too little; () of a fit without any.
 
     Args:
         problem: with flights and instruments.
         at: where the fit ended.
+        J: the whitened rows' derivative there.
     """
     layout = at.layout
     if not layout.estimator.by_instrument or not instruments_of(problem):
@@ -52,7 +55,7 @@ def weak_by_instrument(problem: Problem, at: Solution) -> tuple[str, ...]:
         return tuple(n for n, s in zip(layout.of_interest, shares, strict=True) if s > _MOST)
     if at.data.flights[0].by_instrument is None:
         return ()
-    shares, of_all = _of_lines(at), strengths(at)
+    shares, of_all = _of_lines(at), strengths(at, J)
     return tuple(
         name
         for name, share in zip(layout.of_interest, shares, strict=True)
