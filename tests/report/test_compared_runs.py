@@ -68,7 +68,7 @@ def test_differences_are_in_the_joint_sd(tmp_path: Path) -> None:
     compared = compare_runs([a, b])
     rows = {row[0]: row[1:] for row in compared.estimates.rows}
     # 0.005 over hypot(0.003, 0.004)
-    assert rows["Ixx"] == ("0.0200 ± 0.003", "0.0250 ± 0.004", "+1.0", "kg m^2")
+    assert rows["Ixx"] == ("0.0200 ± 0.0030", "0.0250 ± 0.0040", "+1.0", "kg m^2")
     assert rows["If"][1:3] == ("–", "–")
     assert rows["a"][0] == "not determined"
     assert rows["a"][2] == "–"
