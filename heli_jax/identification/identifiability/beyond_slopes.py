@@ -31,6 +31,8 @@ _AS_EXPECTED = 1.15
 slopes is then as wide as that of the likelihood within about as much"""
 _TOGETHER = 0.99
 """correlation beyond which two parameters lie along one valley"""
+_SINGULAR = 0.999
+"""correlation beyond which the valley is so long that chance has put the optimum along it"""
 _ENOUGH = 0.05
 """squares that a further step may promise where a search stops"""
 _STEPS = 10
@@ -102,6 +104,7 @@ def beyond_slopes(
     # Several that go together along one valley have as many ways to fit the noise: their intervals
     # are those that hold for all of them at once.
     together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
+    certain = math.sqrt(scipy.special.chdtri(len(wide), _BY_CHANCE)) / Z95
     for i, u in wide:
         # What goes along with one that is open to a side is open with it.
         tied = any(
@@ -111,13 +114,25 @@ def beyond_slopes(
             one_sided += [u.name] * (u.name not in opened)
             continue
         reach = together * float(reaches[i])
-        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach)
+        others = np.abs(np.delete(verdict.correlation[i], i)).max(initial=0.0)
+        far = (certain if others > _SINGULAR else together) * float(reaches[i])
+        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach, far)
         ends = profile.ends()
         if ends is None:
             one_sided.append(u.name)
         elif not all(end.as_expected for end in ends):
             low, high = sorted(end.value for end in ends)
             limits[u.name] = (low, high)
+    # Also those that were asked before the one that is open, or were too narrow to be asked.
+    at_side = [i for i, n in enumerate(verdict.names) if n in one_sided]
+    one_sided += [
+        n
+        for i, n in enumerate(verdict.names)
+        if n in problem.free
+        and n not in {*one_sided, *opened, *lacking}
+        and np.abs(verdict.correlation[i, at_side]).max(initial=0.0) > _TOGETHER
+    ]
+    limits = {n: ends for n, ends in limits.items() if n not in one_sided}
     return BeyondSlopes(limits, tuple(one_sided), tuple(null))
 
 
@@ -203,6 +218,8 @@ class _Profile(NamedTuple):
     """(q,) column of the covariance: how the others go with it to first order"""
     reach: float
     """root of what may be lost within the interval"""
+    certain: float
+    """root of what has to be lost at a factor of ten"""
 
     def ends(self) -> tuple[_End, _End] | None:
         """Both ends; None where one of them is not within the factor of ten."""
@@ -243,6 +260,12 @@ class _Profile(NamedTuple):
                 inside = max(s for s, r in seen if r < self.reach)
                 guess, tangent = z0, self.along / self.along[self.i]
                 t = max(0.5 * (t + inside), t * self.reach / root) if root < math.inf else 0.5 * t
+        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
+        # chance is one among many places where the noise may have put it.
+        z = guess + tangent * (z0[self.i] + side * furthest - guess[self.i])
+        point = _follow(self.at, z, np.arange(z0.size) == self.i)
+        if _lost(self.at, first, point.squares) < self.certain**2:
+            return self._at_limit(side)
         return _End(self._value(z0[self.i] + side * self._crossing(seen)), False)
 
     def _crossing(self, seen: list[tuple[float, float]]) -> float:
