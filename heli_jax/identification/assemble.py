@@ -34,6 +34,8 @@ from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
     estimates_of,
     flight_nuisances,
+    limit_notes,
+    with_limits,
 )
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
 from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
@@ -57,6 +59,7 @@ from heli_jax.identification.validation.excitation_test import (
     by_excitation,
     unless_unrelated,
 )
+from heli_jax.identification.validation.explains_nothing import unless_explains_nothing
 from heli_jax.identification.validation.feedback import (
     Feedback,
     feedback_notes,
@@ -131,8 +134,9 @@ def _numbers(
 ) -> Numbers:
     """The estimates; `absent`: the parameters of disturbances that do not show."""
     layout = at.layout
-    verdict, wider, quantiles, _ = errors
+    verdict, wider, quantiles = errors.verdict, errors.wider, errors.quantiles
     of_interest = estimates_of(problem, layout, e, verdict, quantiles, wider)
+    of_interest = with_limits(of_interest, errors.limits)
     nuisance = {k: v for k, v in of_interest.items() if k not in layout.free}
     # A method that does not see initial states and biases has no interval of them.
     if layout.estimator.nuisances_in_rows:
@@ -170,7 +174,14 @@ def assemble(
     aliased = frozenset(n for mode in fast for n in mode.undetermined)
     twins = twins_of(problem, solution, e) if bool(best.converged) else ()
     errors = standard_errors(
-        problem, solution, e, run.before, white=all_white, aliased=aliased, twins=twins
+        problem,
+        solution,
+        e,
+        run.before,
+        white=all_white,
+        aliased=aliased,
+        twins=twins,
+        optimum=bool(best.converged),
     )
     if bool(best.converged):
         verdict = unless_inputs_explain_nothing(solution, e, errors.verdict)
@@ -197,11 +208,16 @@ def assemble(
     )
     if layout.estimator.noise_spectrum:
         adequacy = unless_unrelated(problem, adequacy)
+    verdict = unless_explains_nothing(errors.verdict, adequacy)
+    if bool(best.converged) and verdict is not errors.verdict:
+        errors = errors._replace(verdict=verdict, limits={})
+        numbers = _numbers(problem, solution, e, errors, absent)
+        estimates = {k: numbers.of_interest[k] for k in layout.free}
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
-    notes += excitation.aliasing(fast)
+    notes += [*limit_notes(errors.limits), *excitation.aliasing(fast)]
     status = _status(best, e, numbers, errors.verdict)
     missing = () if all_white else _missing(problem, signals, adequacy)
     return Fit(

@@ -23,8 +23,10 @@ from heli_jax.identification.identifiability.directions import (
     Directions,
     Exchange,
     WithoutWeakPriors,
+    correlation_of,
     covariance_of,
     directions,
+    without_effect_of,
 )
 from heli_jax.identification.identifiability.sentences import (
     Facts,
@@ -35,7 +37,10 @@ from heli_jax.identification.identifiability.sentences import (
 from heli_jax.identification.identifiability.verdict import ROUGHLY, Z95, Pair, Unknown, Verdict
 from heli_jax.identification.identifiability.wide_intervals import (
     TAKES_NO_PART,
+    factor,
     further,
+    holds_zero,
+    one_sided,
     reported_too_wide,
     single_too_wide,
     too_wide,
@@ -73,6 +78,7 @@ def _determined(
     unknowns: tuple[Unknown, ...],
     null_below: float,
     reported: np.ndarray | None,
+    elsewhere: Elsewhere,
 ) -> _Determined:
     """Directions without effect, then those whose interval reaches too far.
 
@@ -100,6 +106,8 @@ def _determined(
     # An alias is another optimum, of which no slope at this one tells.
     aliased = [np.eye(len(unknowns))[i] for i, u in enumerate(unknowns) if u.aliased]
     null += further(aliased, null)
+    null += further([unit_vector(v) for v in elsewhere.null], null)
+    null += further(one_sided(covariance, unknowns, elsewhere.one_sided), null)
     if reported is not None:
         wide = single_too_wide if null else reported_too_wide
         null += further(wide(reported, unknowns), null)
@@ -144,6 +152,8 @@ class _Analysis(NamedTuple):
     """what priors determine, and the data alone do not"""
     exchange: Exchange
     twins: tuple[tuple[str, str], ...]
+    limits: Mapping[str, tuple[float, float]]
+    """by name the ends of an interval that is not the slopes'"""
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -188,9 +198,9 @@ def analyse(
         elsewhere: what is known of other points.
     """
     bare = sensitivity if without_weak is None else without_weak.sensitivity
-    determined = _determined(sensitivity, bare, unknowns, null_below, reported)
+    determined = _determined(sensitivity, bare, unknowns, null_below, reported, elsewhere)
     data = _by_data(bare, determined, unknowns, null_below)
-    dead = _without_effect(sensitivity, unknowns)
+    dead = without_effect_of(sensitivity, unknowns)
     least = null_below * max(determined.total.singular[0], 1e-300)
     exchange = Exchange(sensitivity, without_weak, least)
     # Two lists: what nothing determines is an error of the experiment, what rests on a prior is a
@@ -201,14 +211,22 @@ def analyse(
     # What the data alone say, so that no prior is in it.
     resting = _groups(data.null, data.covariance, unknowns, (), (exchange, elsewhere.tied))
     analysis = _Analysis(
-        unknowns, determined, data, dead, groups, resting, exchange, elsewhere.twins
+        unknowns,
+        determined,
+        data,
+        dead,
+        groups,
+        resting,
+        exchange,
+        elsewhere.twins,
+        elsewhere.limits,
     )
     return _verdict(analysis, remedies or {})
 
 
 def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
     names, known = tuple(u.name for u in a.unknowns), a.determined
-    correlation = _correlation(known.covariance)
+    correlation = correlation_of(known.covariance)
     pairs = _pairs(correlation, names, a.undetermined)
     share = _shares(known.covariance, known.without_weak, a.unknowns)
     nuisances_hold = [n for group in a.groups if group.nuisances for n in group.names]
@@ -261,12 +279,14 @@ def _verdict(a: _Analysis, remedies: Mapping[str, str]) -> Verdict:
 
 def _roughly(a: _Analysis) -> dict[str, float]:
     """By parameter that is determined in a wide interval, the factor to its ends."""
-    # A coordinate that is no logarithm has no factor; what has no effect has no variance.
-    return {
-        u.name: math.exp(Z95 * float(sd))
+    lacking = (*a.undetermined, *a.without_effect)
+    factors = {
+        u.name: factor(u, float(sd), a.limits)
         for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
-        if u.logarithmic and sd > ROUGHLY and u.name not in (*a.undetermined, *a.without_effect)
+        # A coordinate that is no logarithm has no factor; what has no effect has no variance.
+        if u.logarithmic and u.name not in lacking
     }
+    return {n: ratio for n, ratio in factors.items() if ratio > math.exp(Z95 * ROUGHLY)}
 
 
 def _through_zero(a: _Analysis) -> tuple[str, ...]:
@@ -275,16 +295,8 @@ def _through_zero(a: _Analysis) -> tuple[str, ...]:
     return tuple(
         u.name
         for u, sd in zip(a.unknowns, a.determined.sd, strict=True)
-        if u.symmetric and Z95 * float(sd) >= u.distance and u.name not in lacking
+        if u.symmetric and u.name not in lacking and holds_zero(u, float(sd), a.limits)
     )
-
-
-def _without_effect(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
-    """The unknowns without any effect."""
-    sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
-    # So little beside the largest is what rounding leaves of no effect.
-    least = 1e-12 * max(sizes.max(), 1e-300)
-    return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)
 
 
 class _Shares(NamedTuple):
@@ -357,15 +369,6 @@ def _tied_together(
                 apart.append(group)
         groups = [*apart, joined]
     return groups
-
-
-def _correlation(covariance: np.ndarray) -> np.ndarray:
-    sd = np.sqrt(np.diag(covariance))
-    # An unknown that takes part in no determined direction has no variance in it.
-    safe = np.where(sd > 0, sd, 1.0)
-    correlation = covariance / np.outer(safe, safe)
-    np.fill_diagonal(correlation, 1.0)
-    return np.clip(correlation, -1.0, 1.0)
 
 
 def _pairs(

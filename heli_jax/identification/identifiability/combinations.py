@@ -3,6 +3,7 @@ the parameters are not: by the slopes at one point, which `valley` asks far from
 
 import math
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -191,6 +192,12 @@ class Elsewhere(NamedTuple):
     twins: tuple[tuple[str, str], ...] = ()
     """pairs of parameters whose values may be exchanged"""
     tied: Tied = combinations
+    null: tuple[np.ndarray, ...] = ()
+    """directions (q,) in relative coordinates that are open at another point as likely"""
+    one_sided: tuple[str, ...] = ()
+    """unknowns that the likelihood does not bound within the factor of ten"""
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """by unknown the ends of its 95 % interval, in its unit, where the slopes have others"""
 
 
 NOT_ASKED = Elsewhere()

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.identification.identifiability.combinations import TAKES_PART
+from heli_jax.identification.identifiability.verdict import Unknown
 
 _SHARPER = 3.0
 """weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
@@ -152,3 +153,21 @@ class Exchange(NamedTuple):
                 for v in rows
             )
         )
+
+
+def correlation_of(covariance: np.ndarray) -> np.ndarray:
+    """(q, q) of a covariance; one that takes part in no determined direction has none."""
+    sd = np.sqrt(np.diag(covariance))
+    # An unknown that takes part in no determined direction has no variance in it.
+    safe = np.where(sd > 0, sd, 1.0)
+    correlation = covariance / np.outer(safe, safe)
+    np.fill_diagonal(correlation, 1.0)
+    return np.clip(correlation, -1.0, 1.0)
+
+
+def without_effect_of(sensitivity: np.ndarray, unknowns: tuple[Unknown, ...]) -> tuple[str, ...]:
+    """The unknowns without any effect."""
+    sizes = np.linalg.norm(sensitivity, axis=0) * np.array([u.scale for u in unknowns])
+    # So little beside the largest is what rounding leaves of no effect.
+    least = 1e-12 * max(sizes.max(), 1e-300)
+    return tuple(u.name for u, s in zip(unknowns, sizes, strict=True) if not s > least)

@@ -1,6 +1,7 @@
 """From the residual's Jacobian to the verdict: relative coordinates, priors, nuisances."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -225,6 +226,12 @@ class Around(NamedTuple):
     """pairs of parameters whose values may be exchanged"""
     valley: Valley | None = None
     """tells which combinations are the same far from the point; else its slopes are believed"""
+    null: tuple[np.ndarray, ...] = ()
+    """directions in relative coordinates that are open at another point as likely"""
+    one_sided: tuple[str, ...] = ()
+    """the parameters that the likelihood does not bound within the factor of ten"""
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
 
 
 NOTHING_ELSE = Around()
@@ -272,5 +279,5 @@ def verdict_of(
         reported = reported * np.outer(to_relative, to_relative)
     remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
     tied = around.valley.tied if around.valley is not None else combinations
-    elsewhere = Elsewhere(around.twins, tied)
+    elsewhere = Elsewhere(around.twins, tied, around.null, around.one_sided, around.limits)
     return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)

@@ -5,6 +5,7 @@ times its value. Everything is in relative coordinates.
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -98,3 +99,31 @@ def further(directions: list[np.ndarray], null: list[np.ndarray]) -> list[np.nda
         if all(abs(w[leads]) <= TAKES_NO_PART for w in (*null, *added)):
             added.append(v)
     return added
+
+
+def one_sided(
+    covariance: np.ndarray, unknowns: tuple[Unknown, ...], names: tuple[str, ...]
+) -> list[np.ndarray]:
+    """For each of the unknowns that the likelihood does not bound its direction, without those
+    that it does."""
+    open_ = np.array([u.name in names for u in unknowns])
+    return [
+        unit_vector(np.where(open_, covariance[:, i] / np.sqrt(np.diag(covariance)), 0.0))
+        for i in np.flatnonzero(open_)
+    ]
+
+
+def factor(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> float:
+    """From the value to the further end of its interval; infinite where that holds zero."""
+    if u.name not in limits:
+        return math.exp(Z95 * sd)
+    ratios = [end / u.value for end in limits[u.name]]
+    return max(max(r, 1.0 / r) if r > 0 else math.inf for r in ratios)
+
+
+def holds_zero(u: Unknown, sd: float, limits: Mapping[str, tuple[float, float]]) -> bool:
+    """Whether the interval of an unknown of either sign holds zero."""
+    if u.name not in limits:
+        return Z95 * sd >= u.distance
+    low, high = limits[u.name]
+    return low <= 0.0 <= high

@@ -1,5 +1,7 @@
 """Estimates with standard deviations and intervals, from an optimum and its verdict."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -74,6 +76,38 @@ def estimates_of(
             sd_alone=None if not_identifiable else float(white * references[i] * insensitivity[i]),
         )
     return estimates
+
+
+def with_limits(
+    estimates: dict[str, Estimate], limits: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """The estimates with those ends of their 95 % intervals that are not the slopes'.
+
+    Args:
+        estimates: by name.
+        limits: by name lower and upper end, in the parameter's unit.
+    """
+    return {
+        n: estimate._replace(lower95=limits[n][0], upper95=limits[n][1])
+        if n in limits and estimate.sd is not None
+        else estimate
+        for n, estimate in estimates.items()
+    }
+
+
+def limit_notes(limits: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Which intervals are those of the likelihood, by name lower and upper end."""
+    if not limits:
+        return []
+    those = (
+        "interval of " + ", ".join(limits) + " is"
+        if len(limits) == 1
+        else ("intervals of " + ", ".join(limits) + " are")
+    )
+    return [
+        f"The {those} by the profile likelihood: it is not quadratic here, and the standard "
+        "deviations alone would claim too much. More excitation would make them narrower."
+    ]
 
 
 def _insensitivity(e: Evaluation) -> Float[np.ndarray, " q"]:

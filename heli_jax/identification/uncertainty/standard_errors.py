@@ -1,7 +1,9 @@
 """How sure the numbers at an optimum are: Cramér-Rao's bound, or wider."""
 
+import math
 from collections.abc import Collection
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +11,11 @@ import scipy.special
 from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.identifiability.beyond_slopes import (
+    AS_SLOPES,
+    Limits,
+    beyond_slopes,
+)
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Z95, Combination, Verdict
@@ -19,6 +26,9 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import (
     sandwich,
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
+
+_LARGEST = 700.0
+"""log of the largest end of an interval: exp overflows at 709"""
 
 
 class StandardErrors(NamedTuple):
@@ -31,6 +41,9 @@ class StandardErrors(NamedTuple):
     """standard deviations that a 95 % interval reaches to either side"""
     coloured: bool
     """whether the intervals allow for residuals that are not white"""
+    limits: Limits = MappingProxyType({})
+    """by parameter the ends of its 95 % interval by the likelihood, in its unit, where the slopes
+    have others"""
 
 
 def standard_errors(
@@ -42,9 +55,9 @@ def standard_errors(
     white: bool,
     aliased: Collection[str] = (),
     twins: tuple[tuple[str, str], ...] = (),
+    optimum: bool = True,
 ) -> StandardErrors:
-    """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
-    estimated, the sandwich.
+    """As the slopes have them, and where these leave wide intervals as the likelihood has them.
 
     Args:
         problem: what was fitted.
@@ -54,10 +67,42 @@ def standard_errors(
         white: whether the residuals are white and independent between outputs.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
         twins: the pairs of parameters whose values may be exchanged.
+        optimum: whether the point is one, about which the likelihood may be asked.
+    """
+    around = Around(frozenset(aliased), twins, Valley(problem, at, e))
+    errors = _by_slopes(problem, at, e, before, around, white=white)
+    if not optimum:
+        return errors
+    beyond = beyond_slopes(problem, at, e, errors.verdict, errors.wider * errors.quantiles)
+    if beyond is AS_SLOPES:
+        return errors
+    around = around._replace(**beyond._asdict())
+    errors = _by_slopes(problem, at, e, before, around, white=white)
+    return errors._replace(limits=beyond.limits)
+
+
+def _by_slopes(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    before: Verdict,
+    around: Around,
+    *,
+    white: bool,
+) -> StandardErrors:
+    """Cramér-Rao's bound, or where the residuals are not white and their autocorrelation can be
+    estimated, the sandwich.
+
+    Args:
+        problem: what was fitted.
+        at: the optimum.
+        e: what it tells.
+        before: the verdict at the first guess, which stands where the optimum has no Jacobian.
+        around: what is known of points other than the optimum.
+        white: whether the residuals are white and independent between outputs.
     """
     layout, estimator = at.layout, at.layout.estimator
     usable = bool(np.all(np.isfinite(e.J)) and np.all(np.isfinite(e.r)))
-    around = Around(frozenset(aliased), twins, Valley(problem, at, e))
     # The noise is estimated from the same residuals: Student's t, not the normal distribution.
     freedom = max(estimator.numbers(layout, at.data, at.noise) - layout.determined, 1)
     quantile = float(scipy.special.stdtrit(freedom, 0.975))
@@ -122,7 +167,11 @@ def _wider(c: Combination, sd: float, reach: float) -> Combination:
     def end(at: float) -> float:
         # The ends of an interval of a product lie at equal factors, not distances.
         if c.kind == "product":
-            return c.value * (at / c.value) ** reach
+            # In logarithms, as an interval of a product may reach past what a float64 holds.
+            if not (at > 0.0 and c.value > 0.0 and math.isfinite(at) and math.isfinite(c.value)):
+                return at
+            log = math.log(c.value) + reach * (math.log(at) - math.log(c.value))
+            return math.exp(log) if log < _LARGEST else math.inf
         return c.value + (at - c.value) * reach
 
     return c._replace(sd=c.sd * sd, lower95=end(c.lower95), upper95=end(c.upper95))

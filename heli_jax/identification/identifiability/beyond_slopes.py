@@ -1,0 +1,346 @@
+"""What the likelihood itself says of parameters that the slopes at an optimum tell poorly.
+
+An optimum of a record that tells little is one of chance: its slopes may bound a parameter that
+the likelihood, a little further off, does not. So the parameters with wide intervals are moved to
+the ends of these, the others follow, and the likelihood that is lost is compared with what the
+slopes let expect.
+"""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
+from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns import transforms
+from heli_jax.identification.unknowns.layout import Solution, value_of
+from heli_jax.identification.unknowns.nuisances import weak_unknowns
+
+_WIDE = 0.1
+"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked"""
+_AS_EXPECTED = 1.15
+"""factor by which the root of what is lost may differ from what the slopes say: the interval of the
+slopes is then as wide as that of the likelihood within about as much"""
+_TOGETHER = 0.99
+"""correlation beyond which two parameters lie along one valley"""
+_SINGULAR = 0.999
+"""correlation beyond which the valley is so long that chance has put the optimum along it"""
+_ENOUGH = 0.05
+"""squares that a further step may promise where a search stops"""
+_STEPS = 10
+"""of Levenberg and Marquardt at most for each point"""
+_RIDGE = 1.0 / 3.0
+"""one over how far a step may go, in coordinates most of which are logarithms, for nothing"""
+_HUGE = 1e50
+_OUTWARDS, _POINTS = 1.7, 7
+"""factor from one point of a profile to the next further out, and how many there are to a side"""
+_BY_CHANCE = 1e-3
+"""probability that initial states which are those of rest gain as much of the likelihood"""
+_REST = 1e-6
+"""initial states below this, in sds of their weak priors, are those of rest already"""
+
+Limits = Mapping[str, tuple[float, float]]
+
+
+class BeyondSlopes(NamedTuple):
+    """What slopes at the optimum do not tell."""
+
+    limits: Limits = MappingProxyType({})
+    """by parameter the ends of its 95 % interval by the likelihood, in the parameter's unit, where
+    those by the slopes are others"""
+    one_sided: tuple[str, ...] = ()
+    """parameters that the likelihood does not bound within the factor of ten to either side"""
+    null: tuple[np.ndarray, ...] = ()
+    """directions (q,) in relative coordinates that are open with the initial states at rest, where
+    the data cannot tell them from that"""
+
+
+AS_SLOPES = BeyondSlopes()
+
+
+def beyond_slopes(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    verdict: Verdict,
+    reaches: np.ndarray,
+) -> BeyondSlopes:
+    """Asks the likelihood of the parameters whose intervals are wide.
+
+    Args:
+        problem: with bounds and priors.
+        at: the optimum.
+        e: what it tells.
+        verdict: what the data determine by the slopes there.
+        reaches: (q,) sds of white residuals that a 95 % interval of each unknown reaches.
+    """
+    lacking = {*verdict.undetermined, *verdict.without_effect}
+    sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    wide = [
+        (i, u)
+        for i, u in enumerate(unknowns_of(problem, at.layout, e))
+        if u.name in problem.free
+        and (u.logarithmic or u.symmetric)
+        and not (u.name in lacking or u.at_bound)
+        and sd[i] * reaches[i] > _WIDE * Z95
+    ]
+    if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
+        return AS_SLOPES
+    null = _open_at_rest(problem, at, e, lacking, reaches)
+    opened = {n for v in null for n, part in zip(verdict.names, v, strict=True) if abs(part) > 0.1}
+    limits, one_sided = {}, []
+    R = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
+    # What is open already goes along with anything, and tells nothing of where the others go.
+    R[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
+    inverse = np.linalg.pinv(R, rcond=1e-10)
+    # Several that go together along one valley have as many ways to fit the noise: their intervals
+    # are those that hold for all of them at once.
+    together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
+    certain = math.sqrt(scipy.special.chdtri(len(wide), _BY_CHANCE)) / Z95
+    for i, u in wide:
+        # What goes along with one that is open to a side is open with it.
+        tied = any(
+            abs(verdict.correlation[i, verdict.names.index(n)]) > _TOGETHER for n in one_sided
+        )
+        if u.name in opened or tied:
+            one_sided += [u.name] * (u.name not in opened)
+            continue
+        reach = together * float(reaches[i])
+        others = np.abs(np.delete(verdict.correlation[i], i)).max(initial=0.0)
+        far = (certain if others > _SINGULAR else together) * float(reaches[i])
+        profile = _Profile(problem, at, e, i, u, inverse @ inverse[i], reach, far)
+        ends = profile.ends()
+        if ends is None:
+            one_sided.append(u.name)
+        elif not all(end.as_expected for end in ends):
+            low, high = sorted(end.value for end in ends)
+            limits[u.name] = (low, high)
+    # Also those that were asked before the one that is open, or were too narrow to be asked.
+    at_side = [i for i, n in enumerate(verdict.names) if n in one_sided]
+    one_sided += [
+        n
+        for i, n in enumerate(verdict.names)
+        if n in problem.free
+        and n not in {*one_sided, *opened, *lacking}
+        and np.abs(verdict.correlation[i, at_side]).max(initial=0.0) > _TOGETHER
+    ]
+    limits = {n: ends for n, ends in limits.items() if n not in one_sided}
+    return BeyondSlopes(limits, tuple(one_sided), tuple(null))
+
+
+class _Point(NamedTuple):
+    """The best that is found with some coordinates held."""
+
+    z: np.ndarray
+    e: Evaluation
+    squares: float
+    """sum of them, less what a further step promises; infinite where nothing is found"""
+
+
+def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
+    """From z (q,) to the smallest sum of squares with the coordinates held (q,) where they are."""
+    moving = ~held
+    ridge = _RIDGE
+    now = _evaluated(at, z)
+    squares, promised = _squares(now), math.inf
+    for _ in range(_STEPS):
+        r, J = np.asarray(now.r, np.float64), np.asarray(now.J, np.float64)[:, moving]
+        # Past that the squares of a simulation that has diverged are no numbers.
+        if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
+            return _Point(now.z, now, math.inf)
+        Q, R = np.linalg.qr(J)
+        left = -(Q.T @ r)
+        damped = np.vstack([R, ridge * np.eye(len(R))])
+        wanted = np.concatenate([left, np.zeros(len(R))])
+        part = np.linalg.lstsq(damped, wanted, rcond=None)[0]
+        promised = float(left @ left - np.sum((left - R @ part) ** 2))
+        if promised < _ENOUGH:
+            break
+        step = np.zeros(z.size)
+        step[moving] = part
+        then = _evaluated(at, now.z + step)
+        gained = squares - _squares(then)
+        # Negated: also what is not finite is no step.
+        if gained > 0:
+            now, squares, ridge = then, squares - gained, max(_RIDGE, ridge / 10.0)
+        elif ridge > _RIDGE * 1e4:
+            break
+        else:
+            ridge *= 10.0
+    return _Point(np.asarray(now.z, np.float64), now, squares - promised)
+
+
+def _evaluated(at: Solution, z: np.ndarray) -> Evaluation:
+    return evaluate(at.layout, at.data, at.noise, jnp.asarray(z, at.z.dtype))
+
+
+def _squares(e: Evaluation) -> float:
+    r = np.asarray(e.r, np.float64)
+    with np.errstate(all="ignore"):
+        return float(r @ r)
+
+
+def _lost(at: Solution, first: float, squares: float) -> float:
+    """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
+    if not math.isfinite(squares):
+        return math.inf
+    n = measured_count(at.data)
+    lost = at.layout.estimator.deviance(at.layout, max(squares, 0.0) / n, first / n, n)
+    return max(0.0, float(lost))
+
+
+class _End(NamedTuple):
+    """One end of an interval."""
+
+    value: float
+    as_expected: bool
+    """whether it is where the slopes have it"""
+
+
+class _Profile(NamedTuple):
+    """The likelihood along one parameter, all others at their best."""
+
+    problem: Problem
+    at: Solution
+    e: Evaluation
+    """at the optimum"""
+    i: int
+    u: Unknown
+    along: np.ndarray
+    """(q,) column of the covariance: how the others go with it to first order"""
+    reach: float
+    """root of what may be lost within the interval"""
+    certain: float
+    """root of what has to be lost at a factor of ten"""
+
+    def ends(self) -> tuple[_End, _End] | None:
+        """Both ends; None where one of them is not within the factor of ten."""
+        low = self.end(-1)
+        high = self.end(1) if low is not None else None
+        return None if low is None or high is None else (low, high)
+
+    def end(self, side: int) -> _End | None:
+        """The end of the interval towards smaller (-1) or larger (1) coordinates; None where
+        the likelihood does not bound the parameter within the factor of ten."""
+        sd = math.sqrt(float(self.along[self.i]))
+        z0, first = np.asarray(self.at.z, np.float64), _squares(self.e)
+        t = self.reach * sd
+        furthest = self._furthest(side)
+        seen, guess = [(0.0, 0.0)], z0
+        tangent = self.along / self.along[self.i]
+        for k in range(_POINTS):
+            t = min(t, furthest)
+            guess = guess + tangent * (z0[self.i] + side * t - guess[self.i])
+            point = _follow(self.at, guess, np.arange(z0.size) == self.i)
+            root = math.sqrt(_lost(self.at, first, point.squares))
+            if k == 0 and 1.0 / _AS_EXPECTED < root / self.reach < _AS_EXPECTED:
+                return _End(self._value(z0[self.i] + side * t), True)
+            if math.isfinite(root):
+                seen.append((t, root))
+            if root < self.reach:
+                if t >= furthest:
+                    return self._at_limit(side)
+                # The direction in which the others went last is where they go on.
+                tangent = (point.z - z0) / (point.z[self.i] - z0[self.i])
+                guess, t = point.z, t * _OUTWARDS
+                above = [s for s, r in seen if r >= self.reach]
+                if above:
+                    t = 0.5 * (min(above) + point.z[self.i] * side - z0[self.i] * side)
+            elif root < _AS_EXPECTED * self.reach or k == _POINTS - 1:
+                break
+            else:
+                inside = max(s for s, r in seen if r < self.reach)
+                guess, tangent = z0, self.along / self.along[self.i]
+                t = max(0.5 * (t + inside), t * self.reach / root) if root < math.inf else 0.5 * t
+        # A likelihood that levels off is no bound, wherever it passes the limit: an optimum of
+        # chance is one among many places where the noise may have put it.
+        z = guess + tangent * (z0[self.i] + side * furthest - guess[self.i])
+        point = _follow(self.at, z, np.arange(z0.size) == self.i)
+        if _lost(self.at, first, point.squares) < self.certain**2:
+            return self._at_limit(side)
+        return _End(self._value(z0[self.i] + side * self._crossing(seen)), False)
+
+    def _crossing(self, seen: list[tuple[float, float]]) -> float:
+        """Where the root of what is lost passes the reach: nearly a straight line."""
+        inside = max(s for s in seen if s[1] < self.reach)
+        beyond = [s for s in seen if s[1] >= self.reach and s[0] > inside[0]]
+        if not beyond:
+            return inside[0]
+        outside = min(beyond)
+        share = (self.reach - inside[1]) / (outside[1] - inside[1])
+        return inside[0] + share * (outside[0] - inside[0])
+
+    def _furthest(self, side: int) -> float:
+        """Distance in the coordinate to a factor of ten, or to a bound."""
+        free, value = self.problem.free[self.u.name], self.u.value
+        size = abs(value) / self.u.distance if self.u.distance else abs(value)
+        rising = float(self.e.slopes[self.i]) > 0
+        up = rising == (side > 0)
+        if self.u.symmetric:
+            # Away from zero a factor, as for all; towards it as far on its other side.
+            outwards = up == (value > 0)
+            far = math.log(FACTOR) * size
+            target = value + (far if up else -far)
+            if outwards and abs(value) > 0.3 * size:
+                target = value * FACTOR
+        else:
+            target = value * FACTOR if up == (value > 0) else value / FACTOR
+        low, high = transforms.limits(free)
+        width = high - low if math.isfinite(high - low) else abs(value)
+        target = min(max(target, low + 1e-6 * width), high - 1e-6 * width)
+        data, kind = self.at.data, self.at.layout.kinds[self.i]
+        limits = (data.sign[self.i], data.low[self.i], data.high[self.i])
+        z = float(transforms.to_coordinate(kind, jnp.asarray(target), *limits))
+        return abs(z - float(self.at.z[self.i]))
+
+    def _at_limit(self, side: int) -> _End | None:
+        """Beyond the furthest point: a bound that was stated bounds it, a factor of ten does
+        not."""
+        value = self._value(float(self.at.z[self.i]) + side * self._furthest(side))
+        if transforms.at_bound(self.problem.free[self.u.name], value):
+            return _End(value, False)
+        return None
+
+    def _value(self, z: float) -> float:
+        return float(value_of(self.at.layout, self.at.data, self.i, jnp.asarray(z)))
+
+
+def _open_at_rest(
+    problem: Problem, at: Solution, e: Evaluation, lacking: set[str], reaches: np.ndarray
+) -> list[np.ndarray]:
+    """Directions that nothing but initial states of chance determine.
+
+    A transient is as large as the initial states that the fit has found, and so is what it tells
+    of the parameters. Where the data do not tell these states from rest, it may as well be none.
+    """
+    layout = at.layout
+    if not layout.estimator.nuisances_in_rows or any(count > 1 for count, _ in layout.windows):
+        return []
+    kinds = np.array([w.kind for w in weak_unknowns(problem, layout)])
+    held = np.zeros(layout.size, bool)
+    held[layout.first_nuisance :] = kinds == "initial_state"
+    z = np.asarray(at.z, np.float64)
+    if not (np.abs(z[held]) > _REST).any():
+        return []
+    point = _follow(at, np.where(held, 0.0, z), held)
+    lost = _lost(at, _squares(e), point.squares)
+    # Autocorrelated residuals let chance gain more.
+    wider = max(1.0, float(np.median(reaches[held])) / Z95)
+    if lost > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
+        return []
+    if not np.isfinite(point.e.J).all():
+        return []
+    there = verdict_of(problem, layout, point.e)
+    return [
+        np.array([v[n] for n in there.names])
+        for v in there.null_directions
+        if not lacking & {n for n, part in v.items() if abs(part) > 0.1}
+    ]
