@@ -43,7 +43,7 @@ ALLOWED = {
     "analysis": {"simulation", "dynamics", "flights", *BASE},
     "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},
     "models": {"dynamics", *BASE},
-    "fused": set(),
+    "fused": {"numerics"},
     "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},
     "report": {
         "identification", "sweeps", "analysis", "simulation", "dynamics", "flights", "models",

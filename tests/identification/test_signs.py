@@ -11,7 +11,7 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Prior, Problem, check, fit
-from heli_jax.identification.estimation.multistart import _draw_values
+from heli_jax.identification.estimation.drawn_starts import _draw_values
 from heli_jax.identification.unknowns.transforms import changes_sign
 from tests.identification.bench import steps
 

@@ -24,13 +24,16 @@ from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Solution, value_of
 from heli_jax.identification.unknowns.nuisances import weak_unknowns
 
-_WIDE = 0.1
-"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked"""
+_WIDE, _WIDE_IN_A_VALLEY = 0.2, 0.1
+"""sd in relative coordinates, as intervals are reported, from which on the likelihood is asked: of
+any parameter, and of one that lies along a valley with another"""
+_VALLEY = 0.9
+"""correlation beyond which two parameters lie along a valley, which bends"""
 _AS_EXPECTED = 1.15
 """factor by which the root of what is lost may differ from what the slopes say: the interval of the
 slopes is then as wide as that of the likelihood within about as much"""
 _TOGETHER = 0.99
-"""correlation beyond which two parameters lie along one valley"""
+"""correlation beyond which what is open of one parameter is open of the other"""
 _SINGULAR = 0.999
 """correlation beyond which the valley is so long that chance has put the optimum along it"""
 _ENOUGH = 0.05
@@ -84,13 +87,15 @@ def beyond_slopes(
     """
     lacking = {*verdict.undetermined, *verdict.without_effect}
     sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
+    n = len(sd)
+    valley = np.abs(np.where(np.eye(n), 0.0, verdict.correlation)).max(1, initial=0.0) > _VALLEY
     wide = [
         (i, u)
         for i, u in enumerate(unknowns_of(problem, at.layout, e))
         if u.name in problem.free
         and (u.logarithmic or u.symmetric)
         and not (u.name in lacking or u.at_bound)
-        and sd[i] * reaches[i] > _WIDE * Z95
+        and sd[i] * reaches[i] > Z95 * (_WIDE_IN_A_VALLEY if valley[i] else _WIDE)
     ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES
