@@ -10,6 +10,7 @@ _TAIL = re.compile(
     rf"(?:[_ ]+per[_ ]+|[_ ]?p|[/_ ])(?:{_SECOND})(?:\^?-?[12])?)",
     re.IGNORECASE,
 )
+_BRACKETS = re.compile(r".*[\[(]([^\[\]()]+)[\])]\s*")
 _MEANINGS = {
     "rad/s": "an angular rate",
     "rad/s^2": "an angular acceleration",
@@ -48,10 +49,11 @@ _AXIS = {"p", "q", "r"}
 _STICKS = {
     *("stick", "sticks", "servo", "servos", "channel", "chan", "ch", "rc", "cmd", "command"),
     *("commanded", "input", "pwm", "pulse", "cyclic", "swash", "swashplate", "delta", "actuator"),
-    *("control", "controls", "output", "out", "aileron", "ail", "elevator", "elev", "ele", "rudder"),
-    *("rud", "pedal", "ped", "collective", "col", "lat", "lon", "lateral", "longitudinal", "tail"),
-    *("rccommand", "setpoint", "sp", "u", "joystick", "throttle", "des", "desired", "target", "ref"),
-}  # fmt: skip
+    *("control", "controls", "output", "out", "aileron", "ail", "elevator", "elev", "ele"),
+    *("rudder", "rud", "pedal", "ped", "collective", "col", "lat", "lon", "lateral", "tail"),
+    *("longitudinal", "rccommand", "setpoint", "sp", "u", "joystick", "throttle", "des", "ref"),
+    *("desired", "target", "excitation", "sweep"),
+}
 _UNSURE = {"current", "bank", "heading", "mag", "climb", "clock", "stamp", "height", "omega"}
 """words that mean such a thing in a list of channels, but not surely"""
 
@@ -63,6 +65,14 @@ def rate_at_end(name: str) -> tuple[str, str] | None:
     if match is None or not units.is_unit(match[2].lower()):
         return None
     return match[1], match[2].lower()
+
+
+def unit_in_name(name: str) -> str:
+    """The unit in brackets or of a rate at the end of a name, empty where there is none."""
+    match = _BRACKETS.fullmatch(name)
+    if match is not None and units.is_unit(match[1].strip()):
+        return match[1].strip()
+    return (rate_at_end(name) or ("", ""))[1]
 
 
 def kind_of_unit(unit: str) -> str:
