@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from heli_jax.errors import nearest
+from heli_jax.unit_spelling import as_known
 
 # A registry of its own rather than pint's default: that calls the radian dimensionless (so that a
 # metre of stick would pass for a radian of blade), reads 'a' as a year, and has a thousand
@@ -82,7 +83,7 @@ _EXAMPLES = (
 def _parse(unit: str) -> Any:
     registry = _registry()
     # The Greek letter looks like the micro sign.
-    text = unit.strip().replace("·", "*").replace("μ", "µ")
+    text = as_known(unit.strip().replace("·", "*").replace("μ", "µ"))
     if text in ("", "1", "-", "dimensionless"):
         return registry.Quantity(1.0)
     try:

@@ -292,3 +292,30 @@ def test_a_logged_sweep_is_offered_as_an_instrument_and_dead_channels_are_no_sig
     assert signals.inputs["lat"].signal == "aileron_pwm"
     assert {n: o.signal for n, o in signals.outputs.items()} == {"p": "GyroRoll_dps"}
     assert signals.instruments["lat"].signal == "SweepAil"
+
+
+@pytest.mark.parametrize(
+    "rate", ["rate_deg_s", "rate_deg_per_s", "rate_degrees_per_second", "rate [deg s-1]", "rate"]
+)
+def test_a_rate_is_never_taken_for_the_stick(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], rate: str
+) -> None:
+    """A rate follows itself more closely than it follows any stick."""
+    columns = table(f"roll_{rate}", "output 1")
+    columns["roll_deg"] = np.degrees(np.cumsum(RATE) * 0.02)
+    log, out = write(tmp_path / "run.csv", columns), tmp_path / "run.yaml"
+    asked = ["new", str(log), "--model", "roll-flybarless", "--out"]
+    assert cli.main([*asked, str(out)]) == 0
+    signals = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals
+    assert signals.inputs["lat"].signal == "output 1"
+    assert signals.outputs["p"].signal == f"roll_{rate}"
+    # Without the stick's column nothing is left that may be one: the user is asked.
+    del columns["output 1"], columns["battery"]
+    write(log, columns | {"yaw_rate_deg_s": columns[f"roll_{rate}"] + 1.0})
+    assert cli.main([*asked, str(tmp_path / "none.yaml")]) == 0
+    assert "no channel that may be lat was found by name or motion" in capsys.readouterr().err
+    assert (
+        "lat: {signal: EDIT}   # no channel's name says so" in (tmp_path / "none.yaml").read_text()
+    )
+    assert cli.main(["fit", str(tmp_path / "none.yaml"), "--out", str(tmp_path / "fit")]) == 2
+    assert "EDIT" in capsys.readouterr().err

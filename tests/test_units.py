@@ -37,6 +37,10 @@ FACTORS = [
     ("g*cm^2", "kg*m^2", 1e-7),
     ("g·cm^2", "kg m^2", 1e-7),
     ("kg mm^2", "kg m^2", 1e-6),
+    # As logs and NetCDF's attributes spell them.
+    *((u, "rad/s", math.pi / 180.0) for u in ("deg s-1", "degrees_per_second", "deg_s", "dps")),
+    *((u, "rad/s", math.pi / 180.0) for u in ("deg_per_s", "degree/second", "Grad/s", "°·s⁻¹")),
+    *((u, "m/s^2", 1.0) for u in ("m s-2", "m.s-2", "m/s²", "m/s2", "m_s2")),
     ("km/h", "m/s", 1.0 / 3.6),
     ("N mm", "N m", 1e-3),
     ("kPa", "Pa", 1e3),

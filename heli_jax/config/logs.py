@@ -24,6 +24,8 @@ from heli_jax.errors import InputError, nearest
 from heli_jax.flights import Also, Flight, Signal, read_flight, read_parts
 from heli_jax.flights.convert import Selection
 from heli_jax.flights.derived import DerivedLog, DerivedTable, with_derived
+from heli_jax.flights.file_units import taken_note
+from heli_jax.flights.flight import Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.named import Named, NamedBy
 from heli_jax.flights.table import Table
@@ -98,7 +100,7 @@ def _read_flight(
         raise  # it names the log and the line already
     except ValueError as e:  # of `Flight`, which knows no file
         raise InputError(f"{where}: {e}") from e
-    notes = (*_unstated_units(model, everything), *named.notes)
+    notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
     flights = tuple(with_instruments(flight, instruments) for flight in flights)
     first, *others = _treated(experiment, flights, f, where)
     cautions = filter_cautions(first.source, everything.outputs)
@@ -276,14 +278,22 @@ def _of_model(
     )
 
 
-def _unstated_units(model: Model, stated: Resolved) -> tuple[str, ...]:
-    """A sentence for each signal whose numbers are read as SI because no unit is stated.
+def _unstated_units(
+    model: Model, stated: Resolved, source: Source | None = None
+) -> tuple[str, ...]:
+    """A sentence for each signal whose numbers are read as SI, or in the file's unit, because no
+    unit is stated.
 
     Numbers in degrees that are read as radians fit as well, and every estimate is wrong by 57.
     """
     notes = []
-    for record, signals in ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs)):
+    as_read = ({}, {}) if source is None else (source.inputs, source.outputs)
+    both = ((model.Inputs, stated.inputs), (model.Outputs, stated.outputs))
+    for (record, signals), read in zip(both, as_read, strict=True):
         for name, signal in signals.items():
+            if name in read and (note := taken_note(name, read[name])):
+                notes.append(note)
+                continue
             # Plain numbers have no unit to mistake.
             si = naming.unit(record, name)
             if signal.unit is None and si is not None and not units.is_plain(si):
@@ -352,8 +362,16 @@ def signals(
             getattr(config, "repeats", "auto"),
             **config.conversion,
             constant=getattr(config, "constant", None),
+            missing=_listed(getattr(config, "missing", None)),
+            assumed=config.unit is None and si is not None,
         )
     return out
+
+
+def _listed(numbers: float | list[float] | None) -> tuple[float, ...]:
+    if numbers is None:
+        return ()
+    return tuple(map(float, numbers if isinstance(numbers, list) else [numbers]))
 
 
 def _si(unit: str, si: str | None, place: str, gain: bool, role: str) -> str:

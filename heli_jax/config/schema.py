@@ -10,7 +10,7 @@ from heli_jax.config.disturbance_section import DisturbanceConfig
 from heli_jax.config.flight_values import one_log, window_choice
 from heli_jax.config.frequency_section import FrequencyConfig
 from heli_jax.config.onboard import Delay, Filters, Notches, OnboardConfig, VibrationConfig
-from heli_jax.config.signal_section import LoggedInputConfig, PresetConfig, ScaledConfig
+from heli_jax.config.signal_section import LoggedInputConfig, Numbers, PresetConfig, ScaledConfig
 from heli_jax.config.simulate_section import SimulateConfig
 from heli_jax.errors import nearest
 from heli_jax.identification.equation_error.limits import F_ENTER
@@ -65,6 +65,9 @@ class InputConfig(LoggedInputConfig):
     """that the numbers have then; taken to be in SI unless given"""
     hold: Literal["auto", "zero-order", "linear"] = "auto"
     """what it does between samples (docs/inputs.md); auto: by how it moves in the log"""
+    missing: Numbers | None = None
+    """numbers in the log, before scale and offset, that stand for no value, one or a list: the
+    input is taken as it was before"""
 
 
 class OutputConfig(ScaledConfig):
@@ -81,6 +84,9 @@ class OutputConfig(ScaledConfig):
     """by how much it is logged late [s]"""
     repeats: Literal["auto", "keep", "missing"] = "auto"
     """of values that a logger wrote again until the next was there (docs/logs.md)"""
+    missing: Numbers | None = None
+    """numbers in the log, before scale and offset, that stand for no value: 0 of a sensor's
+    dropouts, or several as a list"""
 
 
 class SignalsConfig(PresetConfig):

@@ -67,15 +67,17 @@ def _numbers(value: object) -> object:
     raise ValueError(f"expected a number or a list of numbers, got {value!r:.60}")
 
 
+# Any, since the validator before it has said what it may be.
+# What an editor is told of it is the type beside the validator.
+Numbers = Annotated[Any, BeforeValidator(_numbers, json_schema_input_type=float | list[float])]
+
+
 def _booleans(value: object) -> object:
     if all(isinstance(v, bool) for v in (value if isinstance(value, list) else [value])):
         return value
     raise ValueError(f"expected true, false or a list of them, got {value!r:.60}")
 
 
-# Any, since the validator before it has said what it may be.
-# What an editor is told of it is the type beside the validator.
-_Numbers = Annotated[Any, BeforeValidator(_numbers, json_schema_input_type=float | list[float])]
 _Booleans = Annotated[Any, BeforeValidator(_booleans, json_schema_input_type=bool | list[bool])]
 
 
@@ -86,11 +88,11 @@ class CcpmConfig(_Strict):
     """the channels of the servos"""
     angles: list[_Finite]
     """[deg] of each, clockwise from the nose, seen from above"""
-    radius: _Numbers = 1.0
+    radius: Numbers = 1.0
     """of each from the mast, in any one unit"""
-    offset: _Numbers = 0.0
+    offset: Numbers = 0.0
     """of each at rest, in the log's numbers"""
-    scale: _Numbers = 1.0
+    scale: Numbers = 1.0
     """lift for a unit of the log"""
     invert: _Booleans = False
     """whether a servo moves the other way"""

@@ -38,6 +38,8 @@ _NEARLY = 0.9
 """turns that an angle of no stated unit has to go over"""
 _TURN = 1.001
 """turns that a wrapped angle goes over, at most; its ends may be rounded"""
+_DIGITS, _TINY = 1e-9, 1e-6
+"""of a number that is compared with one that was stated, and the smallest that counts"""
 _NONE: Mapping[Key, Mapping[str, Marked]] = MappingProxyType({})
 
 
@@ -86,6 +88,12 @@ def _as_logged(
     for key, timed in signals.items():
         signal, name = request.signals[key], shown(request.signals[key].name)
         numbers = _in_log(signal, timed.values)
+        stated = _at_stated(signal, numbers)
+        if stated.any():
+            values, note = _without(timed.values, stated, key[1])
+            notes.append(f"{name} {note}")
+            timed = timed._replace(values=values)
+            numbers = _in_log(signal, values)
         at = at_marks(numbers)
         sources = of_sources.get(key, {})
         marks[key] = (Marked(timed.seconds[at], numbers[at]), *sources.values())
@@ -108,6 +116,29 @@ def _as_logged(
         notes += [f"{name} has {stray_words(found)}: kept as measured" for found in odd[key]]
         made[key] = Timed(timed.seconds, values)
     return AsLogged(made, _facts(made, marks, odd), tuple(notes))
+
+
+def _at_stated(signal: Signal, numbers: np.ndarray) -> np.ndarray:
+    """Which of the numbers (N,) of a log the configuration says to stand for no value."""
+    at = np.zeros(numbers.shape, bool)
+    for value in signal.missing:
+        # Numbers have been through their unit and back.
+        at |= np.abs(numbers - value) <= _DIGITS * max(abs(value), abs(signal.offset), _TINY)
+    return at
+
+
+def _without(values: np.ndarray, at: np.ndarray, kind: str) -> tuple[np.ndarray, str]:
+    """Values (N,) without those that stand for none, and in words what was done."""
+    count = int(np.count_nonzero(at))
+    words = f"has {count} sample{'' if count == 1 else 's'} that are missing by the configuration"
+    if kind == "output":
+        return np.where(at, np.nan, values), words
+    known = np.flatnonzero(~at)
+    if not known.size:
+        return values, words
+    # An input acts all the time: a stick stays where it was.
+    last = known[np.maximum(np.searchsorted(known, np.arange(at.size), side="right") - 1, 0)]
+    return values[last], f"{words}: taken as it was before"
 
 
 def _facts(
@@ -140,7 +171,9 @@ def source_notes(name: str, marks: Mapping[str, Counts]) -> list[str]:
 
 def measured(signal: Signal, values: np.ndarray) -> np.ndarray:
     """Values (N,) in SI of a signal, NaN where one stands for no value."""
-    return np.where(np.isnan(without_marks(_in_log(signal, values))), np.nan, values)
+    numbers = _in_log(signal, values)
+    none = np.isnan(without_marks(numbers)) | _at_stated(signal, numbers)
+    return np.where(none, np.nan, values)
 
 
 def without_marks_and_turns(numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:

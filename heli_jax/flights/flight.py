@@ -30,6 +30,9 @@ class Signal:
         offset: in the log's own numbers, as 1500 of a PWM.
         invert: whether its sign is the other one.
         constant: value in `unit` of an input that the log lacks.
+        missing: numbers of the log that stand for no value; an output is missing there, and an
+            input as it was before.
+        assumed: whether nobody stated the unit: that of the file goes before it, if it has one.
         origin: where unit, axes and sign come from, in words, where a preset states them.
     """
 
@@ -43,6 +46,8 @@ class Signal:
     offset: float = 0.0
     invert: bool = False
     constant: float | None = None
+    missing: tuple[float, ...] = ()
+    assumed: bool = False
     origin: str = ""
 
     def to_si(self, numbers: np.ndarray) -> np.ndarray:

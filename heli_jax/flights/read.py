@@ -148,10 +148,14 @@ def _opened(
     # Checked before a log is opened, which may take minutes.
     request = Request(path.path if is_open else str(path), time, logged, outputs, options)
     logs, request = opened(request, path if is_open else None)
-    # In the order in which they were asked for, those of further logs last.
-    both = [
+    # In the order in which they were asked for, those of further logs last; units as they are read.
+    asked = [
         {**own, **{n: s for also in options.also for n, s in getattr(also, role).items()}}
         for role, own in (("inputs", inputs), ("outputs", outputs))
+    ]
+    both = [
+        {n: request.signals.get((n, kind), s) for n, s in of_kind.items()}
+        for kind, of_kind in zip(("input", "output"), asked, strict=True)
     ]
     return logs, request, functools.partial(
         with_origins, inputs=both[0], outputs=both[1], constants=constants

@@ -11,6 +11,7 @@ import numpy as np
 
 from heli_jax.flights.marks import Counts, Marked
 from heli_jax.flights.noisy_rails import PILE, rail_below_noise
+from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.flights.strays import Strays
 
 FEW = 8
@@ -215,6 +216,8 @@ def facts_of_all[K: Hashable](
             )
             dropouts = _dropouts(*signals[key])
             facts[key] = replace(facts[key], stretches=stretches, dropouts=dropouts)
+        for key in signals.keys() - outputs:
+            facts[key] = replace(facts[key], dropouts=_of_stick(*signals[key]))
     return facts
 
 
@@ -309,6 +312,11 @@ def _dropouts(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
     if not often or float(np.median(jumps)) < far:
         return None
     return Dropouts(float(levels[k]), s[at])
+
+
+def _of_stick(seconds: np.ndarray, x: np.ndarray) -> Dropouts | None:
+    found = stick_dropouts(x)
+    return None if found is None else Dropouts(found[0], seconds[found[1]])
 
 
 def at_rails(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

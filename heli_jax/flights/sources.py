@@ -11,6 +11,7 @@ import numpy as np
 from heli_jax.flights.align import Lag, NotAligned, lag_between
 from heli_jax.flights.as_logged import measured
 from heli_jax.flights.derived import with_derived
+from heli_jax.flights.file_units import with_file_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import without_marks
@@ -64,6 +65,7 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
         InputError: a log cannot be read, or not be aligned with the first.
     """
     first = _open(request, log)
+    request = with_file_units(_log_of(first), request)
     keys, everything, beside = frozenset(request.signals), copy.copy(request), []
     for also in request.options.also:
         signals = {(n, "input"): s for n, s in also.inputs.items()}
@@ -72,7 +74,9 @@ def opened(request: Request, log: ChannelLog | Table | None = None) -> tuple[Ope
         if twice is not None:
             raise wrong(also.path, f"{twice[1]} {twice[0]!r} is taken from two logs, expected one")
         everything.signals = {**everything.signals, **signals}
-        beside.append(_beside(first, request, also))
+        one, asked = _beside(first, request, also)
+        everything.signals = {**everything.signals, **asked.signals}
+        beside.append(one)
     return Opened(first, keys, tuple(beside)), everything
 
 
@@ -142,8 +146,13 @@ def _whole(request: Request) -> Request:
     return request
 
 
-def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Beside:
-    """The signals of a further log, its clock shifted to that of the first."""
+def _log_of(log: ChannelLog | LoadedTable) -> ChannelLog | Table:
+    return log if isinstance(log, ChannelLog) else log.table
+
+
+def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tuple[Beside, Request]:
+    """The signals of a further log, its clock shifted to that of the first, and the request for
+    them with the units that they have."""
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
@@ -165,11 +174,12 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> Besi
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already: it may be large.
-    signals = _clocked(_open(asked, other if isinstance(other, ChannelLog) else other.table), asked)
+    asked = with_file_units(_log_of(other), asked)
+    signals = _clocked(_open(asked, _log_of(other)), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
-    sha256 = other.sha256 if isinstance(other, ChannelLog) else other.table.sha256
-    return Beside(shifted, _note(f"{name} (sha256 {sha256[:12]})", also, lag))
+    words = _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)
+    return Beside(shifted, words), asked
 
 
 def _note(name: str, also: Also, lag: Lag) -> str:

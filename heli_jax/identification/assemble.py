@@ -69,6 +69,7 @@ from heli_jax.identification.validation.feedback import (
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
 from heli_jax.identification.validation.metrics import Whiteness, metrics
+from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
@@ -240,9 +241,9 @@ def assemble(
         one_step=pooled_metrics(signals, one_step=True),
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=white,
-        adequacy=adequacy.doubted([mode.words for mode in fast if mode.undetermined])._replace(
-            at_optimum=status != "not-converged"
-        ),
+        adequacy=adequacy.doubted(
+            [*record_doubts(problem), *(mode.words for mode in fast if mode.undetermined)]
+        )._replace(at_optimum=status != "not-converged"),
         coloured=errors.coloured,
         responses=responses,
         starts=table(layout, data, run.points, run.optima),

@@ -9,6 +9,7 @@ import numpy as np
 
 from heli_jax import models, naming
 from heli_jax.errors import InputError, nearest
+from heli_jax.flights.channel_names import names_a_stick
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
@@ -33,6 +34,8 @@ _AXES = {
 _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
     ("roll_rate", "pitch_rate", "yaw_rate"), "rad/s"
 )
+_STICKS_TOO = {"roll", "pitch", "yaw"}
+"""names of motions that sticks have as well"""
 _GRAVITY = ("g", "gravity", "g0")
 _FEWEST = 8
 """samples of a signal"""
@@ -112,6 +115,10 @@ def write_config(
     if todo:
         words = "1 number is" if todo == 1 else f"{todo} numbers are"
         notes.append(f"{words} yours to give, where {EDIT} stands")
+    lacking = [] if signals is None else [n for n, g in signals.inputs.items() if g is None]
+    if lacking:
+        words = f"no channel that may be {' or '.join(lacking)} was found by name or motion"
+        notes.append(f"{words}: name the stick's, which no rate or angle is")
     if others:
         assert isinstance(chosen.name, dict)
         notes.append(
@@ -279,7 +286,8 @@ def _signals(model: Any, log: _Log) -> text.Signals:
             stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
             known, commands = called["inputs"][stick], called["commands"][stick]
         unit, known = naming.unit(model.Inputs, name) or "1", [_own(name), *known]
-        inputs[name] = _found(log, guess.by_name(known, sticks, commands), unit, taken)
+        allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
+        inputs[name] = _found(log, guess.by_name(known, allowed, commands), unit, taken)
         for channel in _moving(log, guess.excitations(known, tuple(log.series)))[:1]:
             excitations[name] = channel
     taken += excitations.values()
@@ -334,19 +342,27 @@ def _by_correlation(
 ) -> None:
     """Inputs whose names tell nothing, by what an output follows."""
     known = [g.channel for g in outputs.values() if g is not None]
+    # What is named as a motion moves with the stick, and more like the output than the stick does.
+    motions = {c for names in _names()["outputs"].values() for c in names} - _STICKS_TOO
+    moving = guess.by_name(sorted(motions), tuple(log.series))
+    measured = {n for n in moving if not names_a_stick(n)}
     for name, found in inputs.items():
         if found is not None or not known:
             continue
+        si = naming.unit(model.Inputs, name) or "1"
         left = {
             n: s
             for n, s in log.series.items()
-            if n not in taken and not guess.is_excitation(n) and np.nanstd(s.values) > 0
+            if n not in {*taken, *measured}
+            and guess.may_move(n, s, si)
+            and not guess.is_excitation(n)
+            and np.nanstd(s.values) > 0
         }
         best = guess.by_motion(log.series[known[-1]], left)
         if best is None:
             continue
         channel, related = best
-        made = guess.scaled(channel, log.series[channel], naming.unit(model.Inputs, name) or "1")
+        made = guess.scaled(channel, log.series[channel], si)
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.channel_names import no_stick, rate_at_end
 from heli_jax.yaml_file import EDIT
 
 # Longest first, so that deg/s is not read as deg.
@@ -114,6 +115,8 @@ def without_unit(name: str) -> tuple[str, str]:
         return match[1], unit
     if match and units.is_unit(match[2].strip()):
         return match[1], match[2].strip()
+    if (rate := rate_at_end(name)) is not None:
+        return rate
     for letter in _LETTERS:
         if name.endswith((f"_{letter}", f" {letter}")):
             return name[:-2], letter
@@ -204,6 +207,17 @@ def may_be(name: str, series: Series, called: Sequence[str], si: str) -> bool:
         return False
     words, own = set(words_of(name)), {w for c in called for w in c.split()}
     return not (_OTHER | _CHANGES) & words - own
+
+
+def may_move(name: str, series: Series, si: str) -> bool:
+    """Whether a channel's name and unit leave room for an input of the model.
+
+    Args:
+        name: of the channel.
+        series: its samples.
+        si: the unit that the model's input has.
+    """
+    return not no_stick(name, series.unit or without_unit(name)[1], si)
 
 
 def by_motion(output: Series, channels: Mapping[str, Series]) -> tuple[str, float] | None:

@@ -21,6 +21,7 @@ from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.late_angles import late_angles
 from heli_jax.identification.validation.late_inputs import late_inputs
 from heli_jax.identification.validation.logging_rate import logging_rate
+from heli_jax.identification.validation.misread import misread
 from heli_jax.identification.validation.missing_outputs import missing_outputs
 from heli_jax.identification.validation.next_flight import next_flight
 from heli_jax.identification.validation.signal_quality import (
@@ -62,6 +63,7 @@ def is_it_enough(
         *stuck(flights),
         *strays(flights),
         *quantisation(flights, at.noise.sd),
+        *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
         *late_angles(problem),
         *against_start(flights, e.simulated),

@@ -124,12 +124,9 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
             if facts.marks and kind == "output":
                 words = f"{label}: {name} has {mark_words(facts.marks)}: taken as missing; look "
                 found.append((0.0, f"{words}at what the log says of such values."))
-            if facts.dropouts is not None and facts.dropped >= DROP_SHARE:
-                words = (
-                    f"{label}: {name} jumps to {facts.dropouts.value:.4g} and back, in "
-                    f"{100 * facts.dropped:.2g} % of the samples: dropouts that are taken for "
-                    "measurements; leave these parts out, or the value empty in the log."
-                )
+            least = DROP_SHARE if kind == "output" else 0.0
+            if facts.dropouts is not None and facts.dropped >= least:
+                words = dropout_words(label, flight, (name, kind), facts)
                 found.append((facts.dropped * facts.size * facts.usual, words))
             for at in facts.stretches:
                 length = at.end - at.begin
@@ -147,6 +144,21 @@ def stuck(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
         Finding("stuck outputs", "doubt", words, round(length, 6), _STUCK_LIMIT)
         for length, words in found[:_MOST_NAMED]
     ]
+
+
+def dropout_words(label: str, flight: Flight, key: tuple[str, str], facts: SignalFacts) -> str:
+    """A sentence on a signal's dropouts, of which there are some."""
+    assert facts.dropouts is not None
+    name, kind = key
+    signals = getattr(flight.source, f"{kind}s", {})
+    value = facts.dropouts.value
+    logged = float(signals[name].from_si(np.array(value))) if name in signals else value
+    words = f"{label}: {name} jumps to {value:.4g} and back, in {100 * facts.dropped:.2g} % of the"
+    what = "drive the model as commands" if kind == "input" else "are taken for measurements"
+    return (
+        f"{words} samples: dropouts that {what}; state missing: {logged:.6g} beside its signal, or "
+        "leave these parts out."
+    )
 
 
 def strays(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:

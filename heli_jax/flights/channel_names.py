@@ -1,0 +1,126 @@
+"""What a channel's name and unit say that it measures, and so what it cannot be."""
+
+import re
+
+from heli_jax import units
+
+_ANGLE, _SECOND = r"deg|degree|degrees|rad|radian|radians|mrad", r"s|sec|second|seconds"
+_TAIL = re.compile(
+    rf"(.*?)[_ .]+((?:{_ANGLE}|m|meters?|metres?|ft|feet)"
+    rf"(?:[_ ]+per[_ ]+|[_ ]?p|[/_ ])(?:{_SECOND})(?:\^?-?[12])?)",
+    re.IGNORECASE,
+)
+_BRACKETS = re.compile(r".*[\[(]([^\[\]()]+)[\])]\s*")
+_MEANINGS = {
+    "rad/s": "an angular rate",
+    "rad/s^2": "an angular acceleration",
+    "m/s": "a speed",
+    "m/s^2": "an acceleration",
+    "s": "a time",
+    "A": "a current",
+    "Pa": "a pressure",
+    "W": "a power",
+    "rad": "an angle",
+    "m": "a length",
+    "V": "a voltage",
+}
+_OF_STICKS = ("rad", "m", "V")
+"""units that a stick may have, or the blades that it moves, if its name says that it is one"""
+_PULSES = ("us", "µs", "usec", "microseconds")
+_WORDS = {
+    word: meaning
+    for meaning, words in {
+        "an angular rate": "rate rates gyro gyr gyrox gyroy gyroz omega phidot thetadot psidot",
+        "an acceleration": "acc accel acceleration accelerometer imuacc",
+        "a speed": "vel velocity speed airspeed climb",
+        "a position": "pos position altitude alt latitude longitude gps baro height",
+        "a rotor's or motor's speed": "rpm erpm headspeed",
+        "a voltage": "volt volts voltage vbat vcc batt battery",
+        "a current": "current amps amperage",
+        "a temperature": "temp temperature",
+        "a time": "time timestamp stamp seconds clock",
+        "an angle": "angle phi theta psi attitude euler heading bank quat",
+        "a field": "mag magnetometer compass",
+    }.items()
+    for word in words.split()
+}
+_AXIS = {"p", "q", "r"}
+"""rates, where nothing else is said"""
+_STICKS = {
+    *("stick", "sticks", "servo", "servos", "channel", "chan", "ch", "rc", "cmd", "command"),
+    *("commanded", "input", "pwm", "pulse", "cyclic", "swash", "swashplate", "delta", "actuator"),
+    *("control", "controls", "output", "out", "aileron", "ail", "elevator", "elev", "ele"),
+    *("rudder", "rud", "pedal", "ped", "collective", "col", "lat", "lon", "lateral", "tail"),
+    *("longitudinal", "rccommand", "setpoint", "sp", "u", "joystick", "throttle", "des", "ref"),
+    *("desired", "target", "excitation", "sweep"),
+}
+_UNSURE = {"current", "bank", "heading", "mag", "climb", "clock", "stamp", "height", "omega"}
+"""words that mean such a thing in a list of channels, but not surely"""
+
+
+def rate_at_end(name: str) -> tuple[str, str] | None:
+    """A name without the unit of a rate or a speed at its end, and this unit: `roll_rate_deg_s`,
+    `p degrees per second`; None where none stands there."""
+    match = _TAIL.fullmatch(name)
+    if match is None or not units.is_unit(match[2].lower()):
+        return None
+    return match[1], match[2].lower()
+
+
+def unit_in_name(name: str) -> str:
+    """The unit in brackets or of a rate at the end of a name, empty where there is none."""
+    match = _BRACKETS.fullmatch(name)
+    if match is not None and units.is_unit(match[1].strip()):
+        return match[1].strip()
+    return (rate_at_end(name) or ("", ""))[1]
+
+
+def kind_of_unit(unit: str) -> str:
+    """The SI unit of the same kind where it is none of a stick's by itself, else empty."""
+    if not unit or unit in _PULSES or not units.is_unit(unit):
+        return ""
+    return next((si for si in _MEANINGS if _is_of(unit, si)), "")
+
+
+def no_stick(name: str, unit: str, si: str, *, sure: bool = False) -> str:
+    """What a channel measures, `an angular rate`, where that is no input of a kind; else empty.
+
+    Args:
+        name: of the channel.
+        unit: that the log or the name states, empty without one.
+        si: the unit that the model's input has.
+        sure: whether to take only what can hardly be a stick, instead of what is likely none.
+    """
+    words = words_in(name)
+    called = names_a_stick(name)
+    kind = kind_of_unit(unit)
+    if kind and not _is_of(unit, si) and (kind not in _OF_STICKS or not (called or sure)):
+        return _MEANINGS[kind]
+    # A speed for an input that is one, as of a rotor, needs no excuse.
+    if called or si in ("rad/s", "m/s", "rad/s^2", "m/s^2"):
+        return ""
+    if len(words) == 1 and words[0] in _AXIS and not sure:
+        return "an angular rate"
+    found = [w for w in words if w in _WORDS and not (sure and w in _UNSURE)]
+    return _WORDS[found[0]] if found else ""
+
+
+def names_a_stick(name: str) -> bool:
+    """Whether a word of a name stands for a stick, a servo or a command."""
+    words = set(words_in(name))
+    return bool(_STICKS & words) and "gps" not in words
+
+
+def words_in(name: str) -> tuple[str, ...]:
+    """The words of a name in lower case: of rollRate, roll_rate and `Roll Rate`."""
+    apart = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
+    # ch1, rc2in: a number is no part of a word.
+    return tuple(w for w in re.split(r"[^a-z]+", apart.lower()) if w)
+
+
+def _is_of(unit: str, si: str) -> bool:
+    """Whether a unit is of the same kind as an SI unit, an angle being one of its own."""
+    try:
+        return units.base_of(unit) == units.base_of(si)
+    except ValueError:
+        return False

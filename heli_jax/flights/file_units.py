@@ -1,0 +1,58 @@
+"""The unit that a file states for a signal of which the configuration states none."""
+
+import copy
+import dataclasses
+import math
+
+from heli_jax import units
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.log import ChannelLog
+from heli_jax.flights.request import Request
+from heli_jax.flights.table import Table, column, shown, wrong
+
+
+def with_file_units(log: ChannelLog | Table, request: Request) -> Request:
+    """The request with the units that the file has where none was asked for.
+
+    Args:
+        log: the file.
+        request: for signals of it.
+
+    Raises:
+        InputError: the file's unit is of another kind than what is asked for.
+    """
+    made = copy.copy(request)
+    made.signals = {
+        key: _of_file(log, signal, key[0]) if signal.assumed else signal
+        for key, signal in request.signals.items()
+    }
+    return made
+
+
+def _of_file(log: ChannelLog | Table, signal: Signal, name: str) -> Signal:
+    # Who states a scale has made of the numbers what they are.
+    if signal.scale != 1.0 or signal.offset:
+        return signal
+    stated = unit_in_file(log, signal.name)
+    if stated in ("", "-", "1") or not units.is_unit(stated):
+        return signal
+    try:
+        same = math.isclose(units.factor(stated, signal.si), 1.0)
+    except ValueError as e:
+        problem = f"{name} has no unit stated, and the file's is another: {e}"
+        remedy = "state unit, with scale and offset where numbers have to be converted"
+        raise wrong(log.path, f"{problem}; {remedy}", column(signal.name)) from e
+    return signal if same else dataclasses.replace(signal, unit=stated)
+
+
+def unit_in_file(log: ChannelLog | Table, name: str) -> str:
+    """What a file says of a channel's unit, empty where it says nothing."""
+    held = log.topic_of(name).units if isinstance(log, ChannelLog) else log.units
+    return held.get(name, "").strip()
+
+
+def taken_note(name: str, signal: Signal) -> str:
+    """That a signal is read in the file's unit, in words; empty where it is not."""
+    if not signal.assumed or signal.unit == signal.si:
+        return ""
+    return f"{name}: no unit stated, {shown(signal.name)} taken in {signal.unit}, as the file says"

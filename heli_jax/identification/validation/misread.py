@@ -1,0 +1,119 @@
+"""Numbers that are hardly what they are taken for: degrees for radians, a rate for a stick, a
+sensor's dropouts for measurements.
+
+What a record says by itself of units is little: degrees fit as well as radians where all outputs
+are in them, with every estimate off by 57. Their size is the only evidence.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.dynamics.model import axes_of
+from heli_jax.flights.channel_names import no_stick, unit_in_name
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.signal_facts import DROP_SHARE
+from heli_jax.flights.table import shown
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.nuisances import labels
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.signal_quality import dropout_words, facts_of
+
+_LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
+"""rad and rad/s that a small helicopter does not exceed, but for its heading"""
+_LINEAR_ANGLE, _LINEAR_RATE = np.pi / 2, 8.0
+"""rad and rad/s up to which a linear model may mean something"""
+_HEADING_TURNS = 20.0
+"""turns in one sense, of a heading without jumps"""
+_MOST = 99.0
+"""percentile of the size that is held against them: no single spike counts"""
+
+
+class Misread(NamedTuple):
+    """One doubt, and in a few words why no model of it is adequate; empty where it is not sure."""
+
+    finding: Finding
+    words: str = ""
+
+
+def misread(problem: Problem) -> list[Misread]:
+    """What of the fitted flights is hardly what it is taken for.
+
+    Args:
+        problem: the flights, and the model, whose axes name headings.
+    """
+    flights = problem.training
+    return [
+        one
+        for label, flight in zip(labels(flights), flights, strict=True)
+        for one in (*_degrees(problem, label, flight), *_sticks(label, flight))
+    ]
+
+
+def record_doubts(problem: Problem) -> list[str]:
+    """Why no model of these numbers is adequate, each reason in a few words."""
+    found = (*misread(problem), *dropouts(problem))
+    return list(dict.fromkeys(one.words for one in found if one.words))
+
+
+def dropouts(problem: Problem) -> list[Misread]:
+    """The signals whose dropouts are taken for values."""
+    flights = problem.training
+    return [
+        Misread(
+            Finding("stuck outputs", "doubt", dropout_words(label, flight, (name, kind), facts)),
+            f"dropouts of {name} are taken for {'commands' if kind == 'input' else 'measurements'}",
+        )
+        for label, flight in zip(labels(flights), flights, strict=True)
+        for (name, kind), facts in facts_of(flight).items()
+        if facts.dropouts is not None and (kind == "input" or facts.dropped >= DROP_SHARE)
+    ]
+
+
+def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
+    headings = {a.angle for a in axes_of(problem.model) if a.rate == "r"} | {"psi", "yaw"}
+    for name, signal in (flight.source.outputs if flight.source else {}).items():
+        values = flight.outputs.get(name)
+        if values is None or signal.unit not in ("rad", "rad/s") or signal.scale != 1.0:
+            continue
+        seen = np.abs(values[np.isfinite(values)])
+        if not seen.size:
+            continue
+        size, linear = float(np.percentile(seen, _MOST)), problem.model.linear
+        if signal.unit == "rad/s":
+            limits = (_LARGEST_RATE, _LINEAR_RATE)
+        elif name in headings:
+            limits = (_HEADING_TURNS * 2 * np.pi,) * 2
+        else:
+            limits = (_LARGEST_ANGLE, _LINEAR_ANGLE)
+        impossible, most = limits[0], limits[1] if linear else limits[0]
+        if size <= most:
+            continue
+        unit = "deg" if signal.unit == "rad" else "deg/s"
+        whose = (
+            "a linear model says nothing of" if size <= impossible else "no small helicopter has"
+        )
+        words = (
+            f"{label}: {name} is up to {size:.3g} {signal.unit} ({np.degrees(size):.0f} {unit}), "
+            f"which {whose}: {shown(signal.name)} looks like {unit} read as {signal.unit}; state "
+            f"unit: {unit}."
+        )
+        criterion = f"{_MOST:g} % of the samples below, {most:.4g} {signal.unit}"
+        sure = f"{name} looks like {unit} read as {signal.unit}" if size > impossible else ""
+        yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
+
+
+def _sticks(label: str, flight: Flight) -> Iterator[Misread]:
+    for name, signal in (flight.source.inputs if flight.source else {}).items():
+        if signal.constant is not None:
+            continue
+        what = no_stick(signal.name, unit_in_name(signal.name), signal.si, sure=True)
+        if what:
+            words = (
+                f"{label}: {name} is taken from {shown(signal.name)}, which by its name is {what}: "
+                "a motion that is taken for the stick makes numbers that mean nothing; name the "
+                "stick's channel."
+            )
+            sure = f"{name} is {what} by its name"
+            yield Misread(Finding("signs and units", "doubt", words), sure)
