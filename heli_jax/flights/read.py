@@ -154,7 +154,10 @@ def _opened(
         for role, own in (("inputs", inputs), ("outputs", outputs))
     ]
     both = [
-        {n: request.signals.get((n, kind), s) for n, s in of_kind.items()}
+        {
+            n: request.signals[n, kind] if (n, kind) in request.signals else s
+            for n, s in of_kind.items()
+        }
         for kind, of_kind in zip(("input", "output"), asked, strict=True)
     ]
     return logs, request, functools.partial(

@@ -1,7 +1,7 @@
 """A run of one element, taken apart: what is computed once, and what at every sample."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,22 +13,10 @@ from heli_jax.numerics.hoist import hoisted
 # `Any` below: trees of arrays, and jaxprs.
 
 
-class Steps(Protocol):
-    """A run in its steps, as `heli_jax.simulation.accumulate.Samples` is one."""
-
-    @property
-    def carry(self) -> Any:
-        """before the first sample"""
-
-    def step(self, carry: Any, k: Any, /) -> Any:
-        """The carry a sample after the k-th."""
-
-    def last(self, carry: Any, /) -> Any:
-        """The results, from the carry at the last sample."""
-
-
-type Making = Callable[[Any, Any, Any], Steps]
-"""of (what all elements share, records (N, ...) that all share, what an element has of its own)"""
+type Making = Callable[[Any, Any, Any], Any]
+"""of (what all elements share, records (N, ...) that all share, what an element has of its own): a
+run in its steps, with `carry`, `step` and `last` as `heli_jax.simulation.accumulate.Samples` has
+them"""
 
 
 class Traced(NamedTuple):

@@ -71,6 +71,7 @@ from heli_jax.identification.validation.inputs_explain import unless_inputs_expl
 from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
+from heli_jax.identification.validation.unmodelled import unmodelled, with_unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
@@ -214,6 +215,8 @@ def assemble(
         errors = errors._replace(verdict=verdict, limits={})
         numbers = _numbers(problem, solution, e, errors, absent)
         estimates = {k: numbers.of_interest[k] for k in layout.free}
+    elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
+        adequacy = with_unmodelled(adequacy, unmodelled(solution, e, numbers.of_interest))
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False

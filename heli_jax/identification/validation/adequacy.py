@@ -69,7 +69,7 @@ class Adequacy(NamedTuple):
     by_chance: bool = False
     """whether nothing measured stands out of the noise, so that any optimum is one of chance"""
     limited: str = ""
-    """what keeps an adequate model from a plain yes, where no residual in time is judged"""
+    """what keeps an adequate model from a plain yes beside residuals that are not white"""
     at_optimum: bool = True
     """whether the optimiser arrived"""
     ahead: float | None = None
@@ -101,10 +101,11 @@ class Adequacy(NamedTuple):
         if self.unjudged:
             return "not judged"
         if self.adequate:
-            left = "; ".join(self._left_over) if self.coloured else self.limited
+            limited = [self.limited] if self.limited else []
+            left = "; ".join([*limited, *(self._left_over if self.coloured else [])])
             words = f"in size only ({left})" if left else "yes"
             if self.one_step_only:
-                left = "; ".join([*self._left_over, *self._simulated_worse])
+                left = "; ".join([*limited, *self._left_over, *self._simulated_worse])
                 words = f"one step ahead only ({left})"
             if self.unexplained:
                 words += f", but nothing of {' and '.join(self.unexplained)} is explained"

@@ -17,7 +17,7 @@ from heli_jax.identification.validation.metrics import cross_correlation
 _SECONDS = 0.4
 """lags of an input that are looked at"""
 _MOST_LAGS = 30
-_ORDER = 10
+ORDER = 10
 """of the autoregression that whitens"""
 _BY_CHANCE = 1e-5
 """probability, for all pairs of a fit together, at which nothing is said"""
@@ -129,17 +129,17 @@ def explained_by(
     lags = _lags(dt)
     seen = np.isfinite(residual)
     # A gap would have to be filled, and what fills it looks like a response.
-    if not seen.all() or residual.size < _FEWEST * (lags + _ORDER):
+    if not seen.all() or residual.size < _FEWEST * (lags + ORDER):
         return None
     e, drive = residual - residual.mean(), u - u.mean()
     if not (np.std(e) > 0 and np.std(drive) > 0):
         return None
     # The filter of the residual is put on the input as well: prewhitening leaves the response
     # between the two as it was, and makes the F test's independent errors true.
-    whitening = _whitening(e)
-    e, drive = (np.convolve(v, whitening)[: v.size] for v in (e, drive))
+    h = whitening(e)
+    e, drive = (np.convolve(v, h)[: v.size] for v in (e, drive))
     # Column k is the input k samples before; the first samples have no past.
-    first = max(lags, _ORDER)
+    first = max(lags, ORDER)
     X = np.stack([drive[first - k : drive.size - k] for k in range(lags)], axis=1)
     y = e[first:] - e[first:].mean()
     X = X - X.mean(axis=0)
@@ -180,8 +180,8 @@ def _answer(e: np.ndarray, drive: np.ndarray, lags: int) -> np.ndarray:
     to lags, both through the filter that whitens the drive."""
     # Else what an input does later is foretold by what it has done, and every answer seems to begin
     # before it.
-    whitening = _whitening(drive)
-    y, x = (np.convolve(v, whitening)[: v.size][2 * _ORDER :] for v in (e, drive))
+    h = whitening(drive)
+    y, x = (np.convolve(v, h)[: v.size][2 * ORDER :] for v in (e, drive))
     return np.abs(cross_correlation(x, y, lags))
 
 
@@ -189,9 +189,13 @@ def _lags(dt: float) -> int:
     return max(2, min(_MOST_LAGS, round(_SECONDS / dt)))
 
 
-def _whitening(e: np.ndarray) -> np.ndarray:
-    """The filter (_ORDER + 1,) of an autoregression, by Yule and Walker."""
-    c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(_ORDER + 1)]) / e.size
+def whitening(e: np.ndarray) -> np.ndarray:
+    """The filter (ORDER + 1,) of an autoregression, by Yule and Walker.
+
+    Args:
+        e: the signal (N,), of mean zero.
+    """
+    c = np.array([float(e[: e.size - k] @ e[k:]) for k in range(ORDER + 1)]) / e.size
     # A little white noise, so that a residual without any has a filter too.
     c[0] *= 1.0 + 1e-9
     return np.concatenate([[1.0], -scipy.linalg.solve_toeplitz(c[:-1], c[1:])])

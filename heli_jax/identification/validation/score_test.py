@@ -1,0 +1,283 @@
+r"""Does a residual follow a drive through some filter, beyond what the estimates could take up?
+
+A mode that a model lacks leaves a residual that is a drive through a resonance, in a few lines of
+the record's spectrum: shares of the whole residual's power do not show it. So residual and
+sensitivities are whitened, and the residual is regressed on sensitivities and on the drive through
+each filter of a bank of second order: the gain of the likelihood in that direction is the score
+test for a model with such a mode. What the record's ends make of the filter's states takes part.
+
+The largest gain of the bank is compared with those of the same residual with phases drawn anew at
+each line. That keeps its spectrum, lines and humps of a disturbance too, and destroys nothing but
+what goes together with the drives, so that no shape of the noise has to be assumed.
+
+Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; Theiler et
+al. (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from heli_jax.identification.validation.missing_dynamics import ORDER, whitening
+
+NARROW = ((0.03, 0.05), (0.1, 0.15), (0.3, 0.4), (1.0, 0.8))
+"""damping of the bank's filters, and the logarithm of the frequency from one to the next"""
+BROAD = NARROW[2:]
+_SURROGATES = 99
+_LINES = 16_000
+"""of all records together at most, the lowest of each"""
+_LEAST = 20
+"""lines of a record below which nothing is asked of it"""
+_SAME = 1e-4
+"""part of a column beyond which it says something that those before it do not"""
+_AT_LEAST = 14.0
+"""gain below which no p value is asked for: by one filter alone chance makes it in 1 of 1000"""
+_EULER = 0.5772156649015329
+
+
+class Lines(NamedTuple):
+    """One record's whitened signals at its own frequencies."""
+
+    e: Complex[np.ndarray, " K"]
+    J: Complex[np.ndarray, "K q"]
+    """sensitivities of e"""
+    drives: Complex[np.ndarray, "K d"]
+    angles: Float[np.ndarray, " K"]
+    """of the lines [rad a sample]"""
+
+
+class Strongest(NamedTuple):
+    """The filter and drive that a residual follows most."""
+
+    statistic: float
+    """gain of twice the log-likelihood, by two numbers"""
+    p_value: float
+    """that chance makes as much, by the best of all drives and filters"""
+    drive: int
+    damping: float
+    """of the filter; infinite of none"""
+    frequency: float
+    """of the filter [rad a sample]"""
+    shift: Float[np.ndarray, " q"]
+    """by which the unknowns move where the filter is in the model"""
+
+
+def lines_of(
+    e: Float[np.ndarray, " N"],
+    J: Float[np.ndarray, "N q"],
+    drives: Float[np.ndarray, "N d"],
+) -> Lines | None:
+    """Whitened by the residual's autoregression; None of records too short or without a residual.
+
+    Args:
+        e: measured less simulated.
+        J: its derivatives by the unknowns.
+        drives: what may drive what the model lacks.
+    """
+    n = e.size - ORDER
+    if (n - 1) // 2 < max(_LEAST, 2 * J.shape[1]) or not np.std(e) > 0:
+        return None
+    h = whitening(e - e.mean())
+    columns = np.concatenate([e[:, None], J, drives], axis=1)
+    columns = columns - columns.mean(axis=0)
+    # Differences with the filter's own order left out have no samples from before the record.
+    white = np.stack([np.convolve(c, h)[ORDER : e.size] for c in columns.T], axis=1)
+    v = np.fft.rfft(white, axis=0)[1 : 1 + (n - 1) // 2]
+    # Of one size in all records: their noise differs.
+    v = v / np.sqrt(np.mean(np.abs(v[:, 0]) ** 2))
+    q = J.shape[1]
+    angles = 2.0 * np.pi * np.arange(1, len(v) + 1) / n
+    return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles)
+
+
+def strongest(
+    records: Sequence[Lines],
+    drives: Sequence[int],
+    bank: Sequence[tuple[float, float]],
+    *,
+    beside: Sequence[int] = (),
+    plain: bool = False,
+) -> Strongest:
+    """The strongest answer of the residual to a drive through a filter of a bank.
+
+    Args:
+        records: those of one output.
+        drives: columns of `Lines.drives` that are asked for.
+        bank: damping of the filters and the logarithm between their frequencies.
+        beside: columns whose answer through the same filter is taken off first.
+        plain: whether the drives are tried without any filter as well.
+    """
+    most = _LINES // len(records)
+    records = [Lines(*(v[:most] for v in record)) for record in records]
+    e, J, X, angles = (np.concatenate(v) for v in zip(*records, strict=True))
+    known = _span(_real(J))
+    white = _without(known, _real(e[:, None]))
+    freedom = 2 * e.size - known.shape[1]
+    filters = _filters(records, bank, plain)
+    back = np.exp(-1j * angles)
+    asked = _Asked(
+        np.stack([_filter(*one, angles) for one in filters]),
+        _complex(known),
+        np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
+        [_pair(X[:, i], back) for i in drives],
+    )
+    gains = _gains(asked, _complex(white))
+    k = int(np.argmax(gains))
+    gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
+    drive, one = drives[k % len(drives)], filters[k // len(drives)]
+    if not gain > _AT_LEAST:
+        return Strongest(gain, 1.0, drive, *one, np.zeros(J.shape[1]))
+    # The same phases for the same residual, whoever asks.
+    turns = np.random.default_rng(0).random((e.size, _SURROGATES))
+    anew = _without(known, _real(_complex(white) * np.exp(2j * np.pi * turns)))
+    anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
+    chance = _by_chance(gain, _gains(asked, _complex(anew)).max(axis=(0, 1)))
+    G = asked.filters[k // len(drives), :, None]
+    columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
+    return Strongest(gain, chance, drive, *one, _shift(_real(J), columns, _real(e[:, None])))
+
+
+class _Asked(NamedTuple):
+    """What is asked of a residual; columns stand before the filter."""
+
+    filters: Complex[np.ndarray, "F K"]
+    known: Complex[np.ndarray, "K q"]
+    """an orthonormal basis of the sensitivities; residuals have nothing of it"""
+    beside: Complex[np.ndarray, "K b"]
+    drives: list[Complex[np.ndarray, "K 2"]]
+
+
+def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray, "F d r"]:
+    """What the squares of each residual lose to each drive through each filter.
+
+    By products of columns, since the filters all act on the same ones: a basis for each filter and
+    drive would take ten times as long.
+    """
+    # In real numbers, of whose products only these are asked.
+    G = np.concatenate([np.real(asked.filters), np.imag(asked.filters)], axis=1)
+    power = np.real(asked.filters) ** 2 + np.imag(asked.filters) ** 2
+
+    def products(a: np.ndarray, b: np.ndarray, *, both: bool = False) -> np.ndarray:
+        """(F, a, b), of filtered columns a with columns b, these filtered too or not."""
+        each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
+        found = (
+            power @ np.real(each) if both else G @ np.concatenate([np.real(each), np.imag(each)])
+        )
+        return found.reshape(len(G), a.shape[1], b.shape[1])
+
+    n = asked.beside
+    known, right = products(n, asked.known), products(n, tried)
+    whole = products(n, n, both=True)
+    over = _inverse(whole - known @ _turned(known), whole)
+    out = np.zeros((len(G), len(asked.drives), tried.shape[1]))
+    for i, d in enumerate(asked.drives):
+        own = products(d, asked.known)
+        cross = products(n, d, both=True) - known @ _turned(own)
+        whole = products(d, d, both=True)
+        left = whole - own @ _turned(own) - _turned(cross) @ over @ cross
+        b = products(d, tried) - _turned(cross) @ over @ right
+        out[:, i] = np.sum(b * (_inverse(left, whole) @ b), axis=1)
+    return out
+
+
+def _turned(M: np.ndarray) -> np.ndarray:
+    return np.swapaxes(M, 1, 2)
+
+
+def _inverse(left: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Of what is left (F, n, n) of the columns' products, without directions of which next to
+    nothing is; whole: of the columns themselves."""
+    sizes = np.sqrt(np.maximum(np.einsum("fii->fi", whole), 1e-300))
+    values, V = np.linalg.eigh(left / (sizes[:, :, None] * sizes[:, None, :]))
+    kept = values > _SAME**2
+    over = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    V = V / sizes[:, :, None]
+    return V @ (over[:, :, None] * _turned(V))
+
+
+def _pair(x: np.ndarray, back: np.ndarray) -> Complex[np.ndarray, "K 2"]:
+    return np.stack([x, x * back], axis=1)
+
+
+def _by_chance(gain: float, others: Float[np.ndarray, " r"]) -> float:
+    """That a gain is one of the others, which are maxima of about exponential numbers."""
+    scale = float(np.std(others)) * np.sqrt(6.0) / np.pi
+    if not scale > 0:
+        return 1.0
+    middle = float(np.mean(others)) - _EULER * scale
+    return float(-np.expm1(-np.exp(-(gain - middle) / scale)))
+
+
+def _filters(
+    records: Sequence[Lines], bank: Sequence[tuple[float, float]], plain: bool
+) -> list[tuple[float, float]]:
+    """Dampings and frequencies [rad a sample], from two swings over the longest record on."""
+    low = 2.0 * min(float(record.angles[0]) for record in records)
+    high = 0.9 * max(float(record.angles[-1]) for record in records)
+    tried = [(np.inf, 0.0)] if plain else []
+    for damping, step in bank:
+        w = low
+        while w < high:
+            tried.append((damping, w))
+            # No finer than lines lie.
+            w *= np.exp(max(step, 0.25 * low / w))
+    return tried
+
+
+def _filter(damping: float, frequency: float, angles: np.ndarray) -> Complex[np.ndarray, " K"]:
+    if not np.isfinite(damping):
+        return np.ones(angles.size, complex)
+    turn = frequency * np.sqrt(max(1.0 - damping**2, 0.0))
+    pole, back = np.exp(-damping * frequency + 1j * turn), np.exp(-1j * angles)
+    return 1.0 / ((1.0 - pole * back) * (1.0 - np.conj(pole) * back))
+
+
+def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray, "K 2"]]:
+    """By record what the filter's states at its ends are driven by."""
+    columns, first = [], 0
+    for record in records:
+        here = np.zeros(back.size)
+        here[first : first + record.e.size] = 1.0
+        columns.append(_pair(here, back))
+        first += record.e.size
+    return columns
+
+
+def _shift(
+    J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
+) -> Float[np.ndarray, " q"]:
+    """The step of the unknowns beside further columns, less that without."""
+    columns = np.concatenate([J, more], axis=1)
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(sizes > 0, sizes, 1.0)
+    q = J.shape[1]
+    alone = np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-8)[0]
+    beside = np.linalg.lstsq(columns, e[:, 0], rcond=1e-8)[0][:q]
+    # e falls by J times the step.
+    return (alone - beside) / np.where(sizes[:q] > 0, sizes[:q], np.inf)
+
+
+def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:
+    return np.concatenate([np.real(v), np.imag(v)])
+
+
+def _complex(v: Float[np.ndarray, "K2 c"]) -> Complex[np.ndarray, "K c"]:
+    return v[: len(v) // 2] + 1j * v[len(v) // 2 :]
+
+
+def _without(basis: np.ndarray, v: np.ndarray) -> np.ndarray:
+    # Twice: the first time leaves rounding of columns that nearly lie in the basis.
+    for _ in range(2):
+        v = v - basis @ (basis.T @ v)
+    return v
+
+
+def _span(columns: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the columns."""
+    sizes = np.linalg.norm(columns, axis=0)
+    # Of its triangle, whose singular values are the same.
+    Q, R = np.linalg.qr(columns[:, sizes > 0] / sizes[sizes > 0])
+    U, values, _ = np.linalg.svd(R)
+    return Q @ U[:, : values.size][:, values > _SAME]

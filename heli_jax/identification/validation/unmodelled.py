@@ -1,0 +1,283 @@
+"""What a model lacks, asked of its residuals: a mode, or an answer that depends on amplitude.
+
+Of every output the residual in time is tested against the inputs through a bank of filters, beyond
+what the sensitivities explain (`score_test`): the simulation and its residual are there by any
+method. Then against cubes and signed squares of inputs, of the simulated output and of its rate,
+beyond what the input through the same filter explains: a saturation, a rate limit and a deadband
+answer large and small inputs differently, and no linear model does.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from heli_jax import naming
+from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.identification.estimation.estimator import Evaluation
+from heli_jax.identification.estimation.evaluation import simulated_outputs
+from heli_jax.identification.estimation.measured_signals import signals
+from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
+from heli_jax.identification.result import Estimate
+from heli_jax.identification.unknowns.layout import Solution
+from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.score_test import (
+    BROAD,
+    NARROW,
+    Lines,
+    Strongest,
+    lines_of,
+    strongest,
+)
+
+LEVEL = 0.01
+"""of all outputs and both questions together"""
+_MATTERS = 0.5
+"""standard deviations of an estimate by which a significant misfit has to move it to count: with
+less a 95 % interval still holds the truth in 92 of 100 cases"""
+_FLIGHTS = 6
+"""that are looked at, the longest"""
+_DIVERGED = -10.0
+"""VAF of a simulation below which its residual says nothing"""
+_ROUNDING = 1e-5
+"""part of an output's sd below which its residual is no noise"""
+_STEP = 1e-4
+"""of an unknown's coordinate, for differences"""
+
+
+class Unmodelled(NamedTuple):
+    """What the residual of one output follows beyond chance."""
+
+    output: str
+    input: str
+    """that drives it; empty of what the output itself drives"""
+    by_amplitude: bool
+    """whether it is an answer that depends on amplitude; else one that is linear"""
+    frequency: float
+    """of the filter that explains most [rad/s]; 0 of none"""
+    damping: float
+    p_value: float
+    gain: float
+    """of twice the log-likelihood"""
+    moved: Mapping[str, float]
+    """by estimate how far it moves where that is in the model, in its standard deviations"""
+
+    @property
+    def matters(self) -> bool:
+        """Whether some estimate moves by a good part of its interval, or none has one."""
+        # What depends on amplitude changes what an estimate means, whatever the fit makes of it.
+        if self.by_amplitude or not self.moved:
+            return True
+        return max(abs(v) for v in self.moved.values()) > _MATTERS
+
+    @property
+    def words(self) -> str:
+        """What is missing, in a few words."""
+        if self.by_amplitude:
+            return f"the response of {self.output} depends on amplitude"
+        return f"the residual of {self.output} still follows {self.input}{self._where}"
+
+    @property
+    def _where(self) -> str:
+        return f" near {self.frequency:.2g} rad/s" if self.damping < 1.0 else ""
+
+    @property
+    def sentence(self) -> str:
+        """For the notes of a fit."""
+        chance = f"twice the log-likelihood gains {self.gain:.3g}, p {self.p_value:.1g}"
+        if self.by_amplitude:
+            said = (
+                f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
+                "rate limit, a deadband or another nonlinearity is missing."
+            )
+        else:
+            what = "a mode or a lag" if self.damping < 1.0 else "dynamics"
+            said = (
+                f"The residual of {self.output} follows {self.input} through {what}"
+                f"{self._where} ({chance}), which the model lacks; if it has them, is this a poor "
+                "optimum? Several starts (fit.starts) tell."
+            )
+        if not self.matters:
+            return f"{said} It moves no estimate by more than {_MATTERS:g} sd."
+        return f"{said} No interval allows for what that does to the estimates."
+
+
+def unmodelled(
+    at: Solution, e: Evaluation, estimates: Mapping[str, Estimate]
+) -> tuple[Unmodelled, ...]:
+    """What the residuals follow beyond chance, by output at most one.
+
+    Of outputs with gaps, of a simulation that left the record, of windows and of sensors compared
+    with each other nothing is asked. Whoever asks has seen to it that inputs do not follow the
+    response: through a loop disturbances are in the inputs, and any residual follows these.
+
+    Args:
+        at: where the fit ended.
+        e: what that tells.
+        estimates: of interest, with their standard deviations.
+    """
+    layout = at.layout
+    if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
+        return ()
+    flights = _longest(at)
+    names = sorted({n for i in flights for n in layout.outputs[i] if _usable(at, e, i, n)})
+    if not names:
+        return ()
+    J = _sensitivities(at, e)
+    found = []
+    for name in names:
+        one = _of_output(at, e, name, [i for i in flights if _usable(at, e, i, name)], J)
+        # Of two answers the better one: each takes up a part of the other.
+        one = max(one, key=lambda f: f[0].statistic, default=None)
+        if one is not None and one[0].p_value < LEVEL / (2 * len(names)):
+            found.append(_said(at, e, name, one, estimates))
+    return tuple(found)
+
+
+def with_unmodelled(adequacy: Adequacy, found: tuple[Unmodelled, ...]) -> Adequacy:
+    """The adequacy, no plain yes where something that matters is missing.
+
+    Args:
+        adequacy: as judged by size and whiteness, or in frequency.
+        found: of `unmodelled`.
+    """
+    if not found:
+        return adequacy
+    adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in found)))
+    words = [adequacy.limited] if adequacy.limited else []
+    words += [f.words for f in found if f.matters]
+    return adequacy._replace(limited="; ".join(words))
+
+
+def _longest(at: Solution) -> list[int]:
+    """The flights that are looked at, of one sample time: the bank's filters are of samples."""
+    flights = at.data.flights
+    sizes = [next(iter(f.outputs.values())).shape[0] for f in flights]
+    order = np.argsort(sizes, kind="stable")[::-1].tolist()
+    dt = float(flights[order[0]].dt)
+    return sorted([i for i in order if np.isclose(float(flights[i].dt), dt)][:_FLIGHTS])
+
+
+def _usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
+    if name not in at.layout.outputs[i]:
+        return False
+    y, left = np.asarray(at.data.flights[i].outputs[name]), np.asarray(e.raw[i][name])
+    if not (np.isfinite(y).all() and np.isfinite(left).all() and np.std(y) > 0):
+        return False
+    with np.errstate(over="ignore"):
+        size = float(np.std(left) / np.std(y))
+    return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
+
+
+def _sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
+    """By flight and output (N, q) the derivative of the residual by all unknowns."""
+    layout, data, noise, z = at
+    if layout.estimator is OUTPUT_ERROR:
+        rows, J = {}, np.asarray(e.J)
+        first = 0
+        for i, n in signals(layout):
+            count = data.flights[i].outputs[n].shape[0]
+            rows[i, n] = J[first : first + count] * float(noise.sd[i][n])
+            first += count
+        return rows
+    # By differences of the simulation, whose program is there: a Jacobian would compile another.
+    z = np.asarray(z)
+    blocks = _blocks(at)
+    common = [np.array([k]) for k in range(layout.first_nuisance)]
+    longest = max((b.size for b in blocks), default=0)
+    # Each flight's own unknowns move at once: none is felt by another flight.
+    own = [np.array([b[k] for b in blocks if k < b.size]) for k in range(longest)]
+    before = simulated_outputs(layout, data, jnp.asarray(z))
+    slopes = {(i, n): np.zeros((before[i][n].size, z.size)) for i, n in signals(layout)}
+    step = _STEP if z.dtype == np.float64 else np.sqrt(_STEP)
+    for columns in (*common, *own):
+        there = z.copy()
+        there[columns] += step
+        after = simulated_outputs(layout, data, jnp.asarray(there))
+        for i, n in signals(layout):
+            for k in columns:
+                if k < layout.first_nuisance or k in blocks[i]:
+                    slopes[i, n][:, k] = (before[i][n] - after[i][n]) / step
+    return slopes
+
+
+def _blocks(at: Solution) -> list[np.ndarray]:
+    """By flight where in z its own unknowns stand."""
+    layout, first, out = at.layout, at.layout.first_nuisance, []
+    for (count, _), outputs in zip(layout.windows, layout.outputs, strict=True):
+        size = count * len(layout.states) + layout.constants(outputs)
+        out.append(np.arange(first, first + size))
+        first += size
+    return out
+
+
+def _of_output(
+    at: Solution,
+    e: Evaluation,
+    name: str,
+    flights: list[int],
+    J: Mapping[tuple[int, str], np.ndarray],
+) -> list[tuple[Strongest, bool]]:
+    """The strongest linear answer and the strongest that depends on amplitude, as there are."""
+    moving = _moving(at)
+    lines: list[Lines] = []
+    for i in flights:
+        one = lines_of(np.asarray(e.raw[i][name]), J[i, name], _drives(at, e, i, name, moving))
+        lines += [] if one is None else [one]
+    if not lines or not moving:
+        return []
+    m = len(moving)
+    linear = strongest(lines, range(m), NARROW)
+    curved = strongest(
+        lines, range(m, lines[0].drives.shape[1]), BROAD, beside=range(m), plain=True
+    )
+    return [(linear, False), (curved, True)]
+
+
+def _moving(at: Solution) -> list[str]:
+    """The inputs that move in some flight."""
+    flights = [naming.asdict(f.inputs) for f in at.data.flights]
+    return [n for n in flights[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in flights)]
+
+
+def _drives(at: Solution, e: Evaluation, i: int, name: str, moving: list[str]) -> np.ndarray:
+    """The inputs that move, then what is not linear of these, of the output and of its rate."""
+    inputs = naming.asdict(at.data.flights[i].inputs)
+    u = [_normal(np.asarray(inputs[n])) for n in moving]
+    y = np.asarray(e.simulated[i][name])
+    shapes = [*u, _normal(y), _normal(np.gradient(y))]
+    curved = [w for v in shapes for w in (v**3, np.abs(v) * v)]
+    return np.stack([*u, *curved], axis=1)
+
+
+def _normal(v: np.ndarray) -> np.ndarray:
+    v = v - v.mean()
+    size = float(np.std(v))
+    return v / size if size > 0 else v
+
+
+def _said(
+    at: Solution,
+    e: Evaluation,
+    name: str,
+    one: tuple[Strongest, bool],
+    estimates: Mapping[str, Estimate],
+) -> Unmodelled:
+    strong, by_amplitude = one
+    moving, moved = _moving(at), {}
+    for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
+        sd = estimates[parameter].sd if parameter in estimates else None
+        if sd:
+            moved[parameter] = float(strong.shift[k] * slope / sd)
+    dt = float(at.data.flights[_longest(at)[0]].dt)
+    return Unmodelled(
+        name,
+        moving[strong.drive] if strong.drive < len(moving) else "",
+        by_amplitude,
+        strong.frequency / dt,
+        strong.damping,
+        strong.p_value,
+        strong.statistic,
+        moved,
+    )
