@@ -153,11 +153,9 @@ def _opened(
         {**own, **{n: s for also in options.also for n, s in getattr(also, role).items()}}
         for role, own in (("inputs", inputs), ("outputs", outputs))
     ]
+    signals = request.signals
     both = [
-        {
-            n: request.signals[n, kind] if (n, kind) in request.signals else s
-            for n, s in of_kind.items()
-        }
+        {n: s if s.constant is not None else signals[n, kind] for n, s in of_kind.items()}
         for kind, of_kind in zip(("input", "output"), asked, strict=True)
     ]
     return logs, request, functools.partial(
