@@ -216,7 +216,9 @@ def assemble(
         numbers = _numbers(problem, solution, e, errors, absent)
         estimates = {k: numbers.of_interest[k] for k in layout.free}
     elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
-        adequacy = with_unmodelled(adequacy, unmodelled(solution, e, numbers.of_interest))
+        in_colour = errors.coloured and not layout.estimator.noise_spectrum
+        lacking = unmodelled(solution, e, numbers.of_interest, coloured=in_colour)
+        adequacy = with_unmodelled(adequacy, lacking)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False

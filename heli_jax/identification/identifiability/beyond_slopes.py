@@ -29,6 +29,8 @@ _WIDE, _WIDE_IN_A_VALLEY = 0.2, 0.1
 any parameter, and of one that lies along a valley with another"""
 _VALLEY = 0.9
 """correlation beyond which two parameters lie along a valley, which bends"""
+_INFLATED = 1.5
+"""factor by which autocorrelated residuals may make intervals wider"""
 _AS_EXPECTED = 1.15
 """factor by which the root of what is lost may differ from what the slopes say: the interval of the
 slopes is then as wide as that of the likelihood within about as much"""
@@ -88,14 +90,19 @@ def beyond_slopes(
     lacking = {*verdict.undetermined, *verdict.without_effect}
     sd = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
     n = len(sd)
-    valley = np.abs(np.where(np.eye(n), 0.0, verdict.correlation)).max(1, initial=0.0) > _VALLEY
+    related = np.abs(np.where(np.eye(n), 0.0, verdict.correlation)).max(1, initial=0.0)
+    # A disturbance makes intervals wide, of which it is said elsewhere, and leaves a likelihood of
+    # white residuals that means little.
+    least = np.where(related > _VALLEY, _WIDE_IN_A_VALLEY, _WIDE)
+    asked = (reaches[:n] < _INFLATED * Z95) | (related > _TOGETHER)
     wide = [
         (i, u)
         for i, u in enumerate(unknowns_of(problem, at.layout, e))
         if u.name in problem.free
         and (u.logarithmic or u.symmetric)
         and not (u.name in lacking or u.at_bound)
-        and sd[i] * reaches[i] > Z95 * (_WIDE_IN_A_VALLEY if valley[i] else _WIDE)
+        and asked[i]
+        and sd[i] * reaches[i] > Z95 * least[i]
     ]
     if not wide or not (np.isfinite(e.r).all() and np.isfinite(e.J).all()):
         return AS_SLOPES

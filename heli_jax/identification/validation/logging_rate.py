@@ -20,6 +20,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.aliases import SHOWS, modes_about
 from heli_jax.identification.validation.finding import Finding, Severity
+from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.numbers import number
 
 HOPELESS, ENOUGH = 2.0, 5.0
@@ -140,7 +141,9 @@ def _of_inputs(label: str, flight: Flight, modes: list[_Mode], where: str) -> li
     for name, u in flight.inputs.items():
         rate = input_rate(flight, name, u)
         felt = [mode for mode in modes if mode.input == name]
-        if rate is None or not felt:
+        # Dropouts move a stick that rests between them, and are said where signals are judged.
+        dropped = facts_of(flight)[name, "input"].dropouts is not None
+        if rate is None or not felt or dropped:
             continue
         fastest = max(felt, key=lambda mode: mode.hz)
         ratio = rate / fastest.hz

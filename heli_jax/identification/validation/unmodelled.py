@@ -31,8 +31,9 @@ from heli_jax.identification.validation.score_test import (
     strongest,
 )
 
-LEVEL = 0.01
-"""of all outputs and both questions together"""
+LEVEL, IN_COLOUR = 0.01, 1e-3
+"""of all outputs and both questions together; and where residuals in time are autocorrelated, as in
+strong gusts: what whitens them is then too short to leave nothing"""
 _MATTERS = 0.5
 """standard deviations of an estimate by which a significant misfit has to move it to count: with
 less a 95 % interval still holds the truth in 92 of 100 cases"""
@@ -104,7 +105,7 @@ class Unmodelled(NamedTuple):
 
 
 def unmodelled(
-    at: Solution, e: Evaluation, estimates: Mapping[str, Estimate]
+    at: Solution, e: Evaluation, estimates: Mapping[str, Estimate], *, coloured: bool = False
 ) -> tuple[Unmodelled, ...]:
     """What the residuals follow beyond chance, by output at most one.
 
@@ -116,8 +117,9 @@ def unmodelled(
         at: where the fit ended.
         e: what that tells.
         estimates: of interest, with their standard deviations.
+        coloured: whether the residuals in time are autocorrelated.
     """
-    layout = at.layout
+    layout, level = at.layout, IN_COLOUR if coloured else LEVEL
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return ()
     flights = _longest(at)
@@ -130,7 +132,7 @@ def unmodelled(
         one = _of_output(at, e, name, [i for i in flights if _usable(at, e, i, name)], J)
         # Of two answers the better one: each takes up a part of the other.
         one = max(one, key=lambda f: f[0].statistic, default=None)
-        if one is not None and one[0].p_value < LEVEL / (2 * len(names)):
+        if one is not None and one[0].p_value < level / (2 * len(names)):
             found.append(_said(at, e, name, one, estimates))
     return tuple(found)
 
