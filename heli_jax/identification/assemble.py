@@ -217,7 +217,8 @@ def assemble(
         estimates = {k: numbers.of_interest[k] for k in layout.free}
     elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
-        lacking = unmodelled(solution, e, numbers.of_interest, coloured=in_colour)
+        sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
+        lacking = unmodelled(solution, e, sds, coloured=in_colour)
         adequacy = with_unmodelled(adequacy, lacking)
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.

@@ -19,7 +19,6 @@ from heli_jax.identification.estimation.estimator import Evaluation
 from heli_jax.identification.estimation.evaluation import simulated_outputs
 from heli_jax.identification.estimation.measured_signals import signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
-from heli_jax.identification.result import Estimate
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.score_test import (
@@ -105,7 +104,7 @@ class Unmodelled(NamedTuple):
 
 
 def unmodelled(
-    at: Solution, e: Evaluation, estimates: Mapping[str, Estimate], *, coloured: bool = False
+    at: Solution, e: Evaluation, sds: Mapping[str, float | None], *, coloured: bool = False
 ) -> tuple[Unmodelled, ...]:
     """What the residuals follow beyond chance, by output at most one.
 
@@ -116,7 +115,7 @@ def unmodelled(
     Args:
         at: where the fit ended.
         e: what that tells.
-        estimates: of interest, with their standard deviations.
+        sds: of the estimates of interest, as they are reported.
         coloured: whether the residuals in time are autocorrelated.
     """
     layout, level = at.layout, IN_COLOUR if coloured else LEVEL
@@ -133,7 +132,7 @@ def unmodelled(
         # Of two answers the better one: each takes up a part of the other.
         one = max(one, key=lambda f: f[0].statistic, default=None)
         if one is not None and one[0].p_value < level / (2 * len(names)):
-            found.append(_said(at, e, name, one, estimates))
+            found.append(_said(at, e, name, one, sds))
     return tuple(found)
 
 
@@ -264,12 +263,12 @@ def _said(
     e: Evaluation,
     name: str,
     one: tuple[Strongest, bool],
-    estimates: Mapping[str, Estimate],
+    sds: Mapping[str, float | None],
 ) -> Unmodelled:
     strong, by_amplitude = one
     moving, moved = _moving(at), {}
     for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
-        sd = estimates[parameter].sd if parameter in estimates else None
+        sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
     dt = float(at.data.flights[_longest(at)[0]].dt)
