@@ -294,13 +294,16 @@ def _setting_lines(flight: LogInfo) -> Iterator[str]:
 
 
 def _nan_share(channel: ColumnInfo) -> float:
-    return channel.n_nan / channel.count if channel.count else 0.0
+    return channel.n_nan / channel.rows if channel.rows else 0.0
 
 
 def _share(channel: ColumnInfo) -> str:
     share = 100 * _nan_share(channel)
     # A single one of a million is not none.
-    return "0" if not channel.n_nan else f"{share:.2g}" if share >= 0.01 else "<.01"
+    if not channel.n_nan:
+        return "0"
+    # Of 99.5 and more two digits would be an exponent.
+    return "<.01" if share < 0.01 else f"{share:.2g}" if share < 99.5 else f"{share:.3g}"
 
 
 def _number(value: float) -> str:

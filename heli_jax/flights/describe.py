@@ -64,6 +64,8 @@ class ColumnInfo:
     """as the log states it; empty where it does not"""
     strays: str = ""
     """of text that is numbers but for some cells, which these are"""
+    rows: int = 0
+    """of numbers, with those that are missing"""
 
 
 @dataclass(frozen=True)
@@ -282,7 +284,8 @@ def _describe_column(survey: Survey, unit: str = "") -> ColumnInfo:
     if x.size:
         with np.errstate(all="ignore"):  # a sum of huge numbers may overflow
             numbers = (float(x.min()), float(x.max()), float(x.mean()), float(x.std()))
-    return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers, unit)
+    rows = survey.values.size
+    return ColumnInfo(survey.name, "number", survey.n_filled, n_nan, *numbers, unit, rows=rows)
 
 
 def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Signal:

@@ -292,3 +292,16 @@ def test_an_unknown_unit_of_time_names_those_of_time(tmp_path, capsys):
     asked = ["info", path, "--time-unit"]
     refused(capsys, [*asked, "foo"], "unknown unit of time 'foo'; known are min, ms, ns, s")
     refused(capsys, [*asked, "deg"], "unit 'deg' is an angle, expected a time")
+
+
+def test_the_share_that_is_missing_is_of_all_rows(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    rows = [f"{0.1 * k:.1f},{k if k % 2 else ''},{'' if k % 4 else k}," for k in range(100)]
+    path.write_text("\n".join(["t,half,quarter,none", *rows]) + "\n")
+    assert main(["info", str(path), "--json"]) == 0
+    [flight] = json.loads(capsys.readouterr().out)["flights"]
+    shares = {c["name"]: c["nan_share"] for c in flight["topics"][0]["channels"]}
+    assert shares == {"t": 0.0, "half": 0.5, "quarter": 0.75, "none": 1.0}
+    assert main(["info", str(path)]) == 0
+    said = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines()[-4:]}
+    assert said == {"t": "0", "half": "50", "quarter": "75", "none": "100"}
