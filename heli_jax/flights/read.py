@@ -155,7 +155,7 @@ def _opened(
     ]
     signals = request.signals
     both = [
-        {n: s if s.constant is not None else signals[n, kind] for n, s in of_kind.items()}
+        {**of_kind, **{n: signals[n, kind] for n in of_kind if (n, kind) in signals}}
         for kind, of_kind in zip(("input", "output"), asked, strict=True)
     ]
     return logs, request, functools.partial(
