@@ -309,7 +309,7 @@ def _sweep(options: argparse.Namespace) -> int:
     _prepare_jax()
     import jax
 
-    from heli_jax.sweeps.cores import cores
+    from heli_jax.numerics.cores import cores
 
     # Each core a device of its own; where there are GPUs they are the devices. Once JAX is in use
     # their number stays as it is.

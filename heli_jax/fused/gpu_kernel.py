@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heli_jax.fused.program import Argument, Run
+from heli_jax.fused.program import Argument, Run, whole
 from heli_jax.fused.ptx import ptx
 
 # `Any` below: devices of JAX, whose class type checkers do not take for one.
@@ -57,7 +57,7 @@ class GpuKernel:
         Args:
             stays: as the run has them; those that are not shared with the vehicles as their last
                 dimension.
-            stored: arrays (N, ...).
+            stored: arrays (N, ...), or (N, vehicles) where each vehicle has its own.
             carry: before the first sample, with the vehicles as the last dimension.
 
         Returns:
@@ -68,7 +68,8 @@ class GpuKernel:
         """
         count = carry[0].shape[-1]
         results = _memory(self._device, count, tuple((r.shape, r.dtype) for r in self._results))
-        kinds = (self._run.stays, self._run.stored, self._run.carry, self._results)
+        run = self._run
+        kinds = (run.stays, whole(run.stored), run.carry, self._results)
         given = [jax.device_put(list(part), self._device) for part in (stays, stored, carry)]
         tables = [
             self._table(_pointers(arrays, count, kind))
@@ -78,7 +79,7 @@ class GpuKernel:
         jax.block_until_ready((given, results, tables))
         few = count < self._gpu.processors * _THREADS
         threads = _FEW if few else _THREADS
-        arguments = [*(t.unsafe_buffer_pointer() for t in tables), 0, count]
+        arguments = [*(t.unsafe_buffer_pointer() for t in tables), 0, count, count]
         self._call(-(-count // threads), threads, arguments)
         return results
 

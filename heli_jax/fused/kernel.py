@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.fused.code import Target
-from heli_jax.fused.program import Argument, Run, write
+from heli_jax.fused.program import Argument, Run, whole, write
 
 
 def lanes_for(dtype: np.dtype) -> int:
@@ -35,7 +35,7 @@ class Kernel:
         self.assembly, self._results = write(run, Target(lanes))
         self._engine = _compiled(self.assembly)
         pointer, size = ctypes.c_void_p, ctypes.c_int64
-        kind = ctypes.CFUNCTYPE(None, *([pointer] * 4), size, size)
+        kind = ctypes.CFUNCTYPE(None, *([pointer] * 4), size, size, size)
         self._call = kind(self._engine.get_function_address("run"))
 
     def __call__(
@@ -50,7 +50,7 @@ class Kernel:
         Args:
             stays: as the run has them; those that are not shared with the vehicles as their last
                 dimension.
-            stored: arrays (N, ...).
+            stored: arrays (N, ...), or (N, vehicles) where each vehicle has its own.
             carry: before the first sample, with the vehicles as the last dimension.
             threads: how many share the vehicles.
 
@@ -63,14 +63,14 @@ class Kernel:
         # Kept until the call is over: the program has pointers to them.
         given = [[np.ascontiguousarray(v) for v in part] for part in (stays, stored, carry)]
         results = [np.empty((*r.shape, count), r.dtype) for r in self._results]
-        kinds = (self._run.stays, self._run.stored, self._run.carry)
+        kinds = (self._run.stays, whole(self._run.stored), self._run.carry)
         tables = [_pointers(v, count, kind) for v, kind in zip(given, kinds, strict=True)]
         ends = _pointers(results, count, self._results)
         blocks = count // self.lanes
         shares = np.linspace(0, blocks, min(threads, blocks) + 1).astype(int) * self.lanes
 
         def part(k: int) -> None:
-            self._call(*tables, ends, int(shares[k]), int(shares[k + 1]))
+            self._call(*tables, ends, int(shares[k]), int(shares[k + 1]), count)
 
         # Threads of Python: the call gives its lock away.
         if len(shares) == 2:

@@ -10,6 +10,8 @@ from heli_jax.fused.code import Code, UnsupportedError, Value, constant
 MOST = 4096
 """Elements of an array that is taken apart; more would take
 minutes to compile."""
+LONG = 64
+"""elements above which an array that repeats one number is not taken apart"""
 INDEX = np.dtype(np.int32)
 """of indices into arrays, and of passes of a loop"""
 

@@ -30,18 +30,23 @@ class Run(NamedTuple):
     stays: tuple[Argument, ...]
     """what does not change over the samples"""
     stored: tuple[Argument, ...]
-    """arrays (N, ...) that all vehicles share, read by the sample"""
+    """arrays (N, ...), read by the sample; of those that are not shared each vehicle has its own"""
     carry: tuple[Argument, ...]
     samples: int
     """N, two at least"""
+
+
+def whole(stored: Sequence[Argument]) -> list[Argument]:
+    """The same with one pointer each: those of vehicles' own are read sample by sample too."""
+    return [argument._replace(shared=True) for argument in stored]
 
 
 class Text(NamedTuple):
     """A program in LLVM's language: of one function, `run`.
 
     Its arguments are four tables of pointers (what stays, what is stored, the carry, the results:
-    one for each array that is shared, one for each row of the others, where a row has a number of
-    each vehicle), and between which vehicles it is to compute.
+    one for each array that is shared or stored, one for each row of the others, where a row has a
+    number of each vehicle), between which vehicles it is to compute, and how many there are.
     """
 
     assembly: str
@@ -93,7 +98,7 @@ def write(run: Run, target: Target) -> Text:
     head = [f"{name} = {text}" for name, text in code.globals.items()]
     head += code.declared.values()
     tables = ", ".join(f"{code.memory} %{n}" for n in ("stays", "stored", "carry", "results"))
-    arguments = f"{tables}, i64 %begin, i64 %end"
+    arguments = f"{tables}, i64 %begin, i64 %end, i64 %count"
     body = "\n".join(code.lines)
     # Without the attributes LLVM would take half of AVX-512's width.
     attributes = '"prefer-vector-width"="512" "min-legal-vector-width"="512"'
@@ -139,15 +144,29 @@ def _stored(code: Code, arguments: Sequence[Argument]) -> list[Stored]:
     for i, argument in enumerate(arguments):
         if len(argument.shape) != 1:
             raise UnsupportedError(f"a record of shape {argument.shape}")
-        pointer = code.pointer("%stored", i)
-        made.append(
-            Stored(
-                argument.shape,
-                argument.dtype,
-                lambda at, p=pointer, d=argument.dtype: code.load(p, at[0], d),
+        pointer, dtype = code.pointer("%stored", i), argument.dtype
+        if argument.shared:
+            made.append(
+                Stored(argument.shape, dtype, lambda at, p=pointer, d=dtype: code.load(p, at[0], d))
             )
-        )
+        else:
+            made.append(
+                Stored(
+                    argument.shape, dtype, lambda at, p=pointer, d=dtype: _own(code, p, at[0], d)
+                )
+            )
     return made
+
+
+def _own(code: Code, pointer: str, index: Value, dtype: np.dtype) -> Value:
+    """The vehicles' own numbers at one sample of arrays (N, vehicles)."""
+    if not index.shared:
+        raise UnsupportedError("an index that is not the same for all vehicles")
+    wide, first, place = (code.register() for _ in range(3))
+    code.write(f"{wide} = sext {type_of(index.dtype)} {index.operand} to i64")
+    code.write(f"{first} = mul i64 {wide}, %count")
+    code.write(f"{place} = add i64 {first}, %b")
+    return _vector(code, pointer, place, dtype)
 
 
 def _tables(
@@ -178,21 +197,23 @@ def _tables(
 def _of_row(code: Code, argument: Argument, pointers: list[str]) -> Elements:
     """The vehicles' own numbers, a vector each."""
     values = np.empty(argument.shape, object)
-    kind = type_of(argument.dtype)
-    kept = "i8" if kind == "i1" else kind
     for pointer, at in zip(pointers, np.ndindex(argument.shape), strict=True):
-        place = code.register()
-        code.write(f"{place} = getelementptr {kept}, {code.memory} {pointer}, i64 %b")
-        size = 1 if kind == "i1" else argument.dtype.itemsize
-        vector = code.vector(kept)
-        value = code.made(
-            f"load {vector}, {code.memory} {place}, align {size}", argument.dtype, False
-        )
-        if kind == "i1":
-            wide = f"trunc {vector} {value.operand} to {code.vector('i1')}"
-            value = code.made(wide, argument.dtype, False)
-        values[at] = value
+        values[at] = _vector(code, pointer, "%b", argument.dtype)
     return values
+
+
+def _vector(code: Code, pointer: str, first: str, dtype: np.dtype) -> Value:
+    """A number of each vehicle, from the first on."""
+    kind = type_of(dtype)
+    kept, size = ("i8", 1) if kind == "i1" else (kind, dtype.itemsize)
+    place = code.register()
+    code.write(f"{place} = getelementptr {kept}, {code.memory} {pointer}, i64 {first}")
+    right = f"load {code.vector(kept)}, {code.memory} {place}, align {size}{code.unchanging}"
+    value = code.made(right, dtype, False)
+    if kind != "i1":
+        return value
+    wide = f"trunc {code.vector(kept)} {value.operand} to {code.vector('i1')}"
+    return code.made(wide, dtype, False)
 
 
 def _store(code: Code, value: Value, row: str) -> None:

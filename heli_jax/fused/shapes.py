@@ -9,6 +9,7 @@ import numpy as np
 from heli_jax.fused.code import Code, UnsupportedError, Value, constant
 from heli_jax.fused.operands import (
     INDEX,
+    LONG,
     MOST,
     Elements,
     Operand,
@@ -100,7 +101,10 @@ def _cut(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
 
 def _broadcast(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     operand, shape, places = inputs[0], tuple(params["shape"]), params["broadcast_dimensions"]
-    if int(np.prod(shape)) > MOST or isinstance(operand, Stored):
+    size = int(np.prod(shape))
+    # One number along a record is that number wherever it is read.
+    along = size > LONG and int(np.prod(operand.shape)) == 1
+    if size > MOST or along or isinstance(operand, Stored):
         zero = constant(0, INDEX)
 
         def element(at: tuple[Value, ...]) -> Value:

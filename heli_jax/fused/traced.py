@@ -1,12 +1,13 @@
 """A run of one element, taken apart: what is computed once, and what at every sample."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.extend import core
 
+from heli_jax.fused.code import UnsupportedError
 from heli_jax.fused.program import Argument, Run
 from heli_jax.numerics.hoist import hoisted
 
@@ -14,7 +15,7 @@ from heli_jax.numerics.hoist import hoisted
 
 
 type Making = Callable[[Any, Any, Any], Any]
-"""of (what all elements share, records (N, ...) that all share, what an element has of its own): a
+"""of (what all elements share, records (N, ...), what an element has of its own): a
 run in its steps, with `carry`, `step` and `last` as `heli_jax.simulation.accumulate.Samples` has
 them"""
 
@@ -54,14 +55,22 @@ class Traced(NamedTuple):
         return [next(of_own) if varying else next(of_common) for varying in self.varies]
 
 
-def traced(making: Making, shared: Any, records: Any, element: Any) -> Traced:
+def traced(
+    making: Making,
+    shared: Any,
+    records: Any,
+    element: Any,
+    own_records: Sequence[bool] | None = None,
+) -> Traced:
     """Trace a run.
 
     Args:
         making: the steps of an element.
         shared: what all elements share, but for records.
-        records: arrays (N, ...) that all elements share, read by the sample.
+        records: arrays (N, ...) that are read by the sample.
         element: an example of what an element has of its own.
+        own_records: of each leaf of the records whether every element has another; none unless
+            given.
 
     Raises:
         UnsupportedError: a part of it has no translation.
@@ -95,9 +104,15 @@ def traced(making: Making, shared: Any, records: Any, element: Any) -> Traced:
 
     closed, shape = jax.make_jaxpr(begin, return_shape=True)(shared, records, element)
     carried, stay = (jax.tree.leaves(part) for part in shape)
-    n_shared = len(jax.tree.leaves((shared, records)))
-    varies = _vary(closed.jaxpr, n_shared)[len(carried) :]
     rows = [np.asarray(v) for v in jax.tree.leaves(records)]
+    own_records = [False] * len(rows) if own_records is None else list(own_records)
+    n_shared = len(jax.tree.leaves(shared))
+    n_common = n_shared + len(rows)
+    arguments = closed.jaxpr.invars
+    of_records = zip(arguments[n_shared:n_common], own_records, strict=True)
+    if any(_vary(closed.jaxpr, [v for v, own in of_records if own])):
+        raise UnsupportedError("what begins with a record of each element's own")
+    varies = _vary(closed.jaxpr, arguments[n_common:])[len(carried) :]
     run = Run(
         found["step"],
         found["last"],
@@ -105,16 +120,16 @@ def traced(making: Making, shared: Any, records: Any, element: Any) -> Traced:
             Argument(v.shape, np.dtype(v.dtype), not varying)
             for v, varying in zip(stay, varies, strict=True)
         ),
-        tuple(Argument(v.shape, v.dtype, True) for v in rows),
+        tuple(Argument(v.shape, v.dtype, not o) for v, o in zip(rows, own_records, strict=True)),
         tuple(Argument(v.shape, np.dtype(v.dtype), False) for v in carried),
         rows[0].shape[0],
     )
     return Traced(run, found["results"], closed)
 
 
-def _vary(jaxpr: Any, n_shared: int) -> list[bool]:
-    """Of each result whether it depends on more than the first arguments."""
-    own = set(jaxpr.invars[n_shared:])
+def _vary(jaxpr: Any, arguments: Sequence[Any]) -> list[bool]:
+    """Of each result whether it depends on these arguments."""
+    own = set(arguments)
     for equation in jaxpr.eqns:
         # A literal has no hash, and depends on nothing.
         if any(not hasattr(v, "val") and v in own for v in equation.invars):

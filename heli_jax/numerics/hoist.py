@@ -13,6 +13,10 @@ from jax.extend.core import Literal
 from jaxtyping import PyTree
 
 
+_LONG = 64
+"""numbers: more are no state's or output's, but a record's"""
+
+
 def hoisted(
     function: Callable[..., Any], params: PyTree, *others: PyTree
 ) -> tuple[list[Any], Callable[..., Any]]:
@@ -37,7 +41,7 @@ def hoisted(
     # compute, waits.
     for equation in jaxpr.eqns:
         inputs = [v for v in equation.invars if not isinstance(v, Literal)]
-        if equation.effects or not all(v in known for v in inputs):
+        if equation.effects or not all(v in known for v in inputs) or _spread(equation):
             later.append(equation)
             continue
         alone = jaxpr.replace(
@@ -57,3 +61,13 @@ def hoisted(
         return jax.tree.unflatten(structure, leaves)
 
     return [known[v] for v in kept], remaining
+
+
+def _spread(equation: Any) -> bool:
+    """Whether one number is repeated along a record, as one that is added to it: that costs nothing
+    where it is read, and a record's memory where it is kept."""
+    return (
+        equation.primitive.name == "broadcast_in_dim"
+        and equation.invars[0].aval.size == 1
+        and equation.outvars[0].aval.size > _LONG
+    )

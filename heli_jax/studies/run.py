@@ -14,10 +14,10 @@ from heli_jax import run_directory
 from heli_jax.config.experiment import from_content
 from heli_jax.config.study import Study, read_study
 from heli_jax.errors import InputError
+from heli_jax.numerics.cores import cores
 from heli_jax.studies import directory
 from heli_jax.studies.dataset import dataset
 from heli_jax.studies.point import Outcome, Task, failure, fit_point
-from heli_jax.sweeps.cores import cores
 from heli_jax.sweeps.run import Progress
 from heli_jax.sweeps.store import only_writer, writable
 from heli_jax.versions import versions

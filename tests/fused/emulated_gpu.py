@@ -52,7 +52,7 @@ class EmulatedGpu:
         module.verify()
         engine = llvm.create_mcjit_compiler(module, machine)
         engine.finalize_object()
-        kinds = [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 2
+        kinds = [ctypes.c_void_p] * 4 + [ctypes.c_int64] * 3
         run = ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address("run"))
         at = {n: ctypes.c_int32.from_address(engine.get_global_value_address(n)) for n in _PLACES}
 

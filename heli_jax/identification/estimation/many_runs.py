@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from heli_jax import stages
+from heli_jax.fused.code import UnsupportedError
+from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
 from heli_jax.identification.estimation.levenberg_marquardt import (
     Optimum,
     descend,
@@ -20,6 +22,10 @@ from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.estimation.scaling import Scaling, scaling, trusted_columns
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Solution
 
+_MANY = 24
+"""runs from which on a program of machine code is worth its compilation"""
+_SIDE_BY_SIDE = 256
+"""runs that such a program computes together: between them somebody may interrupt"""
 _MANY_STEPS = 60
 """steps after which a run among many, which began near its optimum, is given up"""
 
@@ -58,6 +64,9 @@ def optimise_many(
     """
     layout, noise = reached.layout, reached.noise
     units = _units_at(reached)
+    fused = _fused(reached, data, each) if starts.shape[0] >= _MANY else None
+    if fused is not None:
+        batch = _SIDE_BY_SIDE
     if hold is not None:
         # What has no unit stays, see `scaling`.
         units = units._replace(unit=units.unit.at[hold].set(0.0))
@@ -71,13 +80,29 @@ def optimise_many(
         constants = jax.vmap(lambda z: constants_of(layout, z, units))(z0)
 
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
-            return _batch(layout, numbers, noise, z)
+            return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)
 
         count = measured_count(numbers) // batch
         ends = descend(evaluate, constants, evaluate(z0), count, _MANY_STEPS, BATCHED).optimum
         optima.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
         stages.advance(min(batch, k - i))
     return jax.tree.map(lambda *v: np.concatenate(v), *optima)
+
+
+def _fused(reached: Solution, data: Callable[[Any], Data], each: Any) -> FusedRuns | None:
+    """The runs as programs of machine code; None where they cannot be."""
+    layout, numbers, noise, _ = reached
+    one = jax.tree.map(lambda v: v[0], each)
+    flights = list(zip(data(one).flights, numbers.flights, strict=True))
+    # Beside the means of priors.
+    own = Own(
+        any(made.inputs is not given.inputs for made, given in flights),
+        any(made.outputs is not given.outputs for made, given in flights),
+    )
+    try:
+        return FusedRuns(layout, numbers, noise, own)
+    except UnsupportedError:
+        return None
 
 
 def _units_at(reached: Solution) -> Scaling:

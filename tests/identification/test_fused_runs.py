@@ -1,0 +1,137 @@
+"""Rows and Jacobians from programs of machine code against those that JAX makes of the record."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Free, Nuisance, Prior, Problem, models
+from heli_jax.fused.code import UnsupportedError
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
+from heli_jax.identification.estimation.residual import differentiate
+from heli_jax.identification.unknowns.initial_guess import start_vector
+from heli_jax.identification.unknowns.layout import Noise, layout_of
+from tests.identification.bench import BENCH, record, vehicle
+
+FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
+RUNS = 18
+"""more than one vector of them, and no whole number of vectors"""
+
+
+def holes(flight, share=0.2):
+    outputs = {n: np.array(y) for n, y in flight.outputs.items()}
+    rng = np.random.default_rng(7)
+    for y in outputs.values():
+        y[rng.random(y.size) < share] = np.nan
+    return dataclasses.replace(flight, outputs=outputs)
+
+
+def one(**how):
+    return [holes(record(BENCH, seed=3, n=150, **how))]
+
+
+def two():
+    return [*one(), record(BENCH, seed=4, n=90, known={"kappa": 5.0})]
+
+
+def problem(flights, free=FREE, **how):
+    return Problem(models.roll_on_stand, vehicle(BENCH), flights, free, **how)
+
+
+CASES = {
+    "two flights": lambda: problem(two()),
+    "rk4": lambda: problem(one(), solver="rk4", substeps=1),
+    "no nuisances": lambda: problem(one(), nuisance=Nuisance(False, False)),
+    "offsets and gains, straight lines between samples": lambda: problem(
+        one(hold={"x_roll": "linear"}), nuisance=Nuisance(input_gain=True, input_offset=True)
+    ),
+}
+
+
+def pieces(problem, seed=0, apart=0.05):
+    """Layout, numbers, noise and points near the start."""
+    layout = layout_of(problem, problem.flights)
+    data = data_of(problem, problem.flights)
+    z = np.asarray(start_vector(layout, data, problem))
+    rng = np.random.default_rng(seed)
+    sd = tuple(dict.fromkeys(f.outputs, np.asarray(2e-3)) for f in data.flights)
+    return layout, data, Noise(sd, np.zeros(())), z + apart * rng.standard_normal((RUNS, z.size))
+
+
+def tiled(data, own, seed=1):
+    """The numbers with a leading axis, of records of their own."""
+    rng = np.random.default_rng(seed)
+
+    def many(v):
+        return np.broadcast_to(np.asarray(v), (RUNS, *np.shape(v)))
+
+    def other(v):
+        v = np.asarray(v)
+        return v + 0.1 * np.nanstd(v) * rng.standard_normal((RUNS, *v.shape))
+
+    made = jax.tree.map(many, data)
+    each = tuple(
+        f._replace(
+            inputs=jax.tree.map(other, g.inputs) if own.inputs else f.inputs,
+            outputs=jax.tree.map(other, g.outputs) if own.outputs else f.outputs,
+        )
+        for f, g in zip(made.flights, data.flights, strict=True)
+    )
+    return made._replace(flights=each)
+
+
+def products(r, J):
+    rows = np.concatenate([np.asarray(r)[:, :, None], np.asarray(J)], axis=2)
+    return np.einsum("bni,bnj->bij", rows, rows)
+
+
+def agree(problem, own):
+    layout, data, noise, z = pieces(problem)
+    numbers = tiled(data, own)
+    found = products(*FusedRuns(layout, data, noise, own)(numbers, jnp.asarray(z)))
+    each = jax.vmap(lambda d, z: differentiate(layout, d, noise, z))(numbers, z)
+    expected = products(each.r, each.J)
+    size = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+    unit = np.where(size > 0, size, 1.0)
+    np.testing.assert_allclose(
+        found / unit[:, :, None] / unit[:, None, :],
+        expected / unit[:, :, None] / unit[:, None, :],
+        atol=1e-10,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_as_jax_makes_them(case):
+    agree(CASES[case](), Own(False, True))
+
+
+@pytest.mark.parametrize("own", [Own(False, False), Own(True, True)])
+def test_records_that_are_shared_and_records_of_each_runs_own(own):
+    agree(problem(one()), own)
+
+
+def test_a_run_that_leaves_all_numbers_is_not_a_number():
+    layout, data, noise, z = pieces(CASES["rk4"]())
+    z[3, 0] = -60.0  # Ixx of 1e-28 kg m^2
+    own = Own(False, False)
+    r, J = FusedRuns(layout, data, noise, own)(tiled(data, own), jnp.asarray(z))
+    finite = np.isfinite(np.asarray(r)).all(axis=1) & np.isfinite(np.asarray(J)).all(axis=(1, 2))
+    assert list(np.flatnonzero(~finite)) == [3]
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"nuisance": Nuisance(time_shift=True)}, "a time shift"),
+        ({"window": 1.0}, "windows"),
+        ({"method": "filter-error"}, "a method other than output error"),
+    ],
+)
+def test_what_has_no_such_program(how, said):
+    layout, data, noise, _ = pieces(problem(one(), **how))
+    with pytest.raises(UnsupportedError, match=said):
+        FusedRuns(layout, data, noise, Own(False, False))
