@@ -42,7 +42,7 @@ ALLOWED = {
     "linear_models": {"dynamics", *BASE},
     "simulation": {"dynamics", *BASE},
     "analysis": {"simulation", "dynamics", "flights", *BASE},
-    "identification": {"analysis", "simulation", "dynamics", "flights", *BASE},
+    "identification": {"fused", "analysis", "simulation", "dynamics", "flights", *BASE},
     "models": {"dynamics", *BASE},
     "fused": {"numerics"},
     "sweeps": {"fused", "analysis", "simulation", "dynamics", "flights", "run_directory", *BASE},

@@ -12,7 +12,6 @@ from jax import core
 from jax.extend.core import Literal
 from jaxtyping import PyTree
 
-
 _LONG = 64
 """numbers: more are no state's or output's, but a record's"""
 

@@ -1,19 +1,28 @@
 """Rows and Jacobians from programs of machine code against those that JAX makes of the record."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heli_jax import Free, Nuisance, Prior, Problem, models
+from heli_jax import Free, Nuisance, Prior, Problem, fit, models
+from heli_jax.fused import gpu_kernel
 from heli_jax.fused.code import UnsupportedError
+from heli_jax.fused.cuda_driver import CudaError
+from heli_jax.fused.gpu_kernel import GpuKernel
+from heli_jax.identification.estimation import fused_runs, many_runs
 from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_ERROR
 from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
+from heli_jax.identification.uncertainty.refits import refit
+from heli_jax.identification.uncertainty.bootstrap import bootstrap
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
+from tests.fused.emulated_gpu import EmulatedGpu, as_text
 from tests.identification.bench import BENCH, record, vehicle
 
 FREE = {"Ixx": Free(0.03), "If": Free(2e-4), "a": Free(5.0, prior=Prior(5.5, 0.5))}
@@ -124,14 +133,88 @@ def test_a_run_that_leaves_all_numbers_is_not_a_number():
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("changed", "said"),
     [
-        ({"nuisance": Nuisance(time_shift=True)}, "a time shift"),
-        ({"window": 1.0}, "windows"),
-        ({"method": "filter-error"}, "a method other than output error"),
+        ({"shift": True}, "a time shift"),
+        ({"windows": ((3, 50),)}, "windows"),
+        ({"estimator": FILTER_ERROR}, "a method other than output error"),
     ],
 )
-def test_what_has_no_such_program(how, said):
-    layout, data, noise, _ = pieces(problem(one(), **how))
+def test_what_has_no_such_program(changed, said):
+    layout, data, noise, _ = pieces(problem(one()))
+    layout = dataclasses.replace(layout, **changed)
     with pytest.raises(UnsupportedError, match=said):
         FusedRuns(layout, data, noise, Own(False, False))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(problem([record(BENCH, seed=3, n=150)]))
+
+
+def test_a_bootstrap_is_what_it_was_run_by_run(fitted, monkeypatch):
+    found = bootstrap(fitted, 24)
+    monkeypatch.setattr(many_runs, "_MANY", 100)
+    expected = bootstrap(fitted, 24)
+    assert found.records == expected.records
+    for name, values in expected.values.items():
+        spread = np.std(values)
+        np.testing.assert_allclose(found.values[name], values, rtol=0, atol=1e-4 * spread)
+
+
+def test_records_fitted_together_are_as_each_by_itself(fitted):
+    records = [record(BENCH, seed=k, n=150) for k in range(5, 8)]
+    found = refit(fitted, [*records, *records, *[[r] for r in records * 6]])
+    assert found.converged.all()
+    for k, flight in enumerate(records):
+        alone = fit(problem([flight]))
+        for name, e in alone.estimates.items():
+            # Noise levels and weak priors are those of the first record.
+            assert abs(found.values[name][k] - e.value) < 0.1 * e.sd
+            np.testing.assert_allclose(found.values[name][k::3], found.values[name][k], rtol=1e-6)
+
+
+def test_records_unlike_the_fits_are_refused(fitted):
+    good = record(BENCH, seed=5, n=150)
+    cases = {
+        "expected samples 150 as the fit has, got 140": record(BENCH, seed=5, n=140),
+        "expected dt 0.02": record(BENCH, seed=5, n=150, dt=0.01),
+        "expected known {}": record(BENCH, seed=5, n=150, known={"kappa": 5.0}),
+        "expected 1 flights, got 2": [good, good],
+    }
+    for said, flight in cases.items():
+        with pytest.raises(ValueError, match=r"^refit, record 1: " + re.escape(said)):
+            refit(fitted, [good, flight])
+    with pytest.raises(ValueError, match="one record at least"):
+        refit(fitted, [])
+
+
+class Device:
+    """As JAX has a GPU, as far as it is asked."""
+
+    platform, local_hardware_id = "gpu", 0
+
+
+@pytest.fixture
+def emulated(monkeypatch):
+    cpu = jax.devices("cpu")[0]
+    monkeypatch.setattr(gpu_kernel, "ptx", as_text)
+    monkeypatch.setattr(fused_runs, "Gpu", lambda _: EmulatedGpu())
+    monkeypatch.setattr(fused_runs, "GpuKernel", lambda run, gpu, _: GpuKernel(run, gpu, cpu))
+    return Device()
+
+
+def test_on_a_gpu_that_is_none(emulated):
+    layout, data, noise, z = pieces(problem(one()))
+    own = Own(False, True)
+    numbers = tiled(data, own)
+    found = FusedRuns(layout, data, noise, own, emulated)(numbers, jnp.asarray(z))
+    expected = FusedRuns(layout, data, noise, own)(numbers, jnp.asarray(z))
+    np.testing.assert_allclose(products(*found), products(*expected), rtol=1e-9, atol=1e-9)
+
+
+def test_a_gpu_that_gives_other_numbers_is_refused():
+    sums = np.broadcast_to(np.eye(3), (4, 3, 3))
+    fused_runs._compare(sums, sums)
+    with pytest.raises(CudaError, match="other numbers"):
+        fused_runs._compare(1.001 * sums, sums)

@@ -51,6 +51,7 @@ def optimise_many(
     *,
     hold: int | None = None,
     batch: int = 8,
+    device: Any = None,
 ) -> Optimum:
     """Optima (k, ...) for many starts or records near an optimum.
 
@@ -61,10 +62,16 @@ def optimise_many(
         each: what differs between the runs, a pytree of arrays (k, ...).
         hold: the unknown that stays at its start, by its number.
         batch: runs side by side, by vmap.
+        device: a GPU of NVIDIA's, as JAX has it, for runs that are programs of machine code; the
+            processor unless given.
+
+    Raises:
+        ValueError: the runs cannot be programs of a GPU, though one was given.
     """
     layout, noise = reached.layout, reached.noise
     units = _units_at(reached)
-    fused = _fused(reached, data, each) if starts.shape[0] >= _MANY else None
+    many = starts.shape[0] >= _MANY or device is not None
+    fused = _fused(reached, data, each, device) if many else None
     if fused is not None:
         batch = _SIDE_BY_SIDE
     if hold is not None:
@@ -89,7 +96,9 @@ def optimise_many(
     return jax.tree.map(lambda *v: np.concatenate(v), *optima)
 
 
-def _fused(reached: Solution, data: Callable[[Any], Data], each: Any) -> FusedRuns | None:
+def _fused(
+    reached: Solution, data: Callable[[Any], Data], each: Any, device: Any
+) -> FusedRuns | None:
     """The runs as programs of machine code; None where they cannot be."""
     layout, numbers, noise, _ = reached
     one = jax.tree.map(lambda v: v[0], each)
@@ -100,8 +109,10 @@ def _fused(reached: Solution, data: Callable[[Any], Data], each: Any) -> FusedRu
         any(made.outputs is not given.outputs for made, given in flights),
     )
     try:
-        return FusedRuns(layout, numbers, noise, own)
-    except UnsupportedError:
+        return FusedRuns(layout, numbers, noise, own, device)
+    except UnsupportedError as e:
+        if device is not None:
+            raise ValueError(f"device: these runs are no program for a GPU: {e}") from e
         return None
 
 

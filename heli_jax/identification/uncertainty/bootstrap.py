@@ -1,6 +1,6 @@
 """Parametric bootstrap: the estimated machine is simulated and identified again, many times."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +31,7 @@ class Bootstrap(NamedTuple):
         return float(low), float(high)
 
 
-def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
+def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0, device: Any = None) -> Bootstrap:
     """Refit records simulated with the estimates: same inputs, same missing samples, new noise.
 
     Filter error draws the disturbance anew. Output error adds white noise, or where its residuals
@@ -41,9 +41,12 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
         fit: with the estimates, and the optimum that all refits begin from.
         runs: how many records.
         seed: of noise and disturbance.
+        device: a GPU of NVIDIA's, as `jax.devices()` has it, that computes the refits of output
+            error; the processor unless given.
 
     Raises:
-        ValueError: the time shift is free, or the data do not determine every parameter.
+        ValueError: the fit has no program for a GPU, though one was given; the time shift is free,
+            or the data do not determine every parameter.
     """
     at = fit.reached
     if at.layout.shift:
@@ -72,7 +75,7 @@ def bootstrap(fit: Fit, runs: int = 200, *, seed: int = 0) -> Bootstrap:
     # Every refit from the optimum, which is where the record was simulated.
     starts = jnp.tile(at.z[None, :], (runs, 1))
     each = (outputs, jnp.asarray(means, at.z.dtype))
-    optima = optimise_many(at, data, starts, each, batch=_BATCH)
+    optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device)
     converged = np.asarray(optima.converged)
     # No nuisances: weak priors hold them, which are not drawn anew, so that they would scatter less
     # than they are uncertain.
