@@ -120,13 +120,17 @@ def beyond(logs: Opened, request: Request) -> tuple[str, ...]:
 
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:
-    log = log or with_derived(open_log(request.path, request.options.number))
+    log = log or _of_file(request)
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
         problem = "its topics have clocks of their own, expected no time to be stated, got "
         raise wrong(log.path, problem + shown(request.time.name))
     return log
+
+
+def _of_file(request: Request) -> ChannelLog | Table:
+    return with_derived(open_log(request.path, request.options.number))
 
 
 def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
@@ -161,7 +165,8 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
     options = ReadOptions(number=also.number)
     # Apart from the others, since it may well be one of them.
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    other = _open(alone, also.log)
+    file = also.log or _of_file(alone)
+    other = _open(alone, file)
     reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
     (twin,) = _clocked(other, alone).values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
@@ -174,8 +179,8 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already: it may be large.
-    asked = with_file_units(_log_of(other), asked)
-    signals = _clocked(_open(asked, _log_of(other)), asked)
+    asked = with_file_units(file, asked)
+    signals = _clocked(_open(asked, file), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
     words = _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)
