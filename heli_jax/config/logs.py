@@ -178,13 +178,13 @@ def _also(
     opened = experiment.logs.get(path, also.flight)
     return Also(
         str(path),
-        align.same,
-        align.to,
+        "" if align is None else align.same,
+        "" if align is None else align.to,
         {n: inputs[n] for n in also.signals.inputs},
         {n: outputs[n] for n in also.signals.outputs},
         None if time is None else Signal(time.signal, time.unit, "s"),
         also.flight,
-        align.reverse,
+        align is not None and align.reverse,
         None if opened is None else with_derived(opened),
     )
 

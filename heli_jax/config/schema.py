@@ -130,8 +130,8 @@ class AlsoConfig(_Strict):
 
     log: str
     """the file; its path begins at the configuration"""
-    align: AlignConfig
-    """how its clock is found"""
+    align: AlignConfig | None = None
+    """how its clock is found; unless given its times count as those of the first log"""
     signals: AlsoSignalsConfig
     """what is taken from it"""
     flight: Annotated[int, Field(ge=1)] | None = None

@@ -114,7 +114,7 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
     Raises:
         NotAligned: no shift does, or several do.
     """
-    r = _correlation(a, b)
+    r = correlations(a, b)
     # As where sample k of a stands beside sample k - shift of b.
     shifts = np.arange(-(b.size - 1), a.size)
     best = int(np.argmax(r))
@@ -129,7 +129,7 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
             f"they hardly agree (correlation {r[best]:.2f} at the best lag), expected at least "
             f"{LEAST}"
         )
-    rival = _rival(r, best)
+    rival = other_peak(r, best)
     if rival is not None and 1.0 - r[rival] ** 2 < _RIVAL * (1.0 - r[best] ** 2):
         raise NotAligned(
             f"{abs(int(shifts[best] - shifts[rival]))} samples apart two lags explain nearly the "
@@ -139,7 +139,7 @@ def _coarse(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
     return int(shifts[best]), float(r[best])
 
 
-def _rival(r: np.ndarray, best: int) -> int | None:
+def other_peak(r: np.ndarray, best: int) -> int | None:
     """The highest maximum outside the hill of the best."""
     # Down both sides to where it turns: what is on the hill is the same solution.
     left, right = best, best
@@ -152,7 +152,7 @@ def _rival(r: np.ndarray, best: int) -> int | None:
     return rival if others[rival] > 0 else None
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Correlation coefficient (N + M - 1,) of a (N,) and b (M,) over what overlaps at each shift,
     -1 < 0 < 1; zero where that is too short."""
     from scipy.signal import correlate

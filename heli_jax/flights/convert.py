@@ -20,7 +20,12 @@ from heli_jax.flights.open_log import open_log
 from heli_jax.flights.read_channels import TopicClock, common_times, topic_clock
 from heli_jax.flights.resample import hold, in_gaps, new_clock, resampled
 from heli_jax.flights.table import require_few_columns, shown, wrong
-from heli_jax.flights.table_topics import as_channels, matching, require_clocks
+from heli_jax.flights.table_topics import (
+    as_channels,
+    matching,
+    require_clocks,
+    without_joins,
+)
 
 ENDINGS = (".csv", ".parquet", ".nc")
 TIME = "time"
@@ -89,6 +94,9 @@ def convert_log(path: str | Path, selection: Selection) -> Converted:
     if isinstance(log, DerivedTable):
         channels, clockless = as_channels(log.table, selection.time, selection.time_unit, notes)
         require_clocks(channels, clockless, selection.signals, notes)
+        # Without a rate the rows are copied as they are, empty cells and all.
+        rate = selection.rate
+        channels = channels if rate is None else without_joins(channels, notes)
         log = with_derived(channels, selection.swashplate)
         assert isinstance(log, DerivedLog)
     elif selection.time or selection.time_unit:

@@ -1,4 +1,5 @@
-"""The unit that a file states for a signal of which the configuration states none."""
+"""The unit that a file states for a signal: taken where none is configured, else compared with the
+configured one."""
 
 import copy
 import dataclasses
@@ -12,7 +13,8 @@ from heli_jax.flights.table import Table, column, shown, wrong
 
 
 def with_file_units(log: ChannelLog | Table, request: Request) -> Request:
-    """The request with the units that the file has where none was asked for.
+    """The request with the units that the file has where none was asked for, and with those that
+    contradict what was.
 
     Args:
         log: the file.
@@ -23,7 +25,7 @@ def with_file_units(log: ChannelLog | Table, request: Request) -> Request:
     """
     made = copy.copy(request)
     made.signals = {
-        key: _of_file(log, signal, key[0]) if signal.assumed else signal
+        key: (_of_file(log, signal, key[0]) if signal.assumed else _compared(log, signal))
         for key, signal in request.signals.items()
     }
     return made
@@ -43,6 +45,32 @@ def _of_file(log: ChannelLog | Table, signal: Signal, name: str) -> Signal:
         remedy = "state unit, with scale and offset where numbers have to be converted"
         raise wrong(log.path, f"{problem}; {remedy}", column(signal.name)) from e
     return signal if same else dataclasses.replace(signal, unit=stated)
+
+
+def _compared(log: ChannelLog | Table, signal: Signal) -> Signal:
+    """With the file's unit where it is another than the one that was asked for."""
+    # Who states a scale has made of the numbers what they are.
+    if signal.scale != 1.0 or signal.constant is not None:
+        return signal
+    stated = unit_in_file(log, signal.name)
+    if stated in ("", "-", "1"):
+        return signal
+    try:
+        same = math.isclose(units.factor(stated, signal.unit), 1.0)
+    # The file's own words need be no unit that is known here.
+    except ValueError:
+        same = not units.is_unit(stated)
+    return signal if same else dataclasses.replace(signal, contradicted=stated)
+
+
+def other_units(request: Request) -> list[str]:
+    """Notes on units that the file states otherwise than the configuration."""
+    return [
+        f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
+        f" the file says {shown(signal.contradicted)}"
+        for (name, _), signal in request.signals.items()
+        if signal.contradicted
+    ]
 
 
 def unit_in_file(log: ChannelLog | Table, name: str) -> str:

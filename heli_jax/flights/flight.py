@@ -34,6 +34,7 @@ class Signal:
             input as it was before.
         assumed: whether nobody stated the unit: that of the file goes before it, if it has one.
         origin: where unit, axes and sign come from, in words, where a preset states them.
+        contradicted: the unit that the file states, where it is another than `unit`.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Signal:
     missing: tuple[float, ...] = ()
     assumed: bool = False
     origin: str = ""
+    contradicted: str = ""
 
     def to_si(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers of the log (N,) in SI.

@@ -8,6 +8,7 @@ import numpy as np
 
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.derived import marks_of_sources, why_missing
+from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Source
 from heli_jax.flights.grid import LATEST, SHORTEST_STEP, Uneven, rounding_of, uniform_grid
 from heli_jax.flights.holds import Decision
@@ -122,7 +123,7 @@ def flight_of_signals(
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
     said = sample_notes(request, {key: signal.timed for key, signal in signals.items()})
     start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
-    notes = (*source.notes, *logged.notes, *repeated, *said, *notes)
+    notes = (*source.notes, *other_units(request), *logged.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates, first_time=first_time)
     end = start + dt * (next(iter(samples.values())).size - 1)

@@ -13,6 +13,7 @@ from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
 from heli_jax.flights.derived import marks_of_sources, why_missing
+from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
     LATEST,
@@ -25,6 +26,8 @@ from heli_jax.flights.grid import (
     without_overflow,
 )
 from heli_jax.flights.holds import Decision
+from heli_jax.flights.joined import joined_log
+from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import Marked
 from heli_jax.flights.onto_grid import (
     FEWEST,
@@ -66,8 +69,8 @@ class LoadedTable:
         return float(self.clock.stamps[0] * self.clock.scale)
 
 
-def load_table(table: Table, request: Request) -> LoadedTable:
-    """The columns that are asked for, and the clock.
+def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
+    """The columns that are asked for, and the clock; as topics where rows hold one topic each.
 
     Raises:
         InputError: a column is missing or holds no numbers, or the time is none.
@@ -76,6 +79,9 @@ def load_table(table: Table, request: Request) -> LoadedTable:
         problem = "no time is stated, expected the name of the column of time stamps"
         raise wrong(table.path, problem)
     numbers = table.numbers(request.columns)
+    joined = joined_log(table, request, numbers)
+    if joined is not None:
+        return joined
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
 
@@ -115,7 +121,7 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     with clock.hinting():
         dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
-    notes = (*table.notes, *clock.notes, *_other_units(table, request), *notes)
+    notes = (*table.notes, *clock.notes, *other_units(request), *notes)
     notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
     source = Source(table.path, table.sha256, notes, first_time=loaded.first_time)
     source = logged.source(source, stamps.seconds[0], stamps.seconds[-1])
@@ -136,26 +142,6 @@ def _of_sources(
             for n, marked in by_source.items()
         }
     return found
-
-
-def _other_units(table: Table, request: Request) -> list[str]:
-    """Notes on units that the file states otherwise than the configuration."""
-    notes = []
-    for (name, _), signal in request.signals.items():
-        stated = table.units.get(signal.name, "").strip()
-        if stated in ("", "-", "1") or signal.scale != 1.0:
-            continue
-        try:
-            same = math.isclose(units.factor(stated, signal.unit), 1.0)
-        # The file's own words need be no unit that is known here.
-        except ValueError:
-            same = not units.is_unit(stated)
-        if not same:
-            notes.append(
-                f"{name}: {shown(signal.name)} is taken in {signal.unit or '1'}, as configured;"
-                f" the file says {shown(stated)}"
-            )
-    return notes
 
 
 def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSignal]:

@@ -20,11 +20,12 @@ from heli_jax.flights.table import Table, column, wrong
 
 @dataclass(frozen=True)
 class Also:
-    """A further log of the same flight, whose clock knows nothing of the first one's.
+    """A further log of the same flight, whose clock may know nothing of the first one's.
 
     Attributes:
         path: of the log.
-        same: the signal of the first log, by the model's name, that both hold.
+        same: the signal of the first log, by the model's name, that both hold; empty where both
+            have one clock.
         to: the column or channel of the same motion in this log, in any unit.
         inputs: signals to take from this log, by the model's names.
         outputs: the same for what was measured.
@@ -35,8 +36,8 @@ class Also:
     """
 
     path: str
-    same: str
-    to: str
+    same: str = ""
+    to: str = ""
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     outputs: Mapping[str, Signal] = field(default_factory=dict)
     time: Signal | None = None

@@ -35,6 +35,9 @@ from heli_jax.flights.read_table import (
 from heli_jax.flights.request import Also, ReadOptions, Request
 from heli_jax.flights.table import Table, sample_count, shown, wrong
 
+_SHARED = 0.5
+"""of the shorter of two logs of one clock that the other covers too, at least"""
+
 
 class Beside(NamedTuple):
     """The signals of a further log, by the clock of the first [s], and a note on how that was
@@ -120,13 +123,17 @@ def beyond(logs: Opened, request: Request) -> tuple[str, ...]:
 
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:
-    log = log or with_derived(open_log(request.path, request.options.number))
+    log = log or _of_file(request)
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
         problem = "its topics have clocks of their own, expected no time to be stated, got "
         raise wrong(log.path, problem + shown(request.time.name))
     return log
+
+
+def _of_file(request: Request) -> ChannelLog | Table:
+    return with_derived(open_log(request.path, request.options.number))
 
 
 def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:
@@ -153,6 +160,8 @@ def _log_of(log: ChannelLog | LoadedTable) -> ChannelLog | Table:
 def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tuple[Beside, Request]:
     """The signals of a further log, its clock shifted to that of the first, and the request for
     them with the units that they have."""
+    if not also.same:
+        return _of_one_clock(log, request, also)
     key = next((key for key in request.signals if key[0] == also.same), None)
     if key is None:
         known = ", ".join(dict.fromkeys(name for name, _ in request.signals))
@@ -161,7 +170,8 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
     options = ReadOptions(number=also.number)
     # Apart from the others, since it may well be one of them.
     alone = Request(also.path, also.time, {}, {also.same: Signal(also.to, "1", "1")}, options)
-    other = _open(alone, also.log)
+    file = also.log or _of_file(alone)
+    other = _open(alone, file)
     reference = _clocked(log, _only(_whole(request), frozenset({key})))[key].timed
     (twin,) = _clocked(other, alone).values()
     reference = reference._replace(values=measured(request.signals[key], reference.values))
@@ -174,12 +184,58 @@ def _beside(log: ChannelLog | LoadedTable, request: Request, also: Also) -> tupl
         raise wrong(also.path, f"cannot be aligned by {what}: {e}") from e
     asked = Request(also.path, also.time, also.inputs, also.outputs, options)
     # The log that is open already: it may be large.
-    asked = with_file_units(_log_of(other), asked)
-    signals = _clocked(_open(asked, _log_of(other)), asked)
+    asked = with_file_units(file, asked)
+    signals = _clocked(_open(asked, file), asked)
     name = Path(also.path).name
     shifted = {key: _shifted(s, lag.lag, name) for key, s in signals.items()}
     words = _note(f"{name} (sha256 {_log_of(other).sha256[:12]})", also, lag)
     return Beside(shifted, words), asked
+
+
+def _of_one_clock(
+    log: ChannelLog | LoadedTable, request: Request, also: Also
+) -> tuple[Beside, Request]:
+    """The signals of a further log whose times count as those of the first.
+
+    Raises:
+        InputError: the two hardly overlap, so that they have no clock in common.
+    """
+    options = ReadOptions(number=also.number)
+    asked = Request(also.path, also.time, also.inputs, also.outputs, options)
+    file = also.log or _of_file(asked)
+    asked = with_file_units(file, asked)
+    other = _open(asked, file)
+    signals = _clocked(other, asked)
+    spans = [
+        _span(clocks, each.first_time)
+        for clocks, each in ((_clocked(log, _whole(request)), log), (signals, other))
+    ]
+    (begin, end), (also_begin, also_end) = spans
+    shared = min(end, also_end) - max(begin, also_begin)
+    name = Path(also.path).name
+    first = Path(request.path).name
+    if not shared >= _SHARED * min(end - begin, also_end - also_begin):
+        raise wrong(
+            also.path,
+            f"its times go from {also_begin:.6g} s to {also_end:.6g} s and those of {first} from "
+            f"{begin:.6g} s to {end:.6g} s, so that they are no one clock; state a motion that "
+            "both hold, align: {with: ..., to: ...}",
+        )
+    lag = float(other.first_time - log.first_time)
+    words = (
+        f"{name} (sha256 {file.sha256[:12]}): its times are taken as those of {first}, with which "
+        f"it shares {shared:.4g} s; if each counts from a beginning of its own, state align"
+    )
+    return Beside({key: _shifted(s, lag, name) for key, s in signals.items()}, words), asked
+
+
+def _span(signals: Mapping[Key, ClockedSignal], first_time: float) -> tuple[float, float]:
+    """First and last time of signals [s], in the log's own count."""
+    clocks = [s.clock.seconds for s in signals.values()]
+    return (
+        first_time + min(float(c[0]) for c in clocks),
+        first_time + max(float(c[-1]) for c in clocks),
+    )
 
 
 def _note(name: str, also: Also, lag: Lag) -> str:

@@ -8,7 +8,8 @@ from heli_jax.errors import InputError
 from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.describe import describe_table
 from heli_jax.flights.grid import without_overflow
-from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
+from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.table import Table, shown, wrong
 
 _MOST_NAMED = 6
@@ -43,6 +44,20 @@ def as_channels(
         topics.append(replace(another, name=f"arrays of {size} samples", times=times))
         notes += said
     return ChannelLog(table.path, table.format, table.size, table.sha256, tuple(topics)), clockless
+
+
+def without_joins(log: ChannelLog, notes: list[str]) -> ChannelLog:
+    """The log with topics of their own where the rows of a table hold one topic each."""
+    topics: list[Topic] = []
+    for topic in log.topics:
+        columns = {name: as_floats(values) for name, values in topic.columns.items()}
+        if not takes_turns(row_groups(columns)):
+            topics.append(topic)
+            continue
+        parts = topics_of(topic.times, columns, topic.units, topic.clock)
+        notes.append(joined_note(parts))
+        topics += parts
+    return replace(log, topics=tuple(topics))
 
 
 def require_clocks(

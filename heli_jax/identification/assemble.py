@@ -248,7 +248,8 @@ def assemble(
         one_step_validation=pooled_metrics(held.signals, one_step=True),
         whiteness=white,
         adequacy=adequacy.doubted(
-            [*record_doubts(problem), *(mode.words for mode in fast if mode.undetermined)]
+            # What is wrong with the record makes any mode: that one is no reason of its own then.
+            record_doubts(problem) or [mode.words for mode in fast if mode.undetermined]
         )._replace(at_optimum=status != "not-converged"),
         coloured=errors.coloured,
         responses=responses,

@@ -53,9 +53,15 @@ from heli_jax.identification.validation.feedback import feedback_notes, feedback
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import dropouts, misread
+from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
-from heli_jax.identification.validation.signal_signs import rate_against_angle
+from heli_jax.identification.validation.signal_signs import (
+    against_start,
+    contradictions,
+    rate_against_angle,
+    sticks_of,
+)
 from heli_jax.stages import stage
 
 __all__ = [
@@ -250,12 +256,26 @@ def fit(
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
     doubted = [one.finding for one in (*misread(problem), *dropouts(problem))]
     doubted += rate_against_angle(problem)
+    doubted += [one.finding for one in odd_flights(problem.training)]
     said = (*cautions(problem), *(f.sentence for f in doubted))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"):
         run = OptimizationRun(before, points, optima, seed, timing)
-        return assemble(problem, search, optimum, run)
+        return _with_turned_sticks(problem, guess, assemble(problem, search, optimum, run))
+
+
+def _with_turned_sticks(problem: Problem, guess: FirstGuess, found: Fit) -> Fit:
+    """With what moved the wrong way at the start values, first of all notes, where the model did
+    not follow from there."""
+    if found.adequacy.adequate:
+        return found
+    flights = list(zip(labels(problem.training), problem.training, strict=True))
+    turned = against_start(flights, guess.e.simulated, sticks_of(problem.model))
+    # Of an angle that runs against its rate that is said already, and is surer.
+    if not turned or contradictions(problem):
+        return found
+    return dataclasses.replace(found, notes=(*(f.sentence for f in turned), *found.notes))
 
 
 def _search(

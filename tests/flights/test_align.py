@@ -113,6 +113,7 @@ def test_two_files_make_one_flight(tmp_path):
     at = 5.0 + flight.times[seen]
     assert at[0] == pytest.approx(7.0, abs=6e-3)
     np.testing.assert_allclose(flight.outputs["roll"][seen], 0.5 * at, atol=2e-3)
+    assert flight.source is not None
     (note,) = [n for n in flight.source.notes if n.startswith("mocap.csv (sha256 ")]
     assert float(note.split("): ")[1].split(" s ")[0]) == pytest.approx(7.0, abs=3e-4)
     assert "(sd " in note
@@ -157,3 +158,41 @@ def test_by_configuration(tmp_path):
     also["signals"]["outputs"]["roll_rate"] = {"signal": "q", "unit": "deg/s"}
     with pytest.raises(InputError, match=r"also\[0\].*'roll_rate' is taken from another log"):
         read(flight)
+
+
+def one_clock(tmp_path, begins):
+    """A flight of sticks and rates, and its attitude in a file of its own, beginning then [s]."""
+    x = motion(3)
+    t, late = 5.0 + np.arange(3000) / 100, begins + np.arange(1200) / 50
+    rows = [f"{a:.3f},{np.sign(b):.1f},{b:.9f}" for a, b in zip(t, x(t), strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,p", *rows]))
+    rows = [f"{1e3 * a:.1f},{b:.9f}" for a, b in zip(late, x(late), strict=True)]
+    (tmp_path / "also.csv").write_text("\n".join(["ms,phi", *rows]))
+    also = Also(
+        str(tmp_path / "also.csv"),
+        outputs={"phi": Signal("phi", "rad", "rad")},
+        time=Signal("ms", "ms", "s"),
+    )
+    return x, read_flight(
+        tmp_path / "log.csv",
+        time="t",
+        inputs={"u": Signal("u", "1", "1")},
+        outputs={"p": Signal("p", "rad/s", "rad/s")},
+        rate=50.0,
+        also=(also,),
+    )
+
+
+def test_a_second_file_on_the_same_clock_needs_no_alignment(tmp_path):
+    x, flight = one_clock(tmp_path, 8.0)
+    t = flight.t0 + flight.dt * np.arange(flight.n_samples)
+    np.testing.assert_allclose(flight.outputs["phi"], x(t), atol=1e-3)
+    assert flight.t0 == pytest.approx(8.0, abs=0.03)
+    assert flight.source is not None
+    [note] = [n for n in flight.source.notes if "also.csv" in n and "sha256" in n]
+    assert "its times are taken as those of log.csv, with which it shares 23.98 s" in note
+
+
+def test_a_second_file_on_another_clock_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"also.csv: its times go from 1000 s .* no one clock"):
+        one_clock(tmp_path, 1000.0)

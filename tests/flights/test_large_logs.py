@@ -14,7 +14,7 @@ import scipy.io
 
 from heli_jax import reading_progress
 from heli_jax.errors import InputError
-from heli_jax.flights import csv_on_disk, csv_table, csv_text, progress
+from heli_jax.flights import csv_on_disk, csv_table, csv_text, parquet_table, progress
 from heli_jax.flights.digest import Digest
 from heli_jax.flights.open_log import open_log, open_table
 from tests.flights import log_writers as writers
@@ -45,6 +45,25 @@ def test_a_tables_fingerprint_is_the_files(tmp_path):
         opened = open_table(tmp_path / name)
         assert opened.sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
         np.testing.assert_array_equal(opened.numbers(["x"])["x"], table.column("x").to_numpy())
+
+
+@pytest.mark.parametrize("kind", ["float64", "int32", "timestamp[ns]", "decimal128(25, 3)", "bool"])
+def test_columns_of_parquet_in_pieces_are_whole(tmp_path, monkeypatch, kind):
+    import pyarrow.parquet
+
+    numbers, gaps = np.arange(1003) % 97, np.arange(1003) % 10 == 3
+    column = pa.array(numbers, mask=gaps)
+    column = column.cast(pa.decimal128(25, 3) if "decimal" in kind else kind, safe=False)
+    clock = pa.array(1e-3 * np.arange(1003))
+    pyarrow.parquet.write_table(pa.table({"t": clock, "x": column}), tmp_path / "log.parquet")
+    whole = open_table(tmp_path / "log.parquet").numbers(["x", "t"])
+    monkeypatch.setattr(parquet_table, "_AT_ONCE", 20)
+    pieces = open_table(tmp_path / "log.parquet").numbers(["x", "t"])
+    expected = np.where(gaps, np.nan, numbers != 0 if kind == "bool" else numbers)
+    assert list(pieces) == ["x", "t"]
+    for read in (whole, pieces):
+        np.testing.assert_array_equal(read["x"], expected)
+        np.testing.assert_array_equal(read["t"], clock.to_numpy())
 
 
 def compressed(size, content):

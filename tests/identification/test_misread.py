@@ -19,7 +19,8 @@ P = 0.4 * np.sin(1.7 * T) + 0.2 * np.cos(4.3 * T)
 def load(tmp_path):
     """load(p, u, unit=..., **p's keys) -> the problem of a table of them."""
 
-    def load(p, u=U, unit="", **of_p):
+    def load(p, u=U, unit="", unit_of_p=None, **of_p):
+        of_p |= {} if unit_of_p is None else {"unit": unit_of_p}
         rows = ["t,lat,p", *([f"s,,{unit}"] if unit else [])]
         rows += [f"{t:.2f},{a:.9g},{b:.9g}" for t, a, b in zip(T, u, p, strict=True)]
         (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
@@ -59,6 +60,21 @@ def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
     assert "p: no unit stated, 'p' taken in deg/s, as the file says" in flight.source.notes
     [plain] = flights(load(P))
     np.testing.assert_allclose(plain.outputs["p"], P, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1.0, 20.0])
+def test_a_unit_against_that_of_the_file_is_doubted(load, size):
+    found = of(flights(load(np.degrees(size * P), unit="deg/s", unit_of_p="rad/s")))
+    first, *more = [one.finding.sentence for one in misread(found)]
+    assert "p is read as rad/s, as configured, where the file says 'deg/s' of 'p'" in first
+    assert "p is 57.3 times as large as it was" in first
+    assert len(more) == 1
+    assert record_doubts(found) == ["p looks like deg/s read as rad/s"]
+    # What is small either way is doubted, and no reason by itself.
+    small = of(flights(load(0.1 * P, unit="deg/s", unit_of_p="rad/s")))
+    assert len(misread(small)) == 1
+    assert record_doubts(small) == []
+    assert misread(of(flights(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s")))) == []
 
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):

@@ -8,17 +8,24 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from heli_jax import Flight
+from heli_jax import Flight, linear_model
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.late_angles import late_angles, lateness
 from heli_jax.identification.validation.late_inputs import late_inputs
+from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
-from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
+from heli_jax.identification.validation.signal_signs import (
+    against_start,
+    contradictions,
+    rate_against_angle,
+    sticks_of,
+)
 from heli_jax.models import with_filters
 from tests.identification.test_enough import DT, SWING, problem, response, steps
 
 N = 1000
 DEGREE = np.pi / 180.0
+STICKS = {"phi": "u", "p": "u"}
 
 
 def moved(seed=0):
@@ -51,7 +58,11 @@ def test_an_angle_that_moves_as_its_rate_says_nothing():
     [
         (DEGREE, 1.0, "in degrees"),
         (1.0, DEGREE, "in degrees"),
-        (-1.0, 1.0, "phi moves as far as the integral of p, and against it: one of the two has"),
+        (
+            -1.0,
+            1.0,
+            "phi moves as far as the integral of p, and against it (correlation -1.00)",
+        ),
         (2.0, 1.0, "the unit or the scale"),
         (1.0, -DEGREE, "wrong sign (invert) and one of the two is in degrees"),
     ],
@@ -72,13 +83,48 @@ def test_an_output_that_moves_against_the_simulated_one_is_said():
         b, a, _ = scipy.signal.cont2discrete(([10.0], [1.0, 2.0, 16.0]), DT)
         guess = scipy.signal.lfilter(np.ravel(b), a, sign * u)
         run = {"phi": guess, "p": np.gradient(guess, DT)}
-        sentences = [f.sentence for f in against_start([("flight 1", flight)], [run])]
-        found += bool(sentences)
-        assert all("moves against the measured one" in s for s in sentences)
+        # Both outputs against it: the stick is at fault, in one sentence.
+        sentences = [f.sentence for f in against_start([("flight 1", flight)], [run], STICKS)]
+        found += len(sentences)
         assert bool(sentences) == (sign < 0)
+        assert all("phi and p move against the measured ones" in s for s in sentences)
+        assert all(": u has the wrong sign (invert: true)" in s for s in sentences)
     assert found == 1
+    # One of the two: that column is.
+    flight = Flight(dt=DT, inputs=inputs, outputs={"phi": -phi, "p": p})
+    run = {n: -y for n, y in run.items()}
+    [finding] = against_start([("flight 1", flight)], [run], STICKS)
+    assert "though p does not: phi has the wrong sign" in finding.sentence
+    # Without another, it may be either.
+    alone = Flight(dt=DT, inputs=inputs, outputs={"p": -p})
+    [finding] = against_start([("flight 1", alone)], [run])
+    assert "the simulated p moves against the measured one" in finding.sentence
+    assert ": p or u or v has the wrong sign" in finding.sentence
     other = [{"phi": moved(7)[1], "p": moved(7)[2]}]
     assert against_start([("flight 1", flight)], other) == []
+
+
+def test_the_stick_of_an_output_is_that_of_its_axis():
+    sticks = sticks_of(linear_model("hybrid").model)
+    assert (sticks["p"], sticks["phi"], sticks["q"], sticks["theta"]) == (
+        "lat",
+        "lat",
+        "lon",
+        "lon",
+    )
+
+
+def test_an_angle_against_its_rate_is_a_reason_against_the_model():
+    _, phi, p = moved()
+    u = np.zeros(N)
+
+    def of(phi):
+        flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
+        return problem(flight)
+
+    assert contradictions(of(phi)) == record_doubts(of(phi)) == []
+    assert record_doubts(of(-phi)) == ["phi runs against the integral of p"]
+    assert contradictions(of(phi / DEGREE)) == ["phi moves 57.3 times as far as the integral of p"]
 
 
 def a_stick_and_its_answer(late):
@@ -152,6 +198,25 @@ def test_an_angle_that_is_logged_late_against_its_rate_is_said(late):
         slow = np.where(np.arange(phi.size) % 5 == 0, phi, np.nan)
         assert late_said(1.0 + slow, 0.9 * p - 0.2)
     assert np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+@pytest.mark.parametrize("late", [0.5, -0.5, 1.3])
+def test_a_long_delay_of_an_angle_is_said(late):
+    for seed in range(10):
+        [sentence] = late_said(*swings(seed, late))
+        assert f"is logged {abs(late):.2g} s later than" in sentence
+
+
+def test_the_delay_of_a_motion_that_repeats_itself_is_not_sure():
+    t = DT * np.arange(1500)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        omega = 2 * np.pi / rng.uniform(0.8, 2.0)
+        noise = 0.003 * rng.standard_normal((2, t.size))
+        p = 0.1 * omega * np.cos(omega * t) + noise[1]
+        assert late_said(0.1 * np.sin(omega * t) + noise[0], p) == []
+        [sentence] = late_said(0.1 * np.sin(omega * (t - 0.5)) + noise[0], p)
+        assert "the motion repeats itself" in sentence or "against it" in sentence
 
 
 def test_an_angle_that_is_on_time_is_not_called_late():

@@ -30,7 +30,11 @@ from heli_jax.identification.validation.signal_quality import (
     strays,
     stuck,
 )
-from heli_jax.identification.validation.signal_signs import against_start, rate_against_angle
+from heli_jax.identification.validation.signal_signs import (
+    against_start,
+    rate_against_angle,
+    sticks_of,
+)
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -66,7 +70,7 @@ def is_it_enough(
         *(one.finding for one in misread(problem)),
         *rate_against_angle(problem),
         *late_angles(problem),
-        *against_start(flights, e.simulated),
+        *against_start(flights, e.simulated, sticks_of(problem.model)),
         *late_inputs(flights, feedback),
     ]
     if compare:

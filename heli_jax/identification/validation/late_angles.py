@@ -4,14 +4,18 @@ An angle is the integral of its rate. Where the two fit together once one of the
 it is logged late, and a fit of both takes the delay for the machine's.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
 from heli_jax.dynamics.model import Model
 from heli_jax.dynamics.onboard.filters import states_behind
+from heli_jax.flights.align import NotAligned, correlations, other_peak
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.metrics import autocorrelation
 from heli_jax.identification.validation.signal_signs import (
     PARTS,
     WITHIN,
@@ -19,8 +23,11 @@ from heli_jax.identification.validation.signal_signs import (
     rates_and_angles,
 )
 
-_MOST = 0.3
-"""[s] over which a delay is looked for, to either side"""
+_MOST, _PART = 5.0, 0.25
+"""[s], and part of the record, over which a delay is looked for, to either side"""
+_USUAL = 0.3
+"""[s] to either side: a longer delay has to explain far more, since a motion that nearly repeats
+itself fits nearly as well one swing later"""
 _STEP = 0.01
 """[s]; samples that come faster tell no more of a delay"""
 _LEAST = 0.02
@@ -32,6 +39,10 @@ _ALIKE = 0.9
 _EXPLAINED = 0.25
 """part of what the two differ by that the delay has to explain: rotation about other axes makes
 differences too, and no delay takes them away"""
+_FAR_EXPLAINED = 0.75
+"""the same of a delay that is longer than usual"""
+_NEARLY = 2.0
+"""times the unexplained part of the best delay, up to which another explains nearly as well"""
 _BLOCKS = 20
 """parts of a record by whose spread the standard deviation of a delay is told"""
 
@@ -50,8 +61,8 @@ def late_angles(problem: Problem) -> list[Finding]:
         for rate, angle in pairs:
             if rate in flight.outputs and angle in flight.outputs:
                 late = lateness(flight.outputs[angle], flight.outputs[rate], flight.dt)
-                if late is not None and _matters(*late, flight.dt):
-                    found.append(_finding(label, rate, angle, *late))
+                if late is not None and late.matters(flight.dt):
+                    found.append(_finding(label, rate, angle, late))
     return found
 
 
@@ -61,26 +72,46 @@ def _behind_devices(model: Model) -> set[str]:
     return behind | dict(model.delay_lines).keys()
 
 
-def _matters(late: float, sd: float, dt: float) -> bool:
-    return abs(late) > max(_LEAST, dt, _SURE * sd)
+class Lateness(NamedTuple):
+    """By how much an angle is later than its rate."""
+
+    late: float
+    """[s]"""
+    sd: float
+    """[s]"""
+    other: float | None = None
+    """[s] that explains the two nearly as well, since the motion repeats itself"""
+
+    def matters(self, dt: float) -> bool:
+        """Whether it is surely more than a sample of `dt` [s]."""
+        return abs(self.late) > max(_LEAST, dt, _SURE * self.sd)
 
 
-def _finding(label: str, rate: str, angle: str, late: float, sd: float) -> Finding:
+def _finding(label: str, rate: str, angle: str, found: Lateness) -> Finding:
+    late = found.late
     first, second = (angle, rate) if late > 0 else (rate, angle)
+    criterion = f"delay of the angle against its integrated rate [s], {_LEAST:g}"
+    if found.other is not None:
+        words = (
+            f"{label}: {angle} and {rate} go together only where one of them is moved in time, and "
+            f"the motion repeats itself: {angle} is logged {late:.2g} s or {found.other:.2g} s "
+            f"later than {rate} (negative: earlier). State the delay if it is known, or leave one "
+            "of the two out."
+        )
+        return Finding("late output", "doubt", words, late, criterion)
     words = (
         f"{label}: {first} is logged {abs(late):.2g} s later than {second}, with which it goes "
-        f"together then (sd {sd:.1g} s): a fit of both takes that for the machine's; state it "
-        f"({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
+        f"together then (sd {found.sd:.1g} s): a fit of both takes that for the machine's; state "
+        f"it ({first}: {{delay: {abs(late):.2g}}}), or leave one of the two out."
     )
-    criterion = f"delay of the angle against its integrated rate [s], {_LEAST:g}"
     return Finding("late output", "doubt", words, late, criterion)
 
 
 def lateness(
     angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
-) -> tuple[float, float] | None:
-    """By how much an angle is later than its rate, and the standard deviation of it [s]; None where
-    the two do not fit together once moved, or hardly better than before.
+) -> Lateness | None:
+    """By how much an angle is later than its rate; None where the two do not fit together once
+    moved, or hardly better than before.
 
     Args:
         angle: [rad], NaN where missing.
@@ -93,10 +124,18 @@ def lateness(
     every = max(1, int(_STEP / dt))
     turned, integral = both[0][::every], both[1][::every]
     dt *= every
-    steps, most = max(1, round(WITHIN / dt)), int(np.ceil(_MOST / dt))
-    # Samples whose integral is there whatever the delay.
-    begin, end = most + 1, turned.size - steps - most - 1
-    if end - begin < PARTS * steps:
+    steps = max(1, round(WITHIN / dt))
+    if turned.size < (PARTS + 1) * steps:
+        return None
+    coarse = _coarse(turned[steps:] - turned[:-steps], integral[steps:] - integral[:-steps], dt)
+    if coarse is None:
+        return None
+    late, other = coarse
+    # Samples whose integral is there whatever the delay that is tried from here on.
+    spare = int(np.ceil(_USUAL / dt))
+    begin = max(0, round(late / dt)) + spare
+    end = turned.size - steps - 1 - max(0, round(-late / dt)) - spare
+    if end - begin < (PARTS - 2) * steps:
         return None
     rows = np.arange(begin, end)
     changes = turned[rows + steps] - turned[rows]
@@ -112,8 +151,6 @@ def lateness(
     def left(late: float) -> float:
         return _unexplained(changes, moved(late)[:, 0])
 
-    grid = np.arange(-most, most + 1) * dt
-    late = float(grid[int(np.argmin([left(t) for t in grid]))])
     # Gauss and Newton's steps from there, as far as the next sample.
     for _ in range(3):
         step = _step(changes, moved(late))
@@ -121,9 +158,43 @@ def lateness(
             break
         late += step
     after, before = left(late), left(0.0)
-    if abs(late) >= _MOST or after > 1.0 - _ALIKE**2 or after > (1.0 - _EXPLAINED) * before:
+    explained = _EXPLAINED if abs(late) < _USUAL else _FAR_EXPLAINED
+    if after > 1.0 - _ALIKE**2 or after > (1.0 - explained) * before:
         return None
-    return late, _spread(changes, moved(late))
+    return Lateness(late, _spread(changes, moved(late)), other)
+
+
+def _coarse(y: np.ndarray, x: np.ndarray, dt: float) -> tuple[float, float | None] | None:
+    """By how much the angle's changes y (n,) are later than the integral's x (n,), to a sample, and
+    another delay [s] that explains them nearly as well; None where none explains them."""
+    try:
+        r = correlations(y, x)
+    except NotAligned:
+        return None
+    shifts = np.arange(-(x.size - 1), y.size)
+    most = int(min(_MOST, _PART * x.size * dt) / dt)
+    inside = np.abs(shifts) <= max(most, int(_USUAL / dt))
+    shifts, r = shifts[inside], r[inside]
+    best = int(np.argmax(r))
+    usual = np.flatnonzero(np.abs(shifts) * dt <= _USUAL)
+    near = int(usual[np.argmax(r[usual])])
+    left = 1.0 - np.maximum(r, 0.0) ** 2
+    # A swing later all looks much the same: what explains nearly as much nearby goes before.
+    if left[best] > (1.0 - _FAR_EXPLAINED) * left[near] or left[near] < _NEARLY * left[best]:
+        best = near
+    if r[best] < _ALIKE - 0.1:
+        return None
+    late, rival = float(shifts[best]) * dt, other_peak(r, best)
+    if rival is not None and left[rival] <= _NEARLY * left[best]:
+        return late, float(shifts[rival]) * dt
+    if best == near:
+        return late, None
+    # Few long swings go together at some delay whatever they are (Bartlett, 1935).
+    lags = max(1, y.size // 5)
+    window = 1.0 - np.arange(lags + 1) / (lags + 1)
+    both = window * autocorrelation(y, lags) * autocorrelation(x, lags)
+    chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / y.size))
+    return None if r[best] < _SURE * chance else (late, None)
 
 
 def _unexplained(y: np.ndarray, x: np.ndarray) -> float:

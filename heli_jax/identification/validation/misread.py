@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heli_jax import units
 from heli_jax.dynamics.model import axes_of
 from heli_jax.flights.channel_names import no_stick, unit_in_name
 from heli_jax.flights.flight import Flight
@@ -18,7 +19,9 @@ from heli_jax.flights.table import shown
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.signal_quality import dropout_words, facts_of
+from heli_jax.identification.validation.signal_signs import contradictions
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
 """rad and rad/s that a small helicopter does not exceed, but for its heading"""
@@ -47,14 +50,20 @@ def misread(problem: Problem) -> list[Misread]:
     return [
         one
         for label, flight in zip(labels(flights), flights, strict=True)
-        for one in (*_degrees(problem, label, flight), *_sticks(label, flight))
+        for one in (
+            *_contradicted(label, flight),
+            *_degrees(problem, label, flight),
+            *_sticks(label, flight),
+        )
     ]
 
 
 def record_doubts(problem: Problem) -> list[str]:
     """Why no model of these numbers is adequate, each reason in a few words."""
     found = (*misread(problem), *dropouts(problem))
-    return list(dict.fromkeys(one.words for one in found if one.words))
+    words = dict.fromkeys(one.words for one in found if one.words)
+    odd = [one.words for one in odd_flights(problem.training)]
+    return [*words, *contradictions(problem), *odd]
 
 
 def dropouts(problem: Problem) -> list[Misread]:
@@ -69,6 +78,26 @@ def dropouts(problem: Problem) -> list[Misread]:
         for (name, kind), facts in facts_of(flight).items()
         if facts.dropouts is not None and (kind == "input" or facts.dropped >= DROP_SHARE)
     ]
+
+
+def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
+    """The signals of which the file states another unit than the configuration."""
+    source = flight.source
+    for name, signal in ({**source.inputs, **source.outputs} if source else {}).items():
+        if not signal.contradicted:
+            continue
+        unit = signal.unit or "1"
+        try:
+            factor = units.factor(signal.unit, signal.contradicted)
+            off = f"{name} is {factor:.3g} times as large as it was"
+        except ValueError:
+            off = f"{name} is no such quantity"
+        words = (
+            f"{label}: {name} is read as {unit}, as configured, where the file says "
+            f"{shown(signal.contradicted)} of {shown(signal.name)}: if the file is right, {off}, "
+            "and the estimates are wrong with it; without unit the file's is taken."
+        )
+        yield Misread(Finding("signs and units", "doubt", words))
 
 
 def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
@@ -100,7 +129,9 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
             f"unit: {unit}."
         )
         criterion = f"{_MOST:g} % of the samples below, {most:.4g} {signal.unit}"
-        sure = f"{name} looks like {unit} read as {signal.unit}" if size > impossible else ""
+        # What the file says of it makes sure what its size alone does not.
+        certain = size > impossible or signal.contradicted == unit
+        sure = f"{name} looks like {unit} read as {signal.unit}" if certain else ""
         yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
 
 

@@ -65,6 +65,25 @@ def rates_and_angles(model: Model) -> list[tuple[str, str]]:
     return list(dict.fromkeys([*axes, *_PAIRS]))
 
 
+def contradictions(problem: Problem) -> list[str]:
+    """In a few words each angle that runs against its integrated rate, or is in other units: no
+    model follows both."""
+    found = []
+    for flight in problem.training:
+        for rate, angle in rates_and_angles(problem.model):
+            if rate not in flight.outputs or angle not in flight.outputs:
+                continue
+            ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
+            if ratio is None:
+                continue
+            size = abs(ratio[0] * ratio[1]) ** 0.5
+            if ratio[0] < 0:
+                found.append(f"{angle} runs against the integral of {rate}")
+            elif 1.0 / _NEARLY < max(size, 1.0 / size) / _DEGREE < _NEARLY:
+                found.append(f"{angle} moves {size:.3g} times as far as the integral of {rate}")
+    return list(dict.fromkeys(found))
+
+
 def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]:
     ratio = angle_over_rate(flight.outputs[angle], flight.outputs[rate], flight.dt)
     if ratio is None:
@@ -75,14 +94,15 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     if not (backward or off):
         return []
     how = f"{abs(size):.3g} times as far as" if off else "as far as"
+    alike = np.sign(smallest) * np.sqrt(smallest / largest)
+    against = f", and against it (correlation {alike:+.2f})" if backward else ""
     reasons = ["one of the two has the wrong sign (invert)"] if backward else []
     if off and 1.0 / _NEARLY < max(abs(size), 1.0 / abs(size)) / _DEGREE < _NEARLY:
         reasons.append("one of the two is in degrees and read as radians, or the reverse (unit)")
     elif off:
         reasons.append("the unit or the scale of one of the two is wrong")
     words = (
-        f"{label}: {angle} moves {how} the integral of {rate}"
-        f"{', and against it' if backward else ''}: {' and '.join(reasons)}."
+        f"{label}: {angle} moves {how} the integral of {rate}{against}: {' and '.join(reasons)}."
     )
     criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
     return [Finding("signs and units", "doubt", words, size, criterion)]
@@ -149,44 +169,90 @@ def _filled(signal: np.ndarray, dt: float) -> np.ndarray | None:
 
 
 def against_start(
-    flights: Sequence[tuple[str, Flight]], simulated: Sequence[Mapping[str, np.ndarray]]
+    flights: Sequence[tuple[str, Flight]],
+    simulated: Sequence[Mapping[str, np.ndarray]],
+    sticks: Mapping[str, str] | None = None,
 ) -> list[Finding]:
-    """A doubt for each output that moves against the one simulated at the start values.
+    """A doubt for outputs that move against those simulated at the start values: for all that a
+    stick moves together, or for one of them that others do not go with.
 
     Args:
         flights: by what each is called.
         simulated: by flight and output (N,), SI.
+        sticks: by output the input that moves it, of `sticks_of`; without it any of them may.
     """
     found = []
     for (label, flight), run in zip(flights, simulated, strict=True):
-        inputs = " and ".join(flight.inputs)
-        for name, measured in flight.outputs.items():
-            c = _against(measured, run[name], flight.dt)
-            if c is None:
-                continue
-            words = (
-                f"{label}: at the start values the simulated {name} moves against the measured one "
-                f"(correlation {c:+.2f}): check the signs and columns of {name} and {inputs}, and "
-                "the signs of the start values."
-            )
-            criterion = f"largest correlation of both, {AGAINST:g}"
-            found.append(Finding("signs and units", "doubt", words, c, criterion))
+        signs = {
+            name: c
+            for name, measured in flight.outputs.items()
+            if (c := _surely(measured, run[name], flight.dt)) is not None
+        }
+        groups: dict[str, dict[str, float]] = {}
+        for name, c in signs.items():
+            stick = (sticks or {}).get(name, " or ".join(flight.inputs))
+            groups.setdefault(stick, {})[name] = c
+        for stick, group in groups.items():
+            found += _of_stick(label, stick, group)
     return found
 
 
-def _against(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
-    """The correlation of the wrong sign, where it is sure; else None."""
+def sticks_of(model: Model) -> dict[str, str]:
+    """By output, named as its axis names it or as outputs are here, the input that turns the model
+    about that axis."""
+    sticks = {}
+    for axis in axes_of(model):
+        if axis.stick is not None:
+            names = {axis.rate, axis.angle, *(a for r, a in _PAIRS if r == axis.rate)}
+            sticks |= {name: axis.stick for name in names if name is not None}
+    return sticks
+
+
+def _of_stick(label: str, stick: str, signs: Mapping[str, float]) -> list[Finding]:
+    """Of the outputs that one input moves, by the correlation of each with what is simulated."""
+    turned = {n: c for n, c in signs.items() if c < 0}
+    criterion = f"largest correlation of both, {AGAINST:g}"
+    if turned and len(turned) == len(signs):
+        names, size = " and ".join(turned), min(turned.values())
+        whose = stick if len(turned) > 1 else f"{names} or {stick}"
+        moves = "move against the measured ones"
+        moves = moves if len(turned) > 1 else "moves against the measured one"
+        words = (
+            f"{label}: at the start values the simulated {names} {moves} (correlation "
+            f"{', '.join(f'{c:+.2f}' for c in turned.values())}): {whose} has the wrong sign "
+            f"(invert: true) or is another column, or the effect of {stick} has the wrong sign at "
+            "the start values."
+        )
+        return [Finding("signs and units", "doubt", words, size, criterion)]
+    return [
+        Finding(
+            "signs and units",
+            "doubt",
+            f"{label}: at the start values the simulated {name} moves against the measured one "
+            f"(correlation {c:+.2f}), though {' and '.join(n for n in signs if n not in turned)} "
+            f"does not: {name} has the wrong sign (invert: true) or is another column.",
+            c,
+            criterion,
+        )
+        for name, c in turned.items()
+    ]
+
+
+def _surely(measured: np.ndarray, simulated: np.ndarray, dt: float) -> float | None:
+    """The correlation of the wrong sign, or else of the right one, where it is sure."""
     seen = np.isfinite(measured)
     if not np.max(np.abs(simulated)) < 1e100 or np.std(simulated) == 0 or seen.mean() < 0.5:
         return None
     lags = max(1, min(round(_LAG / dt), measured.size // 4))
     # Missing samples add nothing to the products and all of the simulation to their scale.
     c = cross_correlation(simulated, measured, lags) / np.sqrt(seen.mean())
-    worst = float(np.min(c))
+    worst, best = float(np.min(c)), float(np.max(c))
     # Of two independent signals, by their autocorrelations (Bartlett, 1935).
     most = max(1, measured.size // 5)
     window = 1.0 - np.arange(most + 1) / (most + 1)
     both = window * autocorrelation(measured, most) * autocorrelation(simulated, most)
     chance = float(np.sqrt(max(both[0] + 2.0 * both[1:].sum(), 1e-12) / seen.sum()))
-    sure = worst < min(AGAINST, -_SURE * chance) and -worst > _LARGER * float(np.max(c))
-    return worst if sure else None
+    least = max(-AGAINST, _SURE * chance)
+    if -worst > least and -worst > _LARGER * best:
+        return worst
+    return best if best > least and best > -worst else None

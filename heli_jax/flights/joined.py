@@ -1,0 +1,143 @@
+"""Tables whose rows hold the values of one topic each, the other cells empty: an outer join.
+
+PlotJuggler, MAVExplorer and pandas' outer merges write such. The columns that are filled in the
+same rows are a topic, and their clock is that of these rows: an empty cell is no lost sample.
+"""
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax import units
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.request import Request
+from heli_jax.flights.slower import SLOWER, usual_step
+from heli_jax.flights.table import Table, shown
+
+_SHARED = 0.1
+"""of the rows of the smaller of two topics that hold the other too, at most: stamps may coincide"""
+_FEWEST = 8
+"""rows of a topic"""
+_NAMED = 2
+"""columns by which a topic is called"""
+
+
+class RowGroup(NamedTuple):
+    """Columns that are filled in the same rows (N,)."""
+
+    names: tuple[str, ...]
+    rows: np.ndarray
+
+
+def row_groups(columns: Mapping[str, np.ndarray]) -> list[RowGroup]:
+    """Columns (N,), NaN where a cell is empty, by the rows in which they are filled."""
+    groups: dict[bytes, RowGroup] = {}
+    for name, values in columns.items():
+        rows = ~np.isnan(values)
+        key = np.packbits(rows).tobytes()
+        names = groups[key].names if key in groups else ()
+        groups[key] = RowGroup((*names, name), rows)
+    return list(groups.values())
+
+
+def takes_turns(groups: Sequence[RowGroup]) -> bool:
+    """Whether two of the groups hardly share a row."""
+    counts = [int(np.count_nonzero(g.rows)) for g in groups]
+    some = [(g.rows, n) for g, n in zip(groups, counts, strict=True) if n >= _FEWEST]
+    return any(
+        np.count_nonzero(a & b) <= _SHARED * min(m, n)
+        for (a, m), (b, n) in itertools.combinations(some, 2)
+    )
+
+
+def is_joined(
+    seconds: np.ndarray, columns: Mapping[str, np.ndarray], needed: Collection[str]
+) -> bool:
+    """Whether the rows of a table are those of several topics.
+
+    Args:
+        seconds: of the rows (N,) [s].
+        columns: that are asked for (N,), NaN where a cell is empty.
+        needed: those of them that no sample may be missing of, such as inputs.
+    """
+    lacking = [name for name in needed if np.isnan(columns[name]).any()]
+    if not lacking:
+        return False
+    groups = row_groups(columns)
+    some = np.any([g.rows for g in groups], axis=0)
+    # A row that holds nothing of what is asked for is one of another topic.
+    if all(np.array_equal(~np.isnan(columns[name]), some) for name in lacking):
+        return True
+    step = usual_step(seconds)
+    slower = any(usual_step(seconds[~np.isnan(columns[n])]) > SLOWER * step for n in lacking)
+    return slower or takes_turns(groups)
+
+
+def joined_log(
+    table: Table, request: Request, numbers: Mapping[str, np.ndarray]
+) -> ChannelLog | None:
+    """A table whose rows are those of several topics as a log of these; else None.
+
+    Args:
+        table: the file.
+        request: names the clock and the signals.
+        numbers: the columns (N,) of both.
+    """
+    assert request.time is not None  # no table is read without
+    stamps = numbers[request.time.name]
+    # What is no clock is told by its line where rows are read.
+    if not stamps.size or not np.isfinite(stamps).all() or np.any(np.diff(stamps) < 0):
+        return None
+    signals = {s.name: numbers[s.name] for s in request.signals.values()}
+    inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
+    scale = units.factor(table.time_unit(request.time.name) or request.time.unit, "s")
+    seconds = stamps * scale
+    if not is_joined(seconds, signals, inputs):
+        return None
+    topics = topics_of(seconds, signals, table.units, request.time.name)
+    notes = (*table.notes, joined_note(topics))
+    start = float(seconds[0])
+    return ChannelLog(
+        table.path, table.format, table.size, table.sha256, topics, notes=notes, start=start
+    )
+
+
+def topics_of(
+    seconds: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    units: Mapping[str, str],
+    clock: str,
+) -> tuple[Topic, ...]:
+    """The topics of a joined table, each at its own rows.
+
+    Args:
+        seconds: of the rows (N,) [s].
+        columns: (N,), NaN where a cell is empty.
+        units: by column, where they are stated.
+        clock: the column of time stamps.
+    """
+    topics = []
+    for group in row_groups(columns):
+        own = {name: columns[name][group.rows] for name in group.names}
+        stated = {name: units[name] for name in own if units.get(name)}
+        topics.append(Topic(_called(group.names), seconds[group.rows], own, stated, clock))
+    return tuple(topics)
+
+
+def joined_note(topics: Sequence[Topic]) -> str:
+    """What was made of the rows, in a sentence."""
+    known = [t for t in topics if t.times.size > 1]
+    rates = ", ".join(f"{t.name} at about {1 / usual_step(t.times):.4g} Hz" for t in known[:6])
+    more = f" and {len(known) - 6} more" if len(known) > 6 else ""
+    return (
+        f"its rows hold one topic each and leave other cells empty: each column is taken at the "
+        f"rows that hold it ({rates}{more})"
+    )
+
+
+def _called(names: Sequence[str]) -> str:
+    few = ", ".join(shown(name) for name in names[:_NAMED])
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"rows of {few}{more}"
