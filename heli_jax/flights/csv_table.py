@@ -12,9 +12,11 @@ import numpy as np
 
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
-from heli_jax.flights.csv_cells import is_date, is_number, row_of_units, seconds_of_dates
+from heli_jax.flights.csv_cells import is_number, row_of_units
+from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
+from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
@@ -53,6 +55,8 @@ if TYPE_CHECKING:
 
 _LARGEST = 16 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
+_FIRST = 100
+"""rows in which a column's first filled cell is looked for"""
 _LARGEST_TEXT = 2 * 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
 
@@ -150,6 +154,7 @@ class CsvTable:
         self.units: Mapping[str, str] = dict(units or {})
         self._digest, self._body = digest, body
         self._dates: set[str] = set()
+        self._signs = decimal_signs(body)
 
     @property
     def sha256(self) -> str:
@@ -171,16 +176,15 @@ class CsvTable:
 
     def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]
-        numbers = number_columns(self._body, len(self.names), indices)
+        numbers = number_columns(self._body, len(self.names), indices, self._signs)
         if numbers is not None:
             return {n: numbers[i].values for n, i in zip(names, indices, strict=True)}
-        try:
-            texts = _decimal_points(self._texts(indices), self._body.delimiter)
-        except _TwoDecimalSigns as e:
-            raise wrong(self.path, str(e)) from e
         result = {}
-        for name, text in zip(names, texts, strict=True):
-            values = self._values(name, text)
+        for name, text in zip(names, self._texts(indices), strict=True):
+            try:
+                values = self._values(name, text)
+            except TwoDecimalSigns as e:
+                raise wrong(self.path, str(e), column(name)) from e
             if isinstance(values, int):
                 self._require_no_names(values)
                 problem = f"got {self.cell_text(name, values)}, expected a number"
@@ -195,8 +199,8 @@ class CsvTable:
 
     def _survey(self) -> list[Survey]:
         width = len(self.names)
-        likely = likely_numbers(self._body, width)
-        plain = number_columns(self._body, width, likely) or {}
+        likely = likely_numbers(self._body, width, self._signs)
+        plain = number_columns(self._body, width, likely, self._signs) or {}
         rest = [i for i in range(width) if i not in plain]
         found = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
         if rest:
@@ -206,9 +210,9 @@ class CsvTable:
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
         try:
-            values = self._values(name, _decimal_points([text], self._body.delimiter)[0])
+            values = self._values(name, text)
         # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
-        except _TwoDecimalSigns:
+        except TwoDecimalSigns:
             values = 0
         filled = len(text) - filled_cells(text).null_count
         if not isinstance(values, int):
@@ -236,14 +240,47 @@ class CsvTable:
         return time_unit(self.units.get(name, ""))
 
     def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
-        """A column's numbers (N,), or the first row that holds none."""
-        values = text_floats(text)
-        if not isinstance(values, int) or not is_date(text[values].as_py().strip()):
+        """A column's numbers (N,), or the first row that holds none.
+
+        Raises:
+            TwoDecimalSigns: a number has the other sign than the file.
+        """
+        filled = filled_cells(text)
+        # Before signs are changed, which dates and times of day have of their own.
+        first = next((c for c in filled[:_FIRST].to_pylist() if c is not None), "")
+        if not is_date(first):
+            # Both may be tried where no row at the beginning has a sign.
+            has_commas = len(self._signs) > 1 and _has_comma(filled)
+            sign = "," if has_commas else self._signs[0]
+            points, example = decimal_points(filled, sign)
+            values = text_floats(points)
+            if example and not isinstance(values, int):
+                other = "commas" if sign == "," else "points"
+                self._note(
+                    f"{shown(name)} has marks between thousands, as in {shown(example)}: "
+                    f"{other} are decimal"
+                )
             return values
-        dates = seconds_of_dates(filled_cells(text).to_pylist())
-        if not isinstance(dates, int):
-            self._dates.add(name)
-        return dates
+        cells = filled.to_pylist()
+        dates = seconds_of_dates(cells, self._days(name))
+        if isinstance(dates, int):
+            return dates
+        self._dates.add(name)
+        if dates.note:
+            self._note(f"{shown(name)}: {dates.note}")
+        return dates.seconds
+
+    def _days(self, name: str) -> list[str | None] | None:
+        """The cells of the one column of dates beside a time of day."""
+        _, first = self._record(0)
+        found = [i for i, cell in enumerate(first) if is_day(cell.strip())]
+        if len(found) != 1 or self.names[found[0]] == name:
+            return None
+        return filled_cells(self._texts(found)[0]).to_pylist()
+
+    def _note(self, words: str) -> None:
+        if words not in self.notes:
+            self.notes = (*self.notes, words)
 
     def _require_no_names(self, row: int) -> None:
         """Refuse a header between the rows: a logger began anew there."""
@@ -324,34 +361,6 @@ def _count(n: int) -> str:
     return "1 cell" if n == 1 else f"{n} cells"
 
 
-class _TwoDecimalSigns(Exception):
-    """A file holds both decimal commas and decimal points."""
-
-
-def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.ChunkedArray"]:
-    """The cells with decimal points for commas, where the comma is not the delimiter.
-
-    Raises:
-        _TwoDecimalSigns: so that no thousands separator passes for a decimal sign.
-    """
+def _has_comma(text: "pa.ChunkedArray") -> bool:
     pc = compute()
-    # Over all columns that are read, not one by one: a file has one decimal sign, and a column of
-    # 1.500 beside one of 1,5 holds thousands.
-    signs = {}
-    for sign in (",", ".") if delimiter != "," else ():
-        for text in texts:
-            matches = pc.match_substring(text, sign)
-            # `index` alone would do, and import pandas for its second argument.
-            row = pc.index(matches, True).as_py() if pc.any(matches).as_py() else -1
-            if row >= 0:
-                signs[sign] = shown(text[row].as_py().strip())
-                break
-    if "," not in signs:
-        return texts
-    if "." in signs:
-        both = f"both {signs[',']} and {signs['.']}"
-        if signs[","] == signs["."]:
-            both = f"{signs[',']}, with commas and points"
-        problem = f"got {both}, expected one decimal sign"
-        raise _TwoDecimalSigns(problem)
-    return [pc.replace_substring(text, ",", ".") for text in texts]
+    return bool(pc.any(pc.match_substring(text, ",")).as_py())

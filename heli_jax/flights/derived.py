@@ -247,8 +247,13 @@ class DerivedTable:
         self.table, self.swashplate = table, swashplate
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
-        self.notes, self.units = table.notes, table.units
+        self.units = table.units
         self._marks: dict[str, dict[str, Marked]] = {}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Those of the table, which says more once its cells were read."""
+        return self.table.notes
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
