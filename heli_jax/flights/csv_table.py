@@ -4,25 +4,27 @@ pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes
 takes the fast way, and `Body.records` walks the text again to say where an error is.
 """
 
+import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from heli_jax.errors import InputError
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
 from heli_jax.flights.csv_cells import is_number, row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
+from heli_jax.flights.csv_preamble import find_head, is_for_comments, qualified
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
     check_text,
-    find_delimiter,
-    find_header,
     first_row,
     header_names,
     is_of_blanks,
@@ -75,38 +77,75 @@ def open_csv(path: Path) -> "CsvTable":
     digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
     data, notes = as_utf8(where, data)
     check_text(where, data)
-    head = find_header(data)
+    blanks = path.suffix.lower() not in (".csv", ".tsv")
+    head = find_head(where, data, blanks)
     if head is None:
         raise wrong(where, "holds no header, expected names of columns and rows of numbers")
-    header, line = head.text, f"line {head.number}"
-    first = first_row(data, head.after)
+    (header, number, after), delimiter = head.header, head.delimiter
+    line = f"line {number}"
+    first = first_row(data, after)
     if first is None:
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
     if len(header) > LONGEST_HEADER:
         raise wrong(where, "is longer than a line of a log can be", line)
-    require_short_lines(where, data, head.after, head.number + 1)
-    delimiter = find_delimiter(header, first)
-    rows = plain.rows(head.after) if plain else memoryview(data)[head.after :]
-    if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
+    require_short_lines(where, data, after, head.first_line)
+    rows = plain.rows(after) if plain else memoryview(data)[after:]
+    if blanks and is_of_blanks(header, first):
         text = Body(where, rows, delimiter, 1, False).text
         header, delimiter = tabs_for_blanks(header), "\t"
         rows = memoryview(tabs_for_blanks(text).encode())
     # Before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(where, header.count(delimiter) + 1, line)
-    names = header_names(where, header, delimiter, head.number)
-    if all(is_number(name) for name in names):
-        listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
-        problem = "got numbers, expected the names of the columns; write a line of names above"
-        raise wrong(where, f"{problem}, such as {shown(listed)}", line)
-    quotes = data.find(b'"', head.after) >= 0
-    body, cut = Body(where, rows, delimiter, head.number + 1, quotes).whole(len(names))
+    names = header_names(where, header, delimiter, number)
+    _require_names(where, names, delimiter, line)
+    quotes = data.find(b'"', after) >= 0
+    body = Body(where, rows, delimiter, head.first_line, quotes)
+    names = _as_wide(qualified(names, _split(head.above, where, delimiter, number)), body)
+    body, cut = body.whole(len(names))
+    notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        return CsvTable(size, digest, names, body, notes)
+        return CsvTable(size, digest, names, body, number, notes)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
-    return CsvTable(size, digest, names, body, notes, dict(zip(names, units, strict=True)))
+    stated = dict(zip(names, units, strict=True))
+    return CsvTable(size, digest, names, body, number, notes, stated)
+
+
+def _require_names(path: str, names: Sequence[str], delimiter: str, line: str) -> None:
+    """Refuse a first line that holds a sample."""
+    numbers = [name for name in names if is_number(name)]
+    if len(numbers) < len(names) and not any(map(is_date, names)):
+        return
+    listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
+    what = "numbers" if len(numbers) == len(names) else f"{shown(next(filter(is_date, names)))}"
+    problem = f"got {what}, expected the names of the columns; write a line of names above"
+    raise wrong(path, f"{problem}, such as {shown(listed)}", line)
+
+
+def _split(above: Sequence[str], path: str, delimiter: str, number: int) -> list[tuple[str, ...]]:
+    return [header_names(path, text, delimiter, number) for text in above]
+
+
+def _as_wide(names: tuple[str, ...], body: Body) -> tuple[str, ...]:
+    """The names as many as rows have cells, where only a delimiter at the end, or a column for
+    comments, makes the difference."""
+    first = body.beginning(LONGEST_HEADER)
+    if body.size > len(first):
+        first = first[: first.rfind(b"\n") + 1]
+    rows = dataclasses.replace(body, rows=memoryview(first))
+    try:
+        cells = [cells for _, cells in itertools.islice(rows.records(), _FIRST)]
+    # What is wrong with the quotes is told where the cells are read.
+    except InputError:
+        return names
+    widths = {len(row) for row in cells}
+    if widths == {len(names) + 1} and not any(row[-1].strip() for row in cells):
+        return (*names, "")
+    if widths == {len(names) - 1} and is_for_comments(names[-1]):
+        return names[:-1]
+    return names
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -146,13 +185,14 @@ class CsvTable:
         digest: Digest,
         names: tuple[str, ...],
         body: Body,
+        header_line: int,
         notes: tuple[str, ...] = (),
         units: Mapping[str, str] | None = None,
     ) -> None:
         self.path, self.size, self.names = body.path, size, names
         self.notes = notes
         self.units: Mapping[str, str] = dict(units or {})
-        self._digest, self._body = digest, body
+        self._digest, self._body, self._header_line = digest, body, header_line
         self._dates: set[str] = set()
         self._signs = decimal_signs(body)
 
@@ -206,7 +246,9 @@ class CsvTable:
         if rest:
             texts = zip(rest, self._texts(rest), strict=True)
             found |= {i: self._surveyed(self.names[i], text) for i, text in texts}
-        return [found[i] for i in range(width)]
+        # What stands behind a delimiter at the end of every row is no column.
+        surveys = [found[i] for i in range(width)]
+        return [s for s in surveys if s.name or s.n_filled]
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
         try:
@@ -297,7 +339,7 @@ class CsvTable:
                 self.path,
                 f"got no comma, semicolon or tab between names, expected columns,"
                 f" {shown(missing[0])} among them",
-                f"line {self._body.first_line - 1}",
+                f"line {self._header_line}",
             )
         require_columns(self.path, self.names, names)
 
@@ -344,6 +386,7 @@ class CsvTable:
         for row, (line, cells) in enumerate(self._body.records()):
             if len(cells) != width:
                 problem = f"{_count(len(cells))}, expected {width} as in the header"
+                problem += f" in line {self._header_line}"
                 raise wrong(self.path, problem, f"line {line}")
             for column_cells, i in zip(cells_of, indices, strict=True):
                 column_cells.append(cells[i])

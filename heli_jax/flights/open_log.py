@@ -21,13 +21,13 @@ from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
-_TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log")
+_TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
 _AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
 """what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
-    "expected a table (.csv, .txt, .tsv, .asc, .dat, .parquet), arrays (.mat, .nc, .h5, .hdf5) or"
-    " an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet), arrays (.mat, .nc, .h5,"
+    " .hdf5) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
 )
 
 
