@@ -6,21 +6,26 @@ as many names, or a line of units between them.
 """
 
 import csv
+import dataclasses
+import itertools
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from heli_jax.errors import InputError
 from heli_jax.flights.csv_cells import is_number, row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day
 from heli_jax.flights.csv_text import (
     DELIMITERS,
+    LONGEST_HEADER,
+    Body,
     Line,
     find_delimiter,
     header_line,
     is_of_blanks,
     lines_in,
 )
-from heli_jax.flights.table import wrong
+from heli_jax.flights.table import shown, wrong
 
 _LOOKED_AT = 1 << 20
 """bytes in which a table is sought"""
@@ -28,6 +33,8 @@ _FEWEST = 3
 """rows that make a table"""
 _NEAR = 6
 """lines from a header on, one of which is a row of the table"""
+_FIRST = 100
+"""rows by which it is told how wide a table is"""
 _NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
 """with any decimal sign, and with marks between thousands"""
 _SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
@@ -226,3 +233,49 @@ def qualified(names: Sequence[str], above: Sequence[Sequence[str]]) -> tuple[str
             continue
         names = [f"{g}.{n}" if g and n else n or g for g, n in zip(groups, names, strict=True)]
     return tuple(names)
+
+
+def require_names(path: str, names: Sequence[str], delimiter: str, line: str) -> None:
+    """Refuse a first line that holds a sample.
+
+    Args:
+        path: for the message.
+        names: what stands in it.
+        delimiter: between them.
+        line: which it is, in words.
+
+    Raises:
+        InputError: with what to write above.
+    """
+    numbers = [name for name in names if is_number(name)]
+    if len(numbers) < len(names) and not any(map(is_date, names)):
+        return
+    listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
+    what = "numbers" if len(numbers) == len(names) else f"{shown(next(filter(is_date, names)))}"
+    problem = f"got {what}, expected the names of the columns; write a line of names above"
+    raise wrong(path, f"{problem}, such as {shown(listed)}", line)
+
+
+def as_wide(names: tuple[str, ...], body: Body) -> tuple[str, ...]:
+    """The names as many as rows have cells, where only a delimiter at the end, or a column for
+    comments, makes the difference.
+
+    Args:
+        names: in the header.
+        body: the rows.
+    """
+    first = body.beginning(LONGEST_HEADER)
+    if body.size > len(first):
+        first = first[: first.rfind(b"\n") + 1]
+    rows = dataclasses.replace(body, rows=memoryview(first))
+    try:
+        cells = [cells for _, cells in itertools.islice(rows.records(), _FIRST)]
+    # What is wrong with the quotes is told where the cells are read.
+    except InputError:
+        return names
+    widths = {len(row) for row in cells}
+    if widths == {len(names) + 1} and not any(row[-1].strip() for row in cells):
+        return (*names, "")
+    if widths == {len(names) - 1} and is_for_comments(names[-1]):
+        return names[:-1]
+    return names

@@ -4,22 +4,19 @@ pyarrow neither names the line of a bad cell nor keeps lines apart inside quotes
 takes the fast way, and `Body.records` walks the text again to say where an error is.
 """
 
-import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heli_jax.errors import InputError
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
-from heli_jax.flights.csv_cells import is_number, row_of_units
+from heli_jax.flights.csv_cells import row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
-from heli_jax.flights.csv_preamble import find_head, is_for_comments, qualified
+from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
@@ -97,10 +94,11 @@ def open_csv(path: Path) -> "CsvTable":
     # Before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(where, header.count(delimiter) + 1, line)
     names = header_names(where, header, delimiter, number)
-    _require_names(where, names, delimiter, line)
+    require_names(where, names, delimiter, line)
     quotes = data.find(b'"', after) >= 0
     body = Body(where, rows, delimiter, head.first_line, quotes)
-    names = _as_wide(qualified(names, _split(head.above, where, delimiter, number)), body)
+    groups = [header_names(where, text, delimiter, number) for text in head.above]
+    names = as_wide(qualified(names, groups), body)
     body, cut = body.whole(len(names))
     notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
@@ -111,41 +109,6 @@ def open_csv(path: Path) -> "CsvTable":
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
     stated = dict(zip(names, units, strict=True))
     return CsvTable(size, digest, names, body, number, notes, stated)
-
-
-def _require_names(path: str, names: Sequence[str], delimiter: str, line: str) -> None:
-    """Refuse a first line that holds a sample."""
-    numbers = [name for name in names if is_number(name)]
-    if len(numbers) < len(names) and not any(map(is_date, names)):
-        return
-    listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
-    what = "numbers" if len(numbers) == len(names) else f"{shown(next(filter(is_date, names)))}"
-    problem = f"got {what}, expected the names of the columns; write a line of names above"
-    raise wrong(path, f"{problem}, such as {shown(listed)}", line)
-
-
-def _split(above: Sequence[str], path: str, delimiter: str, number: int) -> list[tuple[str, ...]]:
-    return [header_names(path, text, delimiter, number) for text in above]
-
-
-def _as_wide(names: tuple[str, ...], body: Body) -> tuple[str, ...]:
-    """The names as many as rows have cells, where only a delimiter at the end, or a column for
-    comments, makes the difference."""
-    first = body.beginning(LONGEST_HEADER)
-    if body.size > len(first):
-        first = first[: first.rfind(b"\n") + 1]
-    rows = dataclasses.replace(body, rows=memoryview(first))
-    try:
-        cells = [cells for _, cells in itertools.islice(rows.records(), _FIRST)]
-    # What is wrong with the quotes is told where the cells are read.
-    except InputError:
-        return names
-    widths = {len(row) for row in cells}
-    if widths == {len(names) + 1} and not any(row[-1].strip() for row in cells):
-        return (*names, "")
-    if widths == {len(names) - 1} and is_for_comments(names[-1]):
-        return names[:-1]
-    return names
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:

@@ -247,13 +247,8 @@ class DerivedTable:
         self.table, self.swashplate = table, swashplate
         self.path, self.format, self.size = table.path, table.format, table.size
         self.sha256, self.names = table.sha256, table.names
-        self.units = table.units
+        self.notes, self.units = table.notes, table.units
         self._marks: dict[str, dict[str, Marked]] = {}
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Those of the table, which says more once its cells were read."""
-        return self.table.notes
 
     def numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns as float64 (N,), NaN where a cell is empty.
@@ -265,6 +260,8 @@ class DerivedTable:
         plain = [name for name in names if name not in derived]
         plain += [n for d in derived.values() for group in d.groups for n in group]
         columns = self.table.numbers(list(dict.fromkeys(plain)))
+        # A table says more of its cells once they were read.
+        self.notes = self.table.notes
         for name, d in derived.items():
             needed = {n: columns[n] for group in d.groups for n in group}
             rows = {n: (np.arange(x.size), x) for n, x in needed.items()}

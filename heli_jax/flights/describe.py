@@ -10,6 +10,7 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.errors import nearest
+from heli_jax.flights.clock_guess import counter_notes, guess_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -33,9 +34,8 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
+from heli_jax.flights.time_units import SECONDS
 
-_TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
 _FILTER = re.compile(
@@ -228,7 +228,7 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
     """
     surveys = table.survey()
     if time is None:
-        signal, guessed = _guess_time(table, surveys)
+        signal, guessed = guess_clock(table, surveys)
     else:
         signal, guessed = _asked_time(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
@@ -246,7 +246,12 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         columns=tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
-        notes=(*table.notes, *_other_lengths(surveys), *marks),
+        notes=(
+            *table.notes,
+            *_other_lengths(surveys),
+            *(counter_notes(surveys) if clock is None else ()),
+            *marks,
+        ),
     )
 
 
@@ -303,32 +308,6 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
         except ValueError as e:
             raise wrong(table.path, str(e), column(signal.name)) from e
     return signal
-
-
-def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, bool]:
-    """The clock, and whether its unit is a guess."""
-    numeric = [survey.name for survey in surveys if survey.values is not None]
-    # A name decides before the numbers do: a counter or a distance may increase all along too.
-    for name in numeric:
-        stem, _ = split_unit(name)
-        # Of a path, log.roll.time, the last part is the name.
-        if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
-            return _with_unit(table, surveys, name)
-    # Without a name to go by, the first column that increases all along is taken. The result names
-    # it, so that a wrong guess is seen.
-    for name in numeric:
-        values = _values(surveys, name)
-        if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
-            return _with_unit(table, surveys, name)
-    return None, False
-
-
-def _with_unit(table: Table, surveys: list[Survey], name: str) -> tuple[Signal, bool]:
-    stated = table.time_unit(name) or split_unit(name)[1]
-    if stated:
-        return Signal(name, stated, "s"), False
-    stamps = _values(surveys, name)
-    return Signal(name, likely_unit(stamps), "s"), True
 
 
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:

@@ -19,6 +19,8 @@ _UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
 # A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
 # bracket was opened that has to be closed.
 _AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
+# TimeUS, timestampMs: joined by a capital alone.
+_JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
 _LONGEST_FLIGHT = 6 * 3600.0
 """s: ticks that would make a longer one are more likely of the next smaller unit"""
 
@@ -37,6 +39,8 @@ def split_unit(name: str) -> tuple[str, str]:
     """A column's name without the unit of time at its end, and this unit, empty where there is
     none."""
     match = _AT_END.fullmatch(name)
+    if match is None and (joined := _JOINED.fullmatch(name)):
+        return joined[1], time_unit(joined[2]) or ""
     unit = time_unit(match[3]) if match else None
     return (match[1], unit) if match and unit else (name, "")
 

@@ -180,7 +180,7 @@ def _read(path: Path, number: int | None) -> _Log:
 def _read_table(table: Table) -> _Log:
     info: LogInfo = describe_table(table, None, None)
     if info.time is None or info.time.problem:
-        why = info.time.problem if info.time is not None else "none of its columns is a time"
+        why = info.time.problem if info.time is not None else _without_time(info)
         raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
     clock = info.time.column
     names = [c.name for c in info.columns if c.kind == "number"]
@@ -195,6 +195,13 @@ def _read_table(table: Table) -> _Log:
         if n != clock and _is_known(values[n])
     }
     return _Log(table.path, table.format, series, info.time, None, False)
+
+
+def _without_time(info: LogInfo) -> str:
+    """Why none of a table's columns is a time, in words."""
+    strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
+    notes = [strays, *(note for note in info.notes if "taken for no time" in note)]
+    return "; ".join(filter(None, ("none of its columns is a time", *notes)))
 
 
 def _is_known(values: np.ndarray) -> bool:
@@ -326,11 +333,15 @@ def _found(log: _Log, names: Sequence[str], si: str, taken: list[str]) -> Guess 
     if not candidates:
         return None
     taken.append(candidates[0])
-    found = guess.scaled(candidates[0], log.series[candidates[0]], si)
+    found = guess.scaled(candidates[0], log.series[candidates[0]], si, _full_travel(log))
     if len(candidates) == 1:
         return found
     others = f"could be {', '.join(candidates[1:4])} as well"
     return found._replace(remarks=(*found.remarks, others))
+
+
+def _full_travel(log: _Log) -> float | None:
+    return guess.full_travel({n: s for n, s in log.series.items() if names_a_stick(n)})
 
 
 def _by_correlation(
@@ -362,7 +373,7 @@ def _by_correlation(
         if best is None:
             continue
         channel, related = best
-        made = guess.scaled(channel, log.series[channel], si)
+        made = guess.scaled(channel, log.series[channel], si, _full_travel(log))
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)
