@@ -18,6 +18,7 @@ from heli_jax.flights.grid import (
     Uneven,
     not_increasing,
     rounding_of,
+    shared_stamps,
     uniform_grid,
     without_overflow,
 )
@@ -34,6 +35,7 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
+from heli_jax.flights.table_view import without_copies
 from heli_jax.flights.time_units import SECONDS
 
 _GAP_STEPS = 1.5
@@ -235,6 +237,10 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
     # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    if signal is not None:
+        once = without_copies(table, signal.name, surveys)
+        if once is not table:
+            table, surveys = once, once.survey()
     marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
     return LogInfo(
@@ -365,7 +371,9 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
     back = not_increasing(seconds)
     if back is not None:
         row, fault = back
-        return f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
+        where = f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
+        shared = shared_stamps(seconds)
+        return f"{where}: {shared}" if shared else where
     if np.median(steps) < SHORTEST_STEP:
         return "the steps are shorter than 1 ns"
     return ""

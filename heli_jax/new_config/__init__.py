@@ -16,6 +16,7 @@ from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.preset import fitting_presets, model_inputs, model_outputs
 from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_view import without_copies
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess, Series
@@ -183,6 +184,7 @@ def _read_table(table: Table) -> _Log:
         why = info.time.problem if info.time is not None else _without_time(info)
         raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
     clock = info.time.column
+    table = without_copies(table, clock)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
