@@ -10,7 +10,7 @@ from heli_jax.flights.flight import Signal
 from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import likely_unit, split_unit
 
-_TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 _COUNTERS = {
     *(
         "frame",
@@ -42,11 +42,11 @@ def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None,
         stem, _ = split_unit(name)
         # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
         last = re.split(r"[./]", stem)[-1].strip("%_ ").casefold()
-        if last in _TIME_NAMES or table.time_unit(name):
+        if last in TIME_NAMES or table.time_unit(name):
             return _with_unit(table, name, values[name])
     increasing = [n for n in numeric if _increases(values[n])]
     # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
-    named = [n for n in increasing if _TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
+    named = [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
     # Without a name to go by, the first column that increases all along is taken, but for numbers
     # of rows. The result names it, so that a wrong guess is seen.
     others = [n for n in increasing if not _counts(n, values[n])]
