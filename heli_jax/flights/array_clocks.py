@@ -11,7 +11,7 @@ from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.channel_names import words_in
 from heli_jax.flights.clock_guess import TIME_NAMES
 from heli_jax.flights.log import ChannelLog, Topic
-from heli_jax.flights.table import sample_count, shown
+from heli_jax.flights.table import Table, sample_count, shown
 from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
 
 _LEVEL = re.compile(r"[./]")
@@ -47,6 +47,19 @@ def by_clocks(table: ArrayTable) -> ChannelLog | None:
     without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
     notes = (*table.notes, *_left_out(without, arrays))
     return ChannelLog(table.path, table.format, table.size, table.sha256, topics, notes=notes)
+
+
+def clock_notes(table: Table) -> tuple[str, ...]:
+    """That arrays have clocks of their own, where they have.
+
+    Args:
+        table: of rows or arrays.
+    """
+    log = by_clocks(table) if isinstance(table, ArrayTable) else None
+    if log is None:
+        return ()
+    listed = ", ".join(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics[:_MOST_NAMED])
+    return (f"arrays have clocks of their own, read where no time is stated: {listed}",)
 
 
 def _clock(name: str, values: np.ndarray) -> _Clock | None:

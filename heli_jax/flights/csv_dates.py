@@ -27,6 +27,8 @@ _MINUTES = re.compile(r"(\d{1,3}):(\d\d[.,]\d{1,12})")
 _COUNT = re.compile(r"([+-]?\d*[.,]?\d+(?:[eE][+-]?\d+)?)\s*([A-Za-zµμ]+)")
 _MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 _CENTURY = 2000
+_LONGEST = 60
+"""characters of a time; of a damaged file a cell may be as long as itself"""
 
 
 class Dates(NamedTuple):
@@ -38,13 +40,15 @@ class Dates(NamedTuple):
 
 def is_date(cell: str) -> bool:
     """Whether a cell is a date with a time of day, a time of day, or a time with its unit."""
+    if len(cell) > _LONGEST:
+        return False
     known = (_DATE, _DATE_MINUTES, _TIME_OF_DAY, _MINUTES)
     return any(form.fullmatch(cell) for form in known) or _unit_of_count(cell) is not None
 
 
 def is_day(cell: str) -> bool:
     """Whether a cell is a date without a time of day."""
-    return _DATE_ALONE.fullmatch(cell) is not None
+    return len(cell) <= _LONGEST and _DATE_ALONE.fullmatch(cell) is not None
 
 
 def seconds_of_dates(
@@ -65,6 +69,8 @@ def seconds_of_dates(
     filled = [i for i, cell in enumerate(cells) if cell is not None]
     if not filled:
         return Dates(np.full(len(cells), np.nan))
+    if (long := next((i for i in filled if len(cells[i] or "") > _LONGEST), None)) is not None:
+        return long
     first = cells[filled[0]] or ""
     read: Callable[[Sequence[str]], Dates | int]
     if form := next((f for f in (_DATE, _DATE_MINUTES) if f.fullmatch(first)), None):

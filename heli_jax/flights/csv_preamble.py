@@ -28,7 +28,8 @@ from heli_jax.flights.csv_text import (
 from heli_jax.flights.table import shown, wrong
 
 _LOOKED_AT = 1 << 20
-"""bytes in which a table is sought"""
+_MOST_LINES = 20_000
+"""bytes and lines in which a table is sought"""
 _FEWEST = 3
 """rows that make a table"""
 _NEAR = 6
@@ -85,7 +86,7 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
     delimiter = find_delimiter(plain.text, near[1].text if len(near) > 1 else "")
     if _is_header(near, delimiter, blanks):
         return Head(plain, delimiter, (), plain.number + 1)
-    lines = [line for line in lines_in(data, plain, _LOOKED_AT) if line.text.strip()]
+    lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
     return _sought(path, lines, blanks) or Head(plain, delimiter, (), plain.number + 1)
 
 
@@ -145,6 +146,8 @@ def _head_above(
         header -= 1
     if header < 0 or not _fits(cells[header], cells[row]):
         return None
+    if delimiter == " " and not is_of_blanks(lines[header].text, lines[row].text):
+        return None
     top = header
     while top and _is_group(lines, cells, top - 1, width) and delimiter != " ":
         top -= 1
@@ -166,7 +169,8 @@ def _is_group(lines: Sequence[Line], cells: Sequence[list[str]], at: int, width:
     """Whether a line may hold names of groups of the columns, or their numbers."""
     filled = [cell for cell in cells[at] if cell.strip()]
     together = lines[at].number + 1 == lines[at + 1].number
-    return together and len(cells[at]) == width and bool(filled) and not is_date(filled[0])
+    alike = len(cells[at]) == width and not _are_units(cells[at])
+    return together and alike and bool(filled) and not is_date(filled[0])
 
 
 def _fits(names: Sequence[str], row: Sequence[str]) -> bool:

@@ -46,6 +46,7 @@ _FILLERS = {
     "body",
     "imu",
     "est",
+    "out1",
 }
 # Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
 _OTHER = {

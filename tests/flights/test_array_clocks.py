@@ -9,6 +9,7 @@ import scipy.io
 from heli_jax import cli, load_config
 from heli_jax.config import read_flights
 from heli_jax.errors import InputError
+from heli_jax.flights import describe_log
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import open_hdf5, open_mat
 
@@ -26,6 +27,9 @@ def test_new_takes_the_clock_of_each_group(
     scipy.io.savemat(path, {"log": log})
     assert cli.main(["new", str(path), "--out", str(out), "--model", "linear:roll"]) == 0
     assert "left out, since no time of their length" in capsys.readouterr().err
+    said = " ".join(describe_log(path).notes)
+    assert "clocks of their own" in said
+    assert "'log.imu.time_ms' of 3, 'log.rc.t' of 1" in said
     assert "time:" not in out.read_text()
     text = out.read_text().replace("rate: 50 ", "rate: 100")
     out.write_text(text)
