@@ -38,6 +38,7 @@ _FIRST = 100
 """rows by which it is told how wide a table is"""
 _NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
 """with any decimal sign, and with marks between thousands"""
+_TYPE = re.compile(r"\s*(?:u?int|long|float|double|single|real|string|bool|boolean)\d*\s*", re.I)
 _SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
 _IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
 """of a body, in place of its name"""
@@ -141,8 +142,8 @@ def _head_above(
     if row and len(cells[row - 1]) == width and _are_units(cells[row - 1]):
         begin = row - 1
     header = begin - 1
-    # A rule, or a word on what follows, between names and rows.
-    if header > 0 and len(cells[header]) == 1:
+    # A rule, a word on what follows, or types of the columns, between names and rows.
+    if header > 0 and (len(cells[header]) == 1 or all(map(_TYPE.fullmatch, cells[header]))):
         header -= 1
     if header < 0 or not _fits(cells[header], cells[row]):
         return None

@@ -82,6 +82,7 @@ NOT_READ = {
         ("a.txt", ["Stand, roll", "Date: 3/1/2024", "", "t u p", "s % deg/s"], rows(" "), "tup", 4),
         ("a.csv", ["Title,Stand", "Rate,100", "Begin,12", "t,u,p"], rows(), "tup", 4),
         ("a.csv", ["t,u,p", "-----"], rows(), "tup", 1),
+        ("a.csv", ["t,u,p", "double,double,single"], rows(), "tup", 1),
         ("a.csv", ["s,deg/s,deg/s", "t,u,p"], rows(), "tup", 2),
         ("a.csv", ["t,u,p"], rows(",", ","), ("t", "u", "p", ""), 1),
     ],

@@ -11,6 +11,7 @@ from heli_jax.flights.csv_dates import Dates, seconds_of_dates
 from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
+from heli_jax.flights.time_units import likely_unit
 
 N, DT = 300, 0.01
 T = DT * np.arange(N)
@@ -137,3 +138,16 @@ def test_points_among_decimal_commas_that_end_no_thousands_are_refused(tmp_path)
         read(path)
     columns = {c.name: c.kind for c in describe_log(path).columns}
     assert columns == {"Time": "number", "u": "text", "p": "number"}
+
+
+@pytest.mark.parametrize(
+    ("step", "rows", "unit"),
+    [
+        *((0.01, 6000, "s"), (1.0, 6000, "s"), (0.1, 100_000, "s")),
+        *((10, 6000, "ms"), (200, 3000, "ms"), (1, 60_000, "ms"), (2, 9000, "ms")),
+        *((2500, 9000, "us"), (500, 40_000, "us"), (125, 200_000, "us")),
+        (10_000_000, 900, "ns"),
+    ],
+)
+def test_ticks_without_a_unit_are_of_the_one_that_makes_a_flight(step, rows, unit):
+    assert likely_unit(step * np.arange(rows) + 12345.0) == unit
