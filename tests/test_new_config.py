@@ -309,6 +309,15 @@ def test_pulse_widths_by_the_unit_of_the_file_get_scale_and_offset(
     np.testing.assert_allclose(flight.outputs["p"], RATE, atol=1e-6)
 
 
+def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) -> None:
+    columns = {"t": T, "rc_aileron": np.round(700 * STICK), "rc_aileron(percent)": 100 * STICK}
+    log, out = write(tmp_path / "run.csv", columns | {"p": RATE}), tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    lat = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals.inputs["lat"]
+    assert (lat.signal, lat.scale) == ("rc_aileron(percent)", 1.0)
+    assert "could be rc_aileron as well" in out.read_text()
+
+
 def test_a_counter_of_rows_is_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = write(tmp_path / "run.csv", {"Frame": np.arange(T.size), "aileron": STICK, "p": RATE})
     assert cli.main(["new", str(log), "--out", str(tmp_path / "x.yaml")]) == 2

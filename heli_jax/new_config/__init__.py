@@ -268,12 +268,14 @@ def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess |
     candidates = _moving(log, candidates) or candidates
     if not candidates:
         return None
-    taken.append(candidates[0])
-    found = guess.scaled(candidates[0], log.series[candidates[0]], si, _full_travel(log))
-    if len(candidates) == 1:
+    chosen = guess.of_known_unit(candidates, log.series, si)
+    taken.append(chosen)
+    found = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    others = [n for n in candidates if n != chosen]
+    if not others:
         return found
-    others = f"could be {', '.join(candidates[1:4])} as well"
-    return found._replace(remarks=(*found.remarks, others))
+    remark = f"could be {', '.join(others[:3])} as well"
+    return found._replace(remarks=(*found.remarks, remark))
 
 
 def _full_travel(log: Log) -> float | None:

@@ -181,6 +181,20 @@ def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
     return words[:end]
 
 
+def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> str:
+    """The first channel, or one of the same words whose unit is stated: rc_aileron(percent).
+
+    Args:
+        names: the likeliest first.
+        log: the channels.
+        si: the unit that the model has.
+    """
+    words = words_of(names[0])
+    alike = [n for n in names if words_of(n) == words]
+    known = (n for n in alike if _fits(log[n].unit or without_unit(n)[1] or "none", si))
+    return next(known, names[0])
+
+
 def is_excitation(name: str) -> bool:
     """Whether a channel's name says that it is an excitation that an autopilot added to a stick."""
     return bool(_EXCITATIONS & set(words_of(name)))
