@@ -66,7 +66,7 @@ def _clock(name: str, values: np.ndarray) -> _Clock | None:
     *group, leaf = _LEVEL.split(name)
     words = words_in(split_unit(leaf)[0])
     at = next((i for i in (0, len(words) - 1) if words and words[i] in TIME_NAMES), None)
-    increases = values.size > 1 and bool(np.all(np.diff(values) > 0))
+    increases = values.size > 1 and bool(np.all(values[1:] > values[:-1]))
     if at is None or not increases:
         return None
     # t_imu as well as imu_time.
@@ -95,7 +95,9 @@ def _topic(
     stamps = arrays[clock]
     unit = table.time_unit(clock) or split_unit(clock)[1] or likely_unit(stamps)
     units = {n: table.units.get(n, "") for n in names}
-    return Topic(clock, stamps * SECONDS[unit], {n: arrays[n] for n in names}, units, clock)
+    with np.errstate(over="ignore"):  # of a damaged file
+        stamps = stamps * SECONDS[unit]
+    return Topic(clock, stamps, {n: arrays[n] for n in names}, units, clock)
 
 
 def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:

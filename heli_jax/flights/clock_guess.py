@@ -76,7 +76,9 @@ def _counts(name: str, values: np.ndarray) -> bool:
     """Whether whole numbers count rows or frames, one by one, by name too: a log at a sample a
     second has such times."""
     by_name = not name or bool(_COUNTERS & set(words_in(name)))
-    return by_name and bool(np.all(np.diff(values) == 1.0) and values[0] % 1.0 == 0.0)
+    return by_name and bool(
+        np.all(values[1:] == values[:-1] + 1.0) and values[0] == np.rint(values[0])
+    )
 
 
 def _with_unit(table: Table, name: str, stamps: np.ndarray) -> tuple[Signal, bool]:

@@ -64,7 +64,7 @@ _MANY = 0.1
 
 def shared_stamps(stamps: np.ndarray) -> str:
     """Why many of the stamps (N,) stand still, in words; empty where few do."""
-    still = int(np.count_nonzero(np.diff(stamps) == 0))
+    still = int(np.count_nonzero(stamps[1:] == stamps[:-1]))
     if still <= _MANY * stamps.size:
         return ""
     return (

@@ -124,9 +124,10 @@ def first_of_copies(stamps: np.ndarray, columns: Sequence[np.ndarray]) -> np.nda
         return None
     keep = np.ones(stamps.size, bool)
     keep[order[1:][same]] = False
+    left = stamps[keep]
     # Where times stand still with other values too, they have too few digits, and a machine at rest
     # made some rows alike.
-    return np.flatnonzero(keep) if np.all(np.diff(stamps[keep]) > 0) else None
+    return np.flatnonzero(keep) if np.all(left[1:] > left[:-1]) else None
 
 
 def seen_once(table: Table, rows: np.ndarray) -> TableView:
