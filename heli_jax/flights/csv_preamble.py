@@ -53,6 +53,7 @@ class Head(NamedTuple):
         above: lines of names above the header, the nearest first.
         first_line: the number of the first line of rows or units.
         note: what stands above, in words; empty of a table that begins with its names.
+        is_fitting: whether rows of as many cells were found right below.
     """
 
     header: Line
@@ -60,6 +61,7 @@ class Head(NamedTuple):
     above: tuple[str, ...]
     first_line: int
     note: str = ""
+    is_fitting: bool = True
 
 
 def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
@@ -88,7 +90,8 @@ def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
     if _is_header(near, delimiter, blanks):
         return Head(plain, delimiter, (), plain.number + 1)
     lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
-    return _sought(path, lines, blanks) or Head(plain, delimiter, (), plain.number + 1)
+    unsure = Head(plain, delimiter, (), plain.number + 1, is_fitting=False)
+    return _sought(path, lines, blanks) or unsure
 
 
 def _is_header(lines: Sequence[Line], delimiter: str, blanks: bool) -> bool:

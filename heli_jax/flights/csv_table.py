@@ -16,7 +16,7 @@ from heli_jax.flights.csv_cells import row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
-from heli_jax.flights.csv_preamble import as_wide, find_head, qualified, require_names
+from heli_jax.flights.csv_preamble import Head, as_wide, find_head, qualified, require_names
 from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 
 _LARGEST = 16 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
+_SOUGHT = "no line of names stands right above rows of as many cells, most of them numbers"
+"""of a file in whose first 1 MB a table was sought"""
 _FIRST = 100
 """rows in which a column's first filled cell is looked for"""
 _LARGEST_TEXT = 2 * 10**9
@@ -103,12 +105,12 @@ def open_csv(path: Path) -> "CsvTable":
     notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        return CsvTable(size, digest, names, body, number, notes)
+        return CsvTable(size, digest, names, body, head, notes)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
     stated = dict(zip(names, units, strict=True))
-    return CsvTable(size, digest, names, body, number, notes, stated)
+    return CsvTable(size, digest, names, body, head, notes, stated)
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -148,14 +150,14 @@ class CsvTable:
         digest: Digest,
         names: tuple[str, ...],
         body: Body,
-        header_line: int,
+        head: Head,
         notes: tuple[str, ...] = (),
         units: Mapping[str, str] | None = None,
     ) -> None:
         self.path, self.size, self.names = body.path, size, names
         self.notes = notes
         self.units: Mapping[str, str] = dict(units or {})
-        self._digest, self._body, self._header_line = digest, body, header_line
+        self._digest, self._body, self._head = digest, body, head
         self._dates: set[str] = set()
         self._signs = decimal_signs(body)
 
@@ -302,7 +304,7 @@ class CsvTable:
                 self.path,
                 f"got no comma, semicolon or tab between names, expected columns,"
                 f" {shown(missing[0])} among them",
-                f"line {self._header_line}",
+                f"line {self._head.header.number}",
             )
         require_columns(self.path, self.names, names)
 
@@ -349,7 +351,9 @@ class CsvTable:
         for row, (line, cells) in enumerate(self._body.records()):
             if len(cells) != width:
                 problem = f"{_count(len(cells))}, expected {width} as in the header"
-                problem += f" in line {self._header_line}"
+                problem += f" in line {self._head.header.number}"
+                if not self._head.is_fitting:
+                    problem += f"; {_SOUGHT}"
                 raise wrong(self.path, problem, f"line {line}")
             for column_cells, i in zip(cells_of, indices, strict=True):
                 column_cells.append(cells[i])

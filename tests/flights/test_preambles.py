@@ -115,5 +115,8 @@ def test_two_tables_in_a_file_and_samples_without_names_are_refused(tmp_path):
         open_csv(path)
     # One cell too many, which is none of a delimiter at the end.
     path.write_text("\n".join(("t,u,p", *rows(",", ",7"))))
-    with pytest.raises(InputError, match="line 2: 4 cells, expected 3 as in the header in line 1"):
+    with pytest.raises(
+        InputError,
+        match=r"line 2: 4 cells, expected 3 as in the header in line 1; no line of names",
+    ):
         open_csv(path).numbers(["t"])
