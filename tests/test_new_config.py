@@ -6,10 +6,21 @@ import numpy as np
 import pytest
 
 from heli_jax import cli, load_config, yaml_file
+from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
+from heli_jax.flights.channel_names import unit_in_name
 from heli_jax.new_config import _names
-from heli_jax.new_config.guess import Series, by_motion, by_name, may_be, scaled, words_of
+from heli_jax.new_config.guess import (
+    Series,
+    by_motion,
+    by_name,
+    full_travel,
+    may_be,
+    scaled,
+    without_unit,
+    words_of,
+)
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 
 T = np.arange(0.0, 20.0, 0.02)
@@ -195,7 +206,11 @@ def test_a_whole_name_goes_before_one_that_holds_it_and_commands_are_no_measurem
     ("name", "called"),
     [
         *((n, "roll_rate") for n in ("RollRate", "gyroX", "wx", "omega_x", "p_meas", "phi_dot")),
+        *((n, "roll_rate") for n in ("gyroADC[0]", "p_radps", "Gyro X (deg/s)", "imu_gx")),
+        *((n, "roll_rate") for n in ("AngVelX", "/orientation/roll-rate-degps", "gx_dps")),
+        *((n, "roll_rate") for n in ("RollRate_degPerSec", "roll_rate_deg_sec_filt", "wx.raw")),
         *((n, "pitch_rate") for n in ("PitchRate", "q_dps_meas", "rates.y", "GyroY_radps")),
+        *((n, "pitch_rate") for n in ("gyroUnfilt[1]", "ang_vel_y", "____Q,_deg/s")),
         *((n, "roll") for n in ("rollDeg", "phi_meas_deg", "RollAngle_rad")),
     ],
 )
@@ -208,7 +223,9 @@ def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
     ("name", "stick"),
     [
         *((n, "roll") for n in ("Roll_Cmd", "roll_cmd_deg", "aileron_cmd", "cmdRoll", "ail_us")),
-        *((n, "pitch") for n in ("elevatorCmd", "pitch_command", "delta_e")),
+        *((n, "roll") for n in ("rcCommand[0]", "ch1_aileron_us", "Ail", "ailrn,_yok1")),
+        *((n, "pitch") for n in ("elevatorCmd", "pitch_command", "delta_e", "rcCommand[1]")),
+        *((n, "yaw") for n in ("rcCommand[2]", "Rud")),
     ],
 )
 def test_names_of_sticks_as_people_write_them(name: str, stick: str) -> None:
@@ -239,6 +256,72 @@ def test_units_by_the_size_of_numbers(
     found = scaled("x", Series(np.arange(50.0), values), si)
     assert (found.unit, found.scale) == (unit, scale)
     assert any(r.startswith("GUESS") for r in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("roll_rate_dps", "deg/s"),
+        ("p_radps", "rad/s"),
+        ("roll-rate-degps", "deg/s"),
+        ("RollRate_degPerSec", "deg/s"),
+        ("p deg per second", "deg/s"),
+        ("w_m_s", "m/s"),
+        ("p_dot_rad_s2", "rad/s^2"),
+        ("Climb ft/sec", "ft/s"),
+    ],
+)
+def test_the_unit_of_a_rate_in_a_name_is_told_by_one_rule(name: str, unit: str) -> None:
+    assert without_unit(name)[1] == unit
+    assert unit_in_name(name) in (unit, "")
+
+
+def test_sticks_that_count_to_their_stops() -> None:
+    values = np.round(np.linspace(-274, 270, 50))
+
+    def stick(name: str, full: float | None = None) -> tuple[str, float | str]:
+        found = scaled(name, Series(np.arange(50.0), values), "1", full)
+        return found.unit, found.scale
+
+    # Betaflight's commands in steps of pulse widths; a radio's sticks as the stop of one tells.
+    assert stick("rcCommand[0]") == ("1", 1 / 500)
+    assert stick("Ail") == ("1", 0.001)
+    thr = Series(np.arange(50.0), np.where(np.arange(50) < 9, -1024.0, values))
+    assert stick("Ail", full_travel({"Ail": thr, "Thr": thr})) == ("1", 1 / 1024)
+    assert full_travel({"x": Series(np.arange(50.0), values)}) is None
+    # Whole numbers are no rad/s, however small.
+    rate = Series(np.arange(50.0), np.round(np.linspace(-5, 6, 50)))
+    assert scaled("gyroADC[0]", rate, "rad/s").unit == "deg/s"
+
+
+@pytest.mark.parametrize("unit", ["us", "µs", "usec"])
+def test_pulse_widths_by_the_unit_of_the_file_get_scale_and_offset(
+    tmp_path: Path, unit: str
+) -> None:
+    """A stick in microseconds is a receiver's, and no time."""
+    columns = {"t": T, "aileron": 1500.0 + 400.0 * STICK, "p": RATE}
+    lines = write(tmp_path / "run.csv", columns).read_text().splitlines()
+    log, out = tmp_path / "run.csv", tmp_path / "run.yaml"
+    log.write_text("\n".join((lines[0], f"s,{unit},rad/s", *lines[1:])) + "\n")
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    (flight,) = read_flights(load_config(out))
+    np.testing.assert_allclose(flight.inputs["lat"], 0.8 * STICK, atol=1e-6)
+    np.testing.assert_allclose(flight.outputs["p"], RATE, atol=1e-6)
+
+
+def test_of_a_stick_logged_twice_the_one_with_a_unit_is_taken(tmp_path: Path) -> None:
+    columns = {"t": T, "rc_aileron": np.round(700 * STICK), "rc_aileron(percent)": 100 * STICK}
+    log, out = write(tmp_path / "run.csv", columns | {"p": RATE}), tmp_path / "run.yaml"
+    assert cli.main(["new", str(log), "--out", str(out)]) == 0
+    lat = Config.model_validate(yaml_file.read_mapping(out)).flights[0].signals.inputs["lat"]
+    assert (lat.signal, lat.scale) == ("rc_aileron(percent)", 1.0)
+    assert "could be rc_aileron as well" in out.read_text()
+
+
+def test_a_counter_of_rows_is_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write(tmp_path / "run.csv", {"Frame": np.arange(T.size), "aileron": STICK, "p": RATE})
+    assert cli.main(["new", str(log), "--out", str(tmp_path / "x.yaml")]) == 2
+    assert "'Frame' counts rows and is taken for no time" in capsys.readouterr().err
 
 
 def test_of_channels_without_names_the_one_that_the_output_follows_is_taken() -> None:

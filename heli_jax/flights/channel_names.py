@@ -4,13 +4,21 @@ import re
 
 from heli_jax import units
 
-_ANGLE, _SECOND = r"deg|degree|degrees|rad|radian|radians|mrad", r"s|sec|second|seconds"
+_PLAIN = {
+    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    "mrad": "mrad",
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("ft", "feet"), "ft"),
+}
+"""what may be had per second, as names spell it"""
 _TAIL = re.compile(
-    rf"(.*?)[_ .]+((?:{_ANGLE}|m|meters?|metres?|ft|feet)"
-    rf"(?:[_ ]+per[_ ]+|[_ ]?p|[/_ ])(?:{_SECOND})(?:\^?-?[12])?)",
+    rf"(.*?)[-_ .,]+({'|'.join(_PLAIN)})(?:[_ .]*per[_ .]*|[_ ]?p[_ .]?|[/_ .])"
+    r"(?:s|sec|second|seconds)(?:\^?-?([12]))?",
     re.IGNORECASE,
 )
-_BRACKETS = re.compile(r".*[\[(]([^\[\]()]+)[\])]\s*")
+_BRACKETS = re.compile(r".*[\[(]([^\[\]()]*[^\[\]()\d\s][^\[\]()]*)[\])]\s*")
+"""gyroADC[1] has a number in them, and no unit"""
 _MEANINGS = {
     "rad/s": "an angular rate",
     "rad/s^2": "an angular acceleration",
@@ -51,7 +59,18 @@ _STICKS = {
     *("commanded", "input", "pwm", "pulse", "cyclic", "swash", "swashplate", "delta", "actuator"),
     *("control", "controls", "output", "out", "aileron", "ail", "elevator", "elev", "ele"),
     *("rudder", "rud", "pedal", "ped", "collective", "col", "lat", "lon", "lateral", "tail"),
-    *("longitudinal", "rccommand", "setpoint", "sp", "u", "joystick", "throttle", "des", "ref"),
+    *(
+        "longitudinal",
+        "rccommand",
+        "setpoint",
+        "sp",
+        "u",
+        "joystick",
+        "throttle",
+        "thr",
+        "des",
+        "ref",
+    ),
     *("desired", "target", "excitation", "sweep"),
 }
 _UNSURE = {"current", "bank", "heading", "mag", "climb", "clock", "stamp", "height", "omega"}
@@ -62,9 +81,9 @@ def rate_at_end(name: str) -> tuple[str, str] | None:
     """A name without the unit of a rate or a speed at its end, and this unit: `roll_rate_deg_s`,
     `p degrees per second`; None where none stands there."""
     match = _TAIL.fullmatch(name)
-    if match is None or not units.is_unit(match[2].lower()):
+    if match is None:
         return None
-    return match[1], match[2].lower()
+    return match[1], f"{_PLAIN[match[2].lower()]}/s{'^2' if match[3] == '2' else ''}"
 
 
 def unit_in_name(name: str) -> str:

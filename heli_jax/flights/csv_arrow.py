@@ -29,19 +29,22 @@ class Column(NamedTuple):
     filled: int
 
 
-def number_columns(body: Body, width: int, indices: Sequence[int]) -> dict[int, Column] | None:
+def number_columns(
+    body: Body, width: int, indices: Sequence[int], signs: Sequence[str]
+) -> dict[int, Column] | None:
     """Columns of numbers by index; None where anything is not plain.
 
     Args:
         body: the rows.
         width: number of columns of the header.
         indices: of the columns to read.
+        signs: which may be decimal, in the order to try.
     """
     import pyarrow as pa
 
-    # A comma is decimal where it stands between no cells. Of the columns read all have to be of one
-    # kind: a column of 1.500 beside one of 1,5 holds thousands, and is read in neither way.
-    for sign in (".",) if body.delimiter == "," else (".", ","):
+    # Of the columns read all have to be of one kind: a column of 1.500 beside one of 1,5 holds
+    # thousands.
+    for sign in signs:
         table = _table(body, width, dict.fromkeys(indices, pa.float64()), sign)
         if table is not None:
             columns = {i: table.column(str(i)) for i in dict.fromkeys(indices)}
@@ -63,12 +66,13 @@ def text_columns(body: Body, width: int, indices: Sequence[int]) -> list["pa.Chu
     return None if table is None else [table.column(str(i)) for i in indices]
 
 
-def likely_numbers(body: Body, width: int) -> list[int]:
+def likely_numbers(body: Body, width: int, signs: Sequence[str]) -> list[int]:
     """The columns that hold numbers as far as the first rows tell.
 
     Args:
         body: the rows.
         width: number of columns of the header.
+        signs: which may be decimal.
     """
     import pyarrow as pa
 
@@ -77,7 +81,7 @@ def likely_numbers(body: Body, width: int) -> list[int]:
         first = first[: first.rfind(b"\n") + 1]
     sample = dataclasses.replace(body, rows=memoryview(first))
     found: dict[int, Any] = {}
-    for sign in (".",) if body.delimiter == "," else (".", ","):
+    for sign in signs:
         table = _table(sample, width, dict.fromkeys(range(width)), sign)
         if table is not None:
             found |= {

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from heli_jax.flights.csv_text import OnDisk, find_header, first_row
+from heli_jax.flights.csv_text import OnDisk, first_row, header_line
 from heli_jax.regular_file import open_regular
 
 _LARGE = 1 << 25
@@ -47,7 +47,7 @@ def plain_beginning(path: Path, at_most: int) -> Beginning | None:
             return None
         first = file.read(_BLOCK)
         first = first[: first.rfind(b"\n") + 1]
-        header = find_header(first)
+        header = header_line(first)
         if header is None or first_row(first, header.after) is None:
             return None
         file.seek(header.after)

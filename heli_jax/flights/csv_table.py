@@ -12,15 +12,16 @@ import numpy as np
 
 from heli_jax.flights import progress
 from heli_jax.flights.csv_arrow import likely_numbers, number_columns, text_columns
-from heli_jax.flights.csv_cells import is_date, is_number, row_of_units, seconds_of_dates
+from heli_jax.flights.csv_cells import row_of_units
+from heli_jax.flights.csv_dates import is_date, is_day, seconds_of_dates
 from heli_jax.flights.csv_encoding import as_utf8
 from heli_jax.flights.csv_on_disk import plain_beginning
+from heli_jax.flights.csv_preamble import Head, as_wide, find_head, qualified, require_names
+from heli_jax.flights.csv_signs import TwoDecimalSigns, decimal_points, decimal_signs
 from heli_jax.flights.csv_text import (
     LONGEST_HEADER,
     Body,
     check_text,
-    find_delimiter,
-    find_header,
     first_row,
     header_names,
     is_of_blanks,
@@ -53,6 +54,10 @@ if TYPE_CHECKING:
 
 _LARGEST = 16 * 10**9
 """bytes: the file is held in memory, and the columns that are asked for"""
+_SOUGHT = "no line of names stands right above rows of as many cells, most of them numbers"
+"""of a file in whose first 1 MB a table was sought"""
+_FIRST = 100
+"""rows in which a column's first filled cell is looked for"""
 _LARGEST_TEXT = 2 * 10**9
 """bytes of cells that are looked at as text, in which they take many times as much"""
 
@@ -71,38 +76,41 @@ def open_csv(path: Path) -> "CsvTable":
     digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
     data, notes = as_utf8(where, data)
     check_text(where, data)
-    head = find_header(data)
+    blanks = path.suffix.lower() not in (".csv", ".tsv")
+    head = find_head(where, data, blanks)
     if head is None:
         raise wrong(where, "holds no header, expected names of columns and rows of numbers")
-    header, line = head.text, f"line {head.number}"
-    first = first_row(data, head.after)
+    (header, number, after), delimiter = head.header, head.delimiter
+    line = f"line {number}"
+    first = first_row(data, after)
     if first is None:
         raise wrong(where, "holds a header alone, expected rows of numbers", line)
     if len(header) > LONGEST_HEADER:
         raise wrong(where, "is longer than a line of a log can be", line)
-    require_short_lines(where, data, head.after, head.number + 1)
-    delimiter = find_delimiter(header, first)
-    rows = plain.rows(head.after) if plain else memoryview(data)[head.after :]
-    if path.suffix.lower() not in (".csv", ".tsv") and is_of_blanks(header, first):
+    require_short_lines(where, data, after, head.first_line)
+    rows = plain.rows(after) if plain else memoryview(data)[after:]
+    if blanks and is_of_blanks(header, first):
         text = Body(where, rows, delimiter, 1, False).text
         header, delimiter = tabs_for_blanks(header), "\t"
         rows = memoryview(tabs_for_blanks(text).encode())
     # Before the names are parsed, so that a line of commas makes no million names.
     require_few_columns(where, header.count(delimiter) + 1, line)
-    names = header_names(where, header, delimiter, head.number)
-    if all(is_number(name) for name in names):
-        listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
-        problem = "got numbers, expected the names of the columns; write a line of names above"
-        raise wrong(where, f"{problem}, such as {shown(listed)}", line)
-    quotes = data.find(b'"', head.after) >= 0
-    body, cut = Body(where, rows, delimiter, head.number + 1, quotes).whole(len(names))
+    names = header_names(where, header, delimiter, number)
+    require_names(where, names, delimiter, line)
+    quotes = data.find(b'"', after) >= 0
+    body = Body(where, rows, delimiter, head.first_line, quotes)
+    groups = [header_names(where, text, delimiter, number) for text in head.above]
+    names = as_wide(qualified(names, groups), body)
+    body, cut = body.whole(len(names))
+    notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        return CsvTable(size, digest, names, body, notes)
+        return CsvTable(size, digest, names, body, head, notes)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
-    return CsvTable(size, digest, names, body, notes, dict(zip(names, units, strict=True)))
+    stated = dict(zip(names, units, strict=True))
+    return CsvTable(size, digest, names, body, head, notes, stated)
 
 
 def _units_below(body: Body, names: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -142,14 +150,16 @@ class CsvTable:
         digest: Digest,
         names: tuple[str, ...],
         body: Body,
+        head: Head,
         notes: tuple[str, ...] = (),
         units: Mapping[str, str] | None = None,
     ) -> None:
         self.path, self.size, self.names = body.path, size, names
         self.notes = notes
         self.units: Mapping[str, str] = dict(units or {})
-        self._digest, self._body = digest, body
+        self._digest, self._body, self._head = digest, body, head
         self._dates: set[str] = set()
+        self._signs = decimal_signs(body)
 
     @property
     def sha256(self) -> str:
@@ -171,16 +181,15 @@ class CsvTable:
 
     def _numbers(self, names: Sequence[str]) -> dict[str, np.ndarray]:
         indices = [self.names.index(name) for name in names]
-        numbers = number_columns(self._body, len(self.names), indices)
+        numbers = number_columns(self._body, len(self.names), indices, self._signs)
         if numbers is not None:
             return {n: numbers[i].values for n, i in zip(names, indices, strict=True)}
-        try:
-            texts = _decimal_points(self._texts(indices), self._body.delimiter)
-        except _TwoDecimalSigns as e:
-            raise wrong(self.path, str(e)) from e
         result = {}
-        for name, text in zip(names, texts, strict=True):
-            values = self._values(name, text)
+        for name, text in zip(names, self._texts(indices), strict=True):
+            try:
+                values = self._values(name, text)
+            except TwoDecimalSigns as e:
+                raise wrong(self.path, str(e), column(name)) from e
             if isinstance(values, int):
                 self._require_no_names(values)
                 problem = f"got {self.cell_text(name, values)}, expected a number"
@@ -195,20 +204,22 @@ class CsvTable:
 
     def _survey(self) -> list[Survey]:
         width = len(self.names)
-        likely = likely_numbers(self._body, width)
-        plain = number_columns(self._body, width, likely) or {}
+        likely = likely_numbers(self._body, width, self._signs)
+        plain = number_columns(self._body, width, likely, self._signs) or {}
         rest = [i for i in range(width) if i not in plain]
         found = {i: Survey(self.names[i], c.values, c.filled) for i, c in plain.items()}
         if rest:
             texts = zip(rest, self._texts(rest), strict=True)
             found |= {i: self._surveyed(self.names[i], text) for i, text in texts}
-        return [found[i] for i in range(width)]
+        # What stands behind a delimiter at the end of every row is no column.
+        surveys = [found[i] for i in range(width)]
+        return [s for s in surveys if s.name or s.n_filled]
 
     def _surveyed(self, name: str, text: "pa.ChunkedArray") -> Survey:
         try:
-            values = self._values(name, _decimal_points([text], self._body.delimiter)[0])
+            values = self._values(name, text)
         # Neither commas nor points are decimal for sure: a survey calls it text, row 0 on.
-        except _TwoDecimalSigns:
+        except TwoDecimalSigns:
             values = 0
         filled = len(text) - filled_cells(text).null_count
         if not isinstance(values, int):
@@ -236,14 +247,47 @@ class CsvTable:
         return time_unit(self.units.get(name, ""))
 
     def _values(self, name: str, text: "pa.ChunkedArray") -> np.ndarray | int:
-        """A column's numbers (N,), or the first row that holds none."""
-        values = text_floats(text)
-        if not isinstance(values, int) or not is_date(text[values].as_py().strip()):
+        """A column's numbers (N,), or the first row that holds none.
+
+        Raises:
+            TwoDecimalSigns: a number has the other sign than the file.
+        """
+        filled = filled_cells(text)
+        # Before signs are changed, which dates and times of day have of their own.
+        first = next((c for c in filled[:_FIRST].to_pylist() if c is not None), "")
+        if not is_date(first):
+            # Both may be tried where no row at the beginning has a sign.
+            has_commas = len(self._signs) > 1 and _has_comma(filled)
+            sign = "," if has_commas else self._signs[0]
+            points, example = decimal_points(filled, sign)
+            values = text_floats(points)
+            if example and not isinstance(values, int):
+                other = "commas" if sign == "," else "points"
+                self._note(
+                    f"{shown(name)} has marks between thousands, as in {shown(example)}: "
+                    f"{other} are decimal"
+                )
             return values
-        dates = seconds_of_dates(filled_cells(text).to_pylist())
-        if not isinstance(dates, int):
-            self._dates.add(name)
-        return dates
+        cells = filled.to_pylist()
+        dates = seconds_of_dates(cells, self._days(name))
+        if isinstance(dates, int):
+            return dates
+        self._dates.add(name)
+        if dates.note:
+            self._note(f"{shown(name)}: {dates.note}")
+        return dates.seconds
+
+    def _days(self, name: str) -> list[str | None] | None:
+        """The cells of the one column of dates beside a time of day."""
+        _, first = self._record(0)
+        found = [i for i, cell in enumerate(first) if is_day(cell.strip())]
+        if len(found) != 1 or self.names[found[0]] == name:
+            return None
+        return filled_cells(self._texts(found)[0]).to_pylist()
+
+    def _note(self, words: str) -> None:
+        if words not in self.notes:
+            self.notes = (*self.notes, words)
 
     def _require_no_names(self, row: int) -> None:
         """Refuse a header between the rows: a logger began anew there."""
@@ -260,7 +304,7 @@ class CsvTable:
                 self.path,
                 f"got no comma, semicolon or tab between names, expected columns,"
                 f" {shown(missing[0])} among them",
-                f"line {self._body.first_line - 1}",
+                f"line {self._head.header.number}",
             )
         require_columns(self.path, self.names, names)
 
@@ -307,6 +351,9 @@ class CsvTable:
         for row, (line, cells) in enumerate(self._body.records()):
             if len(cells) != width:
                 problem = f"{_count(len(cells))}, expected {width} as in the header"
+                problem += f" in line {self._head.header.number}"
+                if not self._head.is_fitting:
+                    problem += f"; {_SOUGHT}"
                 raise wrong(self.path, problem, f"line {line}")
             for column_cells, i in zip(cells_of, indices, strict=True):
                 column_cells.append(cells[i])
@@ -324,34 +371,6 @@ def _count(n: int) -> str:
     return "1 cell" if n == 1 else f"{n} cells"
 
 
-class _TwoDecimalSigns(Exception):
-    """A file holds both decimal commas and decimal points."""
-
-
-def _decimal_points(texts: list["pa.ChunkedArray"], delimiter: str) -> list["pa.ChunkedArray"]:
-    """The cells with decimal points for commas, where the comma is not the delimiter.
-
-    Raises:
-        _TwoDecimalSigns: so that no thousands separator passes for a decimal sign.
-    """
+def _has_comma(text: "pa.ChunkedArray") -> bool:
     pc = compute()
-    # Over all columns that are read, not one by one: a file has one decimal sign, and a column of
-    # 1.500 beside one of 1,5 holds thousands.
-    signs = {}
-    for sign in (",", ".") if delimiter != "," else ():
-        for text in texts:
-            matches = pc.match_substring(text, sign)
-            # `index` alone would do, and import pandas for its second argument.
-            row = pc.index(matches, True).as_py() if pc.any(matches).as_py() else -1
-            if row >= 0:
-                signs[sign] = shown(text[row].as_py().strip())
-                break
-    if "," not in signs:
-        return texts
-    if "." in signs:
-        both = f"both {signs[',']} and {signs['.']}"
-        if signs[","] == signs["."]:
-            both = f"{signs[',']}, with commas and points"
-        problem = f"got {both}, expected one decimal sign"
-        raise _TwoDecimalSigns(problem)
-    return [pc.replace_substring(text, ",", ".") for text in texts]
+    return bool(pc.any(pc.match_substring(text, ",")).as_py())

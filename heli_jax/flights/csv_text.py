@@ -175,9 +175,11 @@ _LONGEST_PREAMBLE = 1_000_000
 """bytes of blank lines and comments before the header"""
 _BLOCK = 1 << 20
 _PLAIN = re.compile(r"[+-]?[0-9]*\.?[0-9]+(?:\.|[eE][+-]?[0-9]+)?|nan", re.IGNORECASE)
-_COMMENT = re.compile(r"\s*(#|%(\s|%|[^,;\t]*$))")
+_COMMENT = re.compile(r"\s*(#|//|%(\s|%|[^,;\t]*$))")
 """A name may begin with a percent sign, so that of MATLAB's comments those are known which go on
 with a blank or have no cells."""
+DELIMITERS = ("\t", "|", ";", ",")
+"""the surest first: a tab stands in no number and in hardly any name, a comma may be decimal"""
 _SOMETHING = re.compile(rb"[^ \t\n\r\v\f]")
 
 
@@ -189,26 +191,53 @@ class Line(NamedTuple):
     after: int
 
 
-def find_header(data: bytes) -> Line | None:
+def header_line(data: bytes, above: Line | None = None) -> Line | None:
     """The first line that is neither blank nor a comment, or the comment above it where that names
-    columns of numbers; None where there is none within the first 1 MB."""
+    columns of numbers; None where there is none within the first 1 MB.
+
+    Args:
+        data: the bytes of the file.
+        above: a line below which it is looked for.
+    """
     # Excel's byte order mark would belong to the first name.
     start, number = 3 if data.startswith(codecs.BOM_UTF8) else 0, 1
+    if above is not None:
+        start, number = above.after, above.number + 1
     comment = ""
     while start < min(len(data), _LONGEST_PREAMBLE):
-        end, after = _line_end(data, start)
-        # Cut: what is refused for its length need not be decoded as a whole.
-        content = data[start : min(end, start + 4 * LONGEST_HEADER + 4)].decode("utf-8", "ignore")
+        line = _line(data, start, number)
         # Comments may say anything, a list of names with commas too.
-        mark = _COMMENT.match(content)
-        if content.strip() and mark is None:
+        mark = _COMMENT.match(line.text)
+        if line.text.strip() and mark is None:
             # MATLAB's and NumPy's writers of text put the names into a comment.
-            if _names_columns(comment, content):
+            if _names_columns(comment, line.text):
                 return Line(comment, number - 1, start)
-            return Line(content, number, after)
-        comment = content.lstrip()[1:].strip() if mark else ""
-        start, number = after, number + 1
+            return line
+        comment = line.text.lstrip().lstrip("#%/").strip() if mark else ""
+        start, number = line.after, number + 1
     return None
+
+
+def lines_in(data: bytes, first: Line, size: int, most: int | None = None) -> list[Line]:
+    """A line and those below it.
+
+    Args:
+        data: the bytes of the file.
+        first: where to begin.
+        size: within how many bytes.
+        most: how many of them.
+    """
+    lines, end = [first], min(len(data), first.after + size)
+    while lines[-1].after < end and len(lines) != most:
+        lines.append(_line(data, lines[-1].after, lines[-1].number + 1))
+    return lines
+
+
+def _line(data: bytes, start: int, number: int) -> Line:
+    end, after = _line_end(data, start)
+    # Cut: what is refused for its length need not be decoded as a whole.
+    text = data[start : min(end, start + 4 * LONGEST_HEADER + 4)].decode("utf-8", "ignore")
+    return Line(text, number, after)
 
 
 def _names_columns(comment: str, row: str) -> bool:
@@ -216,7 +245,7 @@ def _names_columns(comment: str, row: str) -> bool:
     cells = re.split(r"[,;\s]+", row.strip(" \t\r\n,;"))
     if not all(_PLAIN.fullmatch(cell) for cell in cells) or _PLAIN.match(comment):
         return False
-    if any(comment.count(d) == row.count(d) > 0 for d in "\t;,"):
+    if any(comment.count(d) == row.count(d) > 0 for d in DELIMITERS):
         return True
     return is_of_blanks(comment, row)
 
@@ -283,17 +312,16 @@ def require_short_lines(path: str, data: bytes, start: int, first_line: int) -> 
 
 def find_delimiter(header: str, first: str) -> str:
     """The delimiter that header and first row agree on; `;` before `,`, which may be a decimal."""
-    # A tab stands in no number and in hardly any name, so it is the surest of the three.
-    for delimiter in ("\t", ";", ","):
+    for delimiter in DELIMITERS:
         if header.count(delimiter) == first.count(delimiter) > 0:
             return delimiter
-    return max((",", ";", "\t"), key=header.count)
+    return max(reversed(DELIMITERS), key=header.count)
 
 
 def is_of_blanks(header: str, first: str) -> bool:
     """Whether blanks alone stand between the cells of header and first row."""
     # Names may hold blanks: only where nothing else is between them, and as many cells below.
-    alone = not any(delimiter in header.strip() + first.strip() for delimiter in ("\t", ";", ","))
+    alone = not any(delimiter in header.strip() + first.strip() for delimiter in DELIMITERS)
     return alone and len(header.split()) == len(first.split()) > 1
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from heli_jax import units
 from heli_jax.errors import nearest
+from heli_jax.flights.array_clocks import clock_notes
+from heli_jax.flights.clock_guess import counter_notes, guess_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -17,6 +19,7 @@ from heli_jax.flights.grid import (
     Uneven,
     not_increasing,
     rounding_of,
+    shared_stamps,
     uniform_grid,
     without_overflow,
 )
@@ -33,9 +36,9 @@ from heli_jax.flights.table import (
     shown,
     wrong,
 )
-from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
+from heli_jax.flights.table_view import without_copies
+from heli_jax.flights.time_units import SECONDS
 
-_TIME_NAMES = {"t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
 _GAP_STEPS = 1.5
 """usual steps: a lost sample makes a step of two, and jitter one of a tenth more"""
 _FILTER = re.compile(
@@ -228,13 +231,17 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
     """
     surveys = table.survey()
     if time is None:
-        signal, guessed = _guess_time(table, surveys)
+        signal, guessed = guess_clock(table, surveys)
     else:
         signal, guessed = _asked_time(table, surveys, time), False
     # A stated unit goes with whatever column is the clock, the guessed one too: then nothing is a
     # guess.
     if signal is not None and unit is not None:
         signal, guessed = _asked_time(table, surveys, Signal(signal.name, unit, "s")), False
+    if signal is not None:
+        once = without_copies(table, signal.name, surveys)
+        if once is not table:
+            table, surveys = once, once.survey()
     marks = mark_notes((s.name, s.values) for s in surveys if s.values is not None)
     clock = None if signal is None else _describe_time(table, surveys, signal, guessed)
     return LogInfo(
@@ -246,7 +253,13 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
         columns=tuple(_describe_column(s, table.units.get(s.name, "")) for s in surveys),
         time=clock,
         duration=float("nan") if clock is None else clock.duration,
-        notes=(*table.notes, *_other_lengths(surveys), *marks),
+        notes=(
+            *table.notes,
+            *_other_lengths(surveys),
+            *clock_notes(table),
+            *(counter_notes(surveys) if clock is None else ()),
+            *marks,
+        ),
     )
 
 
@@ -305,32 +318,6 @@ def _asked_time(table: Table, surveys: list[Survey], time: str | Signal) -> Sign
     return signal
 
 
-def _guess_time(table: Table, surveys: list[Survey]) -> tuple[Signal | None, bool]:
-    """The clock, and whether its unit is a guess."""
-    numeric = [survey.name for survey in surveys if survey.values is not None]
-    # A name decides before the numbers do: a counter or a distance may increase all along too.
-    for name in numeric:
-        stem, _ = split_unit(name)
-        # Of a path, log.roll.time, the last part is the name.
-        if re.split(r"[./]", stem)[-1].casefold() in _TIME_NAMES or table.time_unit(name):
-            return _with_unit(table, surveys, name)
-    # Without a name to go by, the first column that increases all along is taken. The result names
-    # it, so that a wrong guess is seen.
-    for name in numeric:
-        values = _values(surveys, name)
-        if values is not None and values.size > 1 and np.all(values[1:] > values[:-1]):
-            return _with_unit(table, surveys, name)
-    return None, False
-
-
-def _with_unit(table: Table, surveys: list[Survey], name: str) -> tuple[Signal, bool]:
-    stated = table.time_unit(name) or split_unit(name)[1]
-    if stated:
-        return Signal(name, stated, "s"), False
-    stamps = _values(surveys, name)
-    return Signal(name, likely_unit(stamps), "s"), True
-
-
 def _values(surveys: list[Survey], name: str) -> np.ndarray | None:
     return next(survey.values for survey in surveys if survey.name == name)
 
@@ -386,7 +373,9 @@ def _clock_problem(seconds: np.ndarray, steps: np.ndarray) -> str:
     back = not_increasing(seconds)
     if back is not None:
         row, fault = back
-        return f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
+        where = f"the time {fault} after {seconds[row - 1] - seconds[0]:.6g} s"
+        shared = shared_stamps(seconds)
+        return f"{where}: {shared}" if shared else where
     if np.median(steps) < SHORTEST_STEP:
         return "the steps are shorter than 1 ns"
     return ""

@@ -58,6 +58,21 @@ def not_increasing(stamps: np.ndarray) -> tuple[int, str] | None:
     return row + 1, "stands still" if steps[row] == 0 else "runs backwards"
 
 
+_MANY = 0.1
+"""part of the stamps"""
+
+
+def shared_stamps(stamps: np.ndarray) -> str:
+    """Why many of the stamps (N,) stand still, in words; empty where few do."""
+    still = int(np.count_nonzero(stamps[1:] == stamps[:-1]))
+    if still <= _MANY * stamps.size:
+        return ""
+    return (
+        f"{still} of {stamps.size} rows have the time of the row before and other values: the "
+        "stamps have too few digits (log them with more), or two records were written into one file"
+    )
+
+
 _COUNTER = 2.0**32
 """ticks after which a counter of 32 bits begins anew: 71.6 minutes of microseconds"""
 

@@ -17,17 +17,18 @@ from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_view import with_joined_clock
 from heli_jax.regular_file import open_regular, require_regular
 
 _SNIFFED = 8192
 """bytes: a DataFlash log in text may begin with the firmware's own lines"""
-_TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log")
+_TEXTS = (".csv", ".txt", ".tsv", ".asc", ".dat", ".log", ".lvm", ".prn", ".tab")
 _AUTOPILOTS = (ulog.MAGIC, dataflash.MAGIC, blackbox_header.MARK)
 """what their logs begin with, and no table does"""
 _ARRAYS = (".mat", ".nc", ".h5", ".hdf5")
 EXPECTED = (
-    "expected a table (.csv, .txt, .tsv, .asc, .dat, .parquet), arrays (.mat, .nc, .h5, .hdf5) or"
-    " an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
+    "expected a table (.csv, .txt, .tsv, .asc, .dat, .lvm, .parquet), arrays (.mat, .nc, .h5,"
+    " .hdf5) or an autopilot's log (.ulg, .bin, .log, .bbl, .bfl)"
 )
 
 
@@ -110,9 +111,13 @@ def open_flights(path: str | Path) -> Table | tuple[ChannelLog, ...]:
             raise wrong(str(path), "is empty, expected a log")
         reader = _reader(path)
         with progress.reading(path, size):
-            return reader(path)
+            opened = reader(path)
     except OSError as e:
         raise wrong(str(path), f"cannot be read ({e.strerror or type(e).__name__})") from e
+    # Arrays may have lengths of their own, of which no row is made.
+    if isinstance(opened, tuple | array_table.ArrayTable):
+        return opened
+    return with_joined_clock(opened)
 
 
 _Reader = Callable[[Path], Table | tuple[ChannelLog, ...]]

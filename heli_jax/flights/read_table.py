@@ -12,7 +12,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import InputError
 from heli_jax.flights.as_logged import as_logged
-from heli_jax.flights.derived import marks_of_sources, why_missing
+from heli_jax.flights.derived import DerivedTable, marks_of_sources, why_missing
 from heli_jax.flights.file_units import other_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.grid import (
@@ -22,6 +22,7 @@ from heli_jax.flights.grid import (
     Uneven,
     not_increasing,
     rounding_of,
+    shared_stamps,
     uniform_grid,
     without_overflow,
 )
@@ -47,6 +48,7 @@ from heli_jax.flights.request import Request
 from heli_jax.flights.resample import new_clock
 from heli_jax.flights.slower import Timed
 from heli_jax.flights.table import Table, column, sample_count, shown, wrong
+from heli_jax.flights.table_view import first_of_copies, seen_once
 from heli_jax.flights.time_units import require_likely, split_unit
 
 _MANY = 0.1
@@ -82,6 +84,13 @@ def load_table(table: Table, request: Request) -> LoadedTable | ChannelLog:
     joined = joined_log(table, request, numbers)
     if joined is not None:
         return joined
+    rows = first_of_copies(numbers[request.time.name], list(numbers.values()))
+    if rows is not None:
+        if isinstance(table, DerivedTable):
+            table = DerivedTable(seen_once(table.table, rows), table.swashplate)
+        else:
+            table = seen_once(table, rows)
+        numbers = table.numbers(request.columns)
     return LoadedTable(table, numbers, _clock(table, request.time, numbers[request.time.name]))
 
 
@@ -255,8 +264,8 @@ def _remedy(table: Table, stamps: np.ndarray, row: int) -> str:
     if row > 1 and stamps[row - 2] < stamps[row] and stamps[row] < stamps[row - 1]:
         return f"{table.place(row - 1)} is out of order with those around it: leave it out"
     steps = np.diff(stamps)
-    if np.count_nonzero(steps == 0) > _MANY * stamps.size:
-        return "the stamps have too few digits: log them with more"
+    if shared := shared_stamps(stamps):
+        return shared
     if np.count_nonzero(steps < 0) > _MANY * stamps.size:
         return "sort the rows by time"
     later = np.flatnonzero(stamps[row:] > stamps[row - 1])

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax.flights.align import Lag, NotAligned, lag_between
+from heli_jax.flights.array_clocks import by_clocks
+from heli_jax.flights.array_table import ArrayTable
 from heli_jax.flights.as_logged import measured
-from heli_jax.flights.derived import with_derived
+from heli_jax.flights.derived import DerivedTable, with_derived
 from heli_jax.flights.file_units import with_file_units
 from heli_jax.flights.flight import Flight, Signal, Source
 from heli_jax.flights.log import ChannelLog
@@ -124,6 +126,8 @@ def beyond(logs: Opened, request: Request) -> tuple[str, ...]:
 
 def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog | LoadedTable:
     log = log or _of_file(request)
+    if request.time is None and not isinstance(log, ChannelLog):
+        log = _by_clocks(log)
     if not isinstance(log, ChannelLog):
         return load_table(log, request)
     if request.time is not None:
@@ -134,6 +138,14 @@ def _open(request: Request, log: ChannelLog | Table | None = None) -> ChannelLog
 
 def _of_file(request: Request) -> ChannelLog | Table:
     return with_derived(open_log(request.path, request.options.number))
+
+
+def _by_clocks(log: Table) -> ChannelLog | Table:
+    """Arrays whose clocks stand beside them in the file; any other table as it is."""
+    swashplate = log.swashplate if isinstance(log, DerivedTable) else None
+    table = log.table if isinstance(log, DerivedTable) else log
+    found = by_clocks(table) if isinstance(table, ArrayTable) else None
+    return log if found is None else with_derived(found, swashplate)
 
 
 def _clocked(log: ChannelLog | LoadedTable, request: Request) -> dict[Key, ClockedSignal]:

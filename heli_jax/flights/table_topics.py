@@ -11,6 +11,7 @@ from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_view import without_copies
 
 _MOST_NAMED = 6
 """columns that notes name"""
@@ -100,6 +101,8 @@ def _table_topic(
         elif texts := [c.name for c in info.columns if c.kind == "text"]:
             why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
         raise wrong(table.path, f"{why}, {remedy}")
+    # As `info` has counted them.
+    table = without_copies(table, clock.column)
     if clock.guessed:
         notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
     rows = next(c.count for c in info.columns if c.name == clock.column)

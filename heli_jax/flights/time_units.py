@@ -19,8 +19,11 @@ _UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
 # A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
 # bracket was opened that has to be closed.
 _AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
-_LONGEST_FLIGHT = 6 * 3600.0
-"""s: ticks that would make a longer one are more likely of the next smaller unit"""
+# TimeUS, timestampMs: joined by a capital alone.
+_JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
+_LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
+"""s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
+slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
 
 
 def time_unit(text: str) -> str | None:
@@ -37,6 +40,8 @@ def split_unit(name: str) -> tuple[str, str]:
     """A column's name without the unit of time at its end, and this unit, empty where there is
     none."""
     match = _AT_END.fullmatch(name)
+    if match is None and (joined := _JOINED.fullmatch(name)):
+        return joined[1], time_unit(joined[2]) or ""
     unit = time_unit(match[3]) if match else None
     return (match[1], unit) if match and unit else (name, "")
 
@@ -62,15 +67,18 @@ def require_likely(path: str, name: str, unit: str, stamps: np.ndarray) -> None:
 
 
 def likely_unit(stamps: np.ndarray | None) -> str:
-    """The unit of stamps (N,) by their usual step: no flight is logged once in 5 s, or lasts a
-    day."""
+    """The unit of stamps (N,) by their usual step and their length: no flight is logged once in
+    5 s, or lasts a day."""
     if stamps is None or stamps.size < 2:
         return "s"
     with np.errstate(all="ignore"):
         step = float(np.median(np.diff(stamps)))
         length = float(stamps[-1] - stamps[0])
     # From the coarsest unit on: the first in which the usual step is that of a log is taken.
-    for unit, most in (("s", 5.0), ("ms", 1e3), ("us", 1e6)):
-        if not step >= most and not (unit == "ms" and length * 1e-3 > _LONGEST_FLIGHT):
+    for unit, most, slow in (("s", 5.0, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
+        longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
+        # Of parts of a second nothing is finer.
+        whole = unit == "ms" or step >= slow
+        if not step >= most and not (whole and length * SECONDS[unit] > longest):
             return unit
     return "ns"

@@ -10,15 +10,12 @@ import numpy as np
 from heli_jax import models, naming
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.channel_names import names_a_stick
-from heli_jax.flights.describe import LogInfo, describe_table
-from heli_jax.flights.log import as_floats
-from heli_jax.flights.marks import without_marks
-from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.preset import fitting_presets, model_inputs, model_outputs
-from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table import shown, wrong
 from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
-from heli_jax.new_config.guess import Guess, Series
+from heli_jax.new_config.guess import Guess
+from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.run_directory import require_place
 from heli_jax.vehicle import read_vehicle
@@ -37,8 +34,6 @@ _UNITS = {"roll": "rad", "pitch": "rad", "down_speed": "m/s"} | dict.fromkeys(
 _STICKS_TOO = {"roll", "pitch", "yaw"}
 """names of motions that sticks have as well"""
 _GRAVITY = ("g", "gravity", "g0")
-_FEWEST = 8
-"""samples of a signal"""
 _FULL_TRAVEL = 1.5
 """of a stick in parts of it, which radios let exceed 1"""
 
@@ -48,18 +43,6 @@ class Written(NamedTuple):
 
     paths: tuple[Path, ...]
     notes: tuple[str, ...]
-
-
-class _Log(NamedTuple):
-    """A flight as `new` looks at it."""
-
-    path: str
-    format: str
-    series: Mapping[str, Series]
-    time: Any
-    """`TimeInfo` of a table; None where topics have clocks of their own"""
-    flight: int | None
-    several: bool
 
 
 def write_config(
@@ -85,7 +68,7 @@ def write_config(
     if out.exists():
         raise InputError(f"{out}: is there already; expected another place, --out FILE")
     require_place(out, str(out))
-    read = _read(Path(log), flight)
+    read = read_log(Path(log), flight)
     chosen = text.Chosen(*_model(model, read, str(log)))
     preset = next(iter(fitting_presets(read.format, tuple(read.series))), None)
     signals = None if preset else _signals(chosen.model, read)
@@ -111,7 +94,7 @@ def write_config(
     for path, words in {out: content, **paths}.items():
         path.write_text(words, encoding="utf-8")
     todo = sum(words.count(EDIT) for words in (content, *paths.values()))
-    notes = [f"wrote {', '.join(map(str, (out, *paths)))}"]
+    notes = [f"wrote {', '.join(map(str, (out, *paths)))}", *read.notes]
     if todo:
         words = "1 number is" if todo == 1 else f"{todo} numbers are"
         notes.append(f"{words} yours to give, where {EDIT} stands")
@@ -129,7 +112,7 @@ def write_config(
     return Written((out, *paths), tuple(notes))
 
 
-def _used(preset: str | None, model: Any, log: _Log, signals: text.Signals | None) -> Sequence[str]:
+def _used(preset: str | None, model: Any, log: Log, signals: text.Signals | None) -> Sequence[str]:
     """The log's channels that the configuration takes."""
     if signals is not None:
         found = (*signals.inputs.values(), *signals.outputs.values())
@@ -161,47 +144,7 @@ def _near(vehicle: Path, out: Path) -> str:
     return path.relative_to(folder, walk_up=True).as_posix() if together else str(path)
 
 
-def _read(path: Path, number: int | None) -> _Log:
-    opened = chosen_flights(path, open_flights(path), number)
-    if not isinstance(opened, tuple):
-        return _read_table(opened)
-    first, *others = opened
-    series = {
-        name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
-        for topic in first.topics
-        if topic.clock and topic.times.size >= _FEWEST
-        for name, values in topic.columns.items()
-        if np.asarray(values).dtype.kind in "biuf" and _is_known(as_floats(values))
-    }
-    flight = first.flight[0] if others or first.flight[1] > 1 else None
-    return _Log(str(path), first.format, series, None, flight, flight is not None)
-
-
-def _read_table(table: Table) -> _Log:
-    info: LogInfo = describe_table(table, None, None)
-    if info.time is None or info.time.problem:
-        why = info.time.problem if info.time is not None else "none of its columns is a time"
-        raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
-    clock = info.time.column
-    names = [c.name for c in info.columns if c.kind == "number"]
-    # Of two columns of one name neither can be asked for.
-    names = [n for n in names if table.names.count(n) == 1]
-    values = table.numbers([clock, *(n for n in names if n != clock)])
-    # Seconds from the first stamp: their count does not matter to a guess.
-    times = np.linspace(0.0, info.time.duration, values[clock].size)
-    series = {
-        n: Series(times, without_marks(values[n]), table.units.get(n, ""))
-        for n in names
-        if n != clock and _is_known(values[n])
-    }
-    return _Log(table.path, table.format, series, info.time, None, False)
-
-
-def _is_known(values: np.ndarray) -> bool:
-    return int(np.sum(np.isfinite(values))) >= _FEWEST
-
-
-def _model(name: str | None, log: _Log, path: str) -> tuple[Any, str | dict[str, str], bool]:
+def _model(name: str | None, log: Log, path: str) -> tuple[Any, str | dict[str, str], bool]:
     """The model, what a configuration calls it, and whether it is linear from a file."""
     if name is None:
         name = _by_what_moves(log, path)
@@ -236,7 +179,7 @@ def _by_name(stated: str) -> Any:
         ) from e
 
 
-def _by_what_moves(log: _Log, path: str) -> str:
+def _by_what_moves(log: Log, path: str) -> str:
     """The linear model of the axis whose stick moves most, of those whose motion is logged."""
     names, called = tuple(log.series), _names()
     moving = {}
@@ -259,7 +202,7 @@ def _by_what_moves(log: _Log, path: str) -> str:
     return max(size, key=lambda model: size[model])
 
 
-def _moving(log: _Log, names: Sequence[str]) -> list[str]:
+def _moving(log: Log, names: Sequence[str]) -> list[str]:
     return [n for n in names if np.nanstd(log.series[n].values) > 0]
 
 
@@ -272,7 +215,7 @@ def _file(name: str) -> dict[str, Any]:
     return parse_mapping(file.read_text(encoding="utf-8"), name)
 
 
-def _signals(model: Any, log: _Log) -> text.Signals:
+def _signals(model: Any, log: Log) -> text.Signals:
     """Channels for inputs and outputs of the model, and which of the log's are left."""
     called, taken = _names(), []
     inputs: dict[str, Guess | None] = {}
@@ -313,29 +256,35 @@ def _own(name: str) -> str:
     return " ".join(guess.words_of(name))
 
 
-def _outputs(log: _Log, called: Sequence[str], si: str) -> list[str]:
+def _outputs(log: Log, called: Sequence[str], si: str) -> list[str]:
     """Channels that may be an output, the likeliest first."""
     names = [n for n, s in log.series.items() if guess.may_be(n, s, called, si)]
     return guess.by_name(called, names)
 
 
-def _found(log: _Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:
+def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess | None:
     candidates = [n for n in names if n not in taken]
     # What never moves is a trim, or a channel that is not connected; better than none.
     candidates = _moving(log, candidates) or candidates
     if not candidates:
         return None
-    taken.append(candidates[0])
-    found = guess.scaled(candidates[0], log.series[candidates[0]], si)
-    if len(candidates) == 1:
+    chosen = guess.of_known_unit(candidates, log.series, si)
+    taken.append(chosen)
+    found = guess.scaled(chosen, log.series[chosen], si, _full_travel(log))
+    others = [n for n in candidates if n != chosen]
+    if not others:
         return found
-    others = f"could be {', '.join(candidates[1:4])} as well"
-    return found._replace(remarks=(*found.remarks, others))
+    remark = f"could be {', '.join(others[:3])} as well"
+    return found._replace(remarks=(*found.remarks, remark))
+
+
+def _full_travel(log: Log) -> float | None:
+    return guess.full_travel({n: s for n, s in log.series.items() if names_a_stick(n)})
 
 
 def _by_correlation(
     model: Any,
-    log: _Log,
+    log: Log,
     inputs: dict[str, Guess | None],
     outputs: Mapping[str, Guess | None],
     taken: list[str],
@@ -362,7 +311,7 @@ def _by_correlation(
         if best is None:
             continue
         channel, related = best
-        made = guess.scaled(channel, log.series[channel], si)
+        made = guess.scaled(channel, log.series[channel], si, _full_travel(log))
         why = f"GUESS: no name says so; {known[-1]} follows it with a correlation of {related:.2f}"
         inputs[name] = made._replace(remarks=(why, *made.remarks))
         taken.append(channel)

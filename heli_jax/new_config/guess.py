@@ -23,7 +23,6 @@ _UNIT_WORDS = {
 _JOINED_UNIT = re.compile(
     r"(.*[a-z0-9XYZ])(Deg|Rad|Dps|Degs|Rads|Radps|Rpm|Mps|Pct|Percent)((?:_?[A-Z]?[a-z]+)?)"
 )
-_PER_SECOND = re.compile(r"(.*)[_ .](deg|rad|m)_?(?:p|per)?[_ .](?:s|sec)", re.IGNORECASE)
 # As people write them: a small v or a is a speed or an acceleration.
 _LETTERS = ("V", "A", "%")
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
@@ -47,6 +46,7 @@ _FILLERS = {
     "body",
     "imu",
     "est",
+    "out1",
 }
 # Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
 _OTHER = {
@@ -63,6 +63,10 @@ _PULSES = (700.0, 2300.0)
 """us: what receivers and servos are sent"""
 _FULL_PULSE = 500.0
 """us from the middle to the end"""
+_FULL_COMMAND = 500.0
+"""at the stop of a stick, where firmware commands in steps of pulse widths around the middle"""
+_PARTS = 1.5
+"""above which a stick is not logged in parts of its travel"""
 _FASTEST_TURN = 8.0
 """rad/s, which a small helicopter hardly exceeds in a log for identification"""
 _LAGS = 0.5
@@ -113,17 +117,16 @@ def without_unit(name: str) -> tuple[str, str]:
     match = _BRACKETS.fullmatch(name)
     if match and (unit := _UNIT_WORDS.get(match[2].strip().lower())):
         return match[1], unit
-    if match and units.is_unit(match[2].strip()):
+    # gyroADC[1] is one of several, and no plain number.
+    if match and not match[2].strip().isdigit() and units.is_unit(match[2].strip()):
         return match[1], match[2].strip()
     if (rate := rate_at_end(name)) is not None:
         return rate
     for letter in _LETTERS:
         if name.endswith((f"_{letter}", f" {letter}")):
             return name[:-2], letter
-    if match := _PER_SECOND.fullmatch(name):
-        return match[1], f"{match[2].lower()}/s"
     for word, unit in _UNIT_WORDS.items():
-        for mark in ("_", " ", "."):
+        for mark in ("_", " ", ".", "-", ","):
             if name.lower().endswith(mark + word):
                 return name[: -len(word) - 1], unit
     match = _JOINED_UNIT.fullmatch(name)
@@ -161,14 +164,35 @@ def by_name(
             continue
         if not words or _COMMANDS & set(words):
             continue
-        # The whole name, before a name that ends so, as of a path: log.roll.
+        # The whole name, before a name that ends so, as of a path: log.roll; and either before
+        # those with words behind them that change nothing: ch1_aileron_us.
+        core = _without_fillers(words)
         if words in forms:
             scored.append((0, forms.index(words), place, name))
         elif any(len(f) < len(words) and words[-len(f) :] == f for f in forms):
             scored.append((1, 0, place, name))
-        elif any(f == words[: len(f)] and set(words[len(f) :]) <= _FILLERS for f in forms):
+        elif any(core[-len(f) :] == f for f in forms):
             scored.append((2, 0, place, name))
     return [name for *_, name in sorted(scored)]
+
+
+def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
+    end = next((i for i in range(len(words), 0, -1) if words[i - 1] not in _FILLERS), 0)
+    return words[:end]
+
+
+def of_known_unit(names: Sequence[str], log: Mapping[str, Series], si: str) -> str:
+    """The first channel, or one of the same words whose unit is stated: rc_aileron(percent).
+
+    Args:
+        names: the likeliest first.
+        log: the channels.
+        si: the unit that the model has.
+    """
+    words = words_of(names[0])
+    alike = [n for n in names if words_of(n) == words]
+    known = (n for n in alike if _fits(log[n].unit or without_unit(n)[1] or "none", si))
+    return next(known, names[0])
 
 
 def is_excitation(name: str) -> bool:
@@ -259,13 +283,32 @@ def _finite(series: Series) -> tuple[np.ndarray, np.ndarray]:
     return series.times[good], series.values[good]
 
 
-def scaled(channel: str, series: Series, si: str) -> Guess:
+def full_travel(sticks: Mapping[str, Series]) -> float | None:
+    """What a log's sticks count to at their stops, where one of them was there; None if not.
+
+    Args:
+        sticks: channels that are named as sticks or what is commanded by them.
+    """
+    for series in sticks.values():
+        values = series.values[np.isfinite(series.values)]
+        # Radios of the EdgeTX family count to 1024, in whole numbers.
+        if values.size and np.max(np.abs(values)) == 1024.0 and _are_whole(values):
+            return 1024.0
+    return None
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    return bool(np.all(values == np.rint(values)))
+
+
+def scaled(channel: str, series: Series, si: str, full: float | None = None) -> Guess:
     """A channel with the unit and the scale that its name, the log or its numbers tell.
 
     Args:
         channel: its name.
         series: its samples.
         si: the unit that the model has.
+        full: what the log's sticks count to at their stops, where that is known.
     """
     values = series.values[np.isfinite(series.values)]
     low, high = float(np.min(values)), float(np.max(values))
@@ -282,13 +325,16 @@ def scaled(channel: str, series: Series, si: str) -> Guess:
         unit = "deg" if max(-low, high) > most else "rad"
     elif si == "rad/s":
         # A rotor turns faster than a body: of its speed the unit is told by 4000 rpm.
-        unit = "deg/s" if max(-low, high) > _FASTEST_TURN else "rad/s"
+        largest = max(-low, high)
+        # Whole numbers of rad/s nobody logs.
+        is_coarse = largest >= 2.0 and _are_whole(values)
+        unit = "deg/s" if largest > _FASTEST_TURN or is_coarse else "rad/s"
     elif si == "1" and stated:
         # A command in degrees: of an angle, or of the swashplate.
         remark = f"GUESS: {low:.4g} to {high:.4g} {stated}; scale: 1 over what full travel is in it"
         return Guess(channel, "1", EDIT, remarks=(remark,))
     elif si == "1":
-        return _of_stick(channel, low, high)
+        return _of_stick(channel, low, high, full)
     elif _fits("m", si):
         guess = "GUESS: full travel of the input for 1 in the log is not known"
         return Guess(channel, si, EDIT, remarks=(guess,))
@@ -316,10 +362,16 @@ def _of_pulses(channel: str, values: np.ndarray, si: str) -> Guess:
     return Guess(channel, si, EDIT, rest, (f"{remark}; scale: {si} for a microsecond",))
 
 
-def _of_stick(channel: str, low: float, high: float) -> Guess:
+def _of_stick(channel: str, low: float, high: float, full: float | None) -> Guess:
     largest = max(-low, high)
-    for full, unit, scale in ((1.5, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
-        if largest <= full:
+    # What pilots command of Betaflight's family counts to 500, its collective to 1000 or so.
+    commanded = words_of(channel)[-3:-1] == ("rc", "command") and largest <= _FULL_COMMAND
+    travel = _FULL_COMMAND if commanded else full
+    if travel and _PARTS < largest <= travel:
+        remark = f"GUESS: {low:.4g} to {high:.4g}, {travel:g} at the stop"
+        return Guess(channel, "1", 1.0 / travel, remarks=(remark,))
+    for most, unit, scale in ((_PARTS, "1", 1.0), (105.0, "%", 1.0), (1050.0, "1", 0.001)):
+        if largest <= most:
             what = "thousandths" if scale != 1.0 else {"1": "parts of full travel"}.get(unit, unit)
             remark = f"GUESS: {low:.4g} to {high:.4g} taken for {what}"
             return Guess(channel, unit, scale, remarks=(remark,))

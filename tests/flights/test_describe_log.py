@@ -85,7 +85,7 @@ def test_clock_found_by_its_values_or_named(tmp_path):
 )
 def test_clock_with_a_problem(tmp_path, stamps, word):
     path = tmp_path / "bench.csv"
-    path.write_text("\n".join(["t,x", *(f"{t},0" for t in stamps.split())]))
+    path.write_text("\n".join(["t,x", *(f"{t},{i}" for i, t in enumerate(stamps.split()))]))
     time = describe_log(path).time
     assert time is not None
     assert word in time.problem

@@ -1,0 +1,109 @@
+"""Arrays that have clocks of their own by where they stand in a file: `log.imu.t` is the time of
+`log.imu.gx` and `log.rc.t` that of `log.rc.aileron`."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.channel_names import words_in
+from heli_jax.flights.clock_guess import TIME_NAMES
+from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.table import Table, sample_count, shown
+from heli_jax.flights.time_units import SECONDS, likely_unit, split_unit
+
+_LEVEL = re.compile(r"[./]")
+_MOST_NAMED = 6
+
+
+class _Clock(NamedTuple):
+    """An array of times: its name, the group that it stands in, and the words before `time`."""
+
+    name: str
+    group: tuple[str, ...]
+    stem: tuple[str, ...]
+    size: int
+
+
+def by_clocks(table: ArrayTable) -> ChannelLog | None:
+    """Arrays as topics, each with the times of its group or of the nearest above that has some of
+    its length; None where all have one clock.
+
+    Args:
+        table: of arrays.
+    """
+    arrays = {s.name: s.values for s in table.survey() if s.values is not None}
+    clocks = [c for name, x in arrays.items() if (c := _clock(name, x)) is not None]
+    matched = {n: _clock_of(n, x.size, clocks) for n, x in arrays.items()}
+    of_clock: dict[str, list[str]] = {}
+    for name, clock in matched.items():
+        if clock is not None and name not in {c.name for c in clocks}:
+            of_clock.setdefault(clock.name, []).append(name)
+    if len(of_clock) < 2:
+        return None
+    topics = tuple(_topic(table, arrays, c, names) for c, names in of_clock.items())
+    without = [n for n, clock in matched.items() if clock is None and arrays[n].size > 1]
+    notes = (*table.notes, *_left_out(without, arrays))
+    return ChannelLog(table.path, table.format, table.size, table.sha256, topics, notes=notes)
+
+
+def clock_notes(table: Table) -> tuple[str, ...]:
+    """That arrays have clocks of their own, where they have.
+
+    Args:
+        table: of rows or arrays.
+    """
+    log = by_clocks(table) if isinstance(table, ArrayTable) else None
+    if log is None:
+        return ()
+    listed = ", ".join(f"{shown(t.name)} of {len(t.columns)}" for t in log.topics[:_MOST_NAMED])
+    return (f"arrays have clocks of their own, read where no time is stated: {listed}",)
+
+
+def _clock(name: str, values: np.ndarray) -> _Clock | None:
+    *group, leaf = _LEVEL.split(name)
+    words = words_in(split_unit(leaf)[0])
+    at = next((i for i in (0, len(words) - 1) if words and words[i] in TIME_NAMES), None)
+    increases = values.size > 1 and bool(np.all(values[1:] > values[:-1]))
+    if at is None or not increases:
+        return None
+    # t_imu as well as imu_time.
+    return _Clock(name, tuple(group), words[:at] + words[at + 1 :], values.size)
+
+
+def _clock_of(name: str, size: int, clocks: Sequence[_Clock]) -> _Clock | None:
+    """The clock of an array; None where its group has none of its length, or several."""
+    *group, leaf = _LEVEL.split(name)
+    for depth in range(len(group), -1, -1):
+        level = tuple(group[:depth])
+        near = [c for c in clocks if c.group == level and c.size == size]
+        if not near:
+            continue
+        # At one level by the word before: imu_t is the time of imu_gx.
+        words = (*group[depth:], *words_in(leaf))
+        own = [c for c in near if c.stem and tuple(words[: len(c.stem)]) == c.stem]
+        near = own or near
+        return near[0] if len(near) == 1 else None
+    return None
+
+
+def _topic(
+    table: ArrayTable, arrays: Mapping[str, np.ndarray], clock: str, names: Sequence[str]
+) -> Topic:
+    stamps = arrays[clock]
+    unit = table.time_unit(clock) or split_unit(clock)[1] or likely_unit(stamps)
+    units = {n: table.units.get(n, "") for n in names}
+    with np.errstate(over="ignore"):  # of a damaged file
+        stamps = stamps * SECONDS[unit]
+    return Topic(clock, stamps, {n: arrays[n] for n in names}, units, clock)
+
+
+def _left_out(names: Sequence[str], arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    if not names:
+        return ()
+    listed = ", ".join(f"{shown(n)} ({sample_count(arrays[n].size)})" for n in names[:_MOST_NAMED])
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    words = "no time of their length, or several, stand in their groups"
+    return (f"left out, since {words}: {listed}{more}",)

@@ -1,0 +1,88 @@
+"""Which column of a table is its clock, where nobody says so."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from heli_jax.flights.channel_names import words_in
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.table import Survey, Table, shown
+from heli_jax.flights.time_units import likely_unit, split_unit
+
+TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+_COUNTERS = {
+    *(
+        "frame",
+        "frames",
+        "seq",
+        "sequence",
+        "index",
+        "idx",
+        "sample",
+        "samples",
+        "count",
+        "counter",
+    ),
+    *("row", "iteration", "id", "no", "nr", "number", "n", "packet", "tick"),
+}
+
+
+def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None, bool]:
+    """The clock, and whether its unit is a guess.
+
+    Args:
+        table: of rows.
+        surveys: of its columns.
+    """
+    values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
+    numeric = [s.name for s in surveys if s.values is not None]
+    # A name decides before the numbers do: a counter or a distance may increase all along too.
+    for name in numeric:
+        stem, _ = split_unit(name)
+        # Of a path, log.roll.time, the last part is the name; %time and __time are names of tools.
+        last = re.split(r"[./]", stem)[-1].strip("%_ ").casefold()
+        if last in TIME_NAMES or table.time_unit(name):
+            return _with_unit(table, name, values[name])
+    increasing = [n for n in numeric if _increases(values[n])]
+    # Those whose last word is one of time: flight_time could be a parameter, but for its steps.
+    named = [n for n in increasing if TIME_NAMES & set(words_in(split_unit(n)[0])[-1:])]
+    # Without a name to go by, the first column that increases all along is taken, but for numbers
+    # of rows. The result names it, so that a wrong guess is seen.
+    others = [n for n in increasing if not _counts(n, values[n])]
+    for name in (*named, *others):
+        return _with_unit(table, name, values[name])
+    return None, False
+
+
+def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:
+    """That a column which might be taken for a clock counts rows, where one does.
+
+    Args:
+        surveys: of a table's columns, none of which is a clock.
+    """
+    with_numbers = [(s.name, s.values) for s in surveys if s.values is not None]
+    counters = [n for n, x in with_numbers if _increases(x) and _counts(n, x)]
+    if not counters:
+        return ()
+    return (f"{shown(counters[0])} counts rows and is taken for no time: add a column of times",)
+
+
+def _increases(values: np.ndarray) -> bool:
+    return values.size > 1 and bool(np.all(values[1:] > values[:-1]))
+
+
+def _counts(name: str, values: np.ndarray) -> bool:
+    """Whether whole numbers count rows or frames, one by one, by name too: a log at a sample a
+    second has such times."""
+    by_name = not name or bool(_COUNTERS & set(words_in(name)))
+    return by_name and bool(
+        np.all(values[1:] == values[:-1] + 1.0) and values[0] == np.rint(values[0])
+    )
+
+
+def _with_unit(table: Table, name: str, stamps: np.ndarray) -> tuple[Signal, bool]:
+    stated = table.time_unit(name) or split_unit(name)[1]
+    if stated:
+        return Signal(name, stated, "s"), False
+    return Signal(name, likely_unit(stamps), "s"), True

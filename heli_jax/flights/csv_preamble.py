@@ -1,0 +1,289 @@
+"""Where the table of a text begins, below what its writer put above: titles, settings, names in
+several lines.
+
+A table is known by its rows: lines of as many cells, most of them numbers, right below a line of
+as many names, or a line of units between them.
+"""
+
+import csv
+import dataclasses
+import itertools
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from heli_jax.errors import InputError
+from heli_jax.flights.csv_cells import is_number, row_of_units
+from heli_jax.flights.csv_dates import is_date, is_day
+from heli_jax.flights.csv_text import (
+    DELIMITERS,
+    LONGEST_HEADER,
+    Body,
+    Line,
+    find_delimiter,
+    header_line,
+    is_of_blanks,
+    lines_in,
+)
+from heli_jax.flights.table import shown, wrong
+
+_LOOKED_AT = 1 << 20
+_MOST_LINES = 20_000
+"""bytes and lines in which a table is sought"""
+_FEWEST = 3
+"""rows that make a table"""
+_NEAR = 6
+"""lines from a header on, one of which is a row of the table"""
+_FIRST = 100
+"""rows by which it is told how wide a table is"""
+_NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
+"""with any decimal sign, and with marks between thousands"""
+_TYPE = re.compile(r"\s*(?:u?int|long|float|double|single|real|string|bool|boolean)\d*\s*", re.I)
+_SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
+_IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
+"""of a body, in place of its name"""
+
+
+class Head(NamedTuple):
+    """The names of a table and where its rows begin.
+
+    Attributes:
+        header: the line of names.
+        delimiter: between them; a tab of a file whose cells have blanks between them.
+        above: lines of names above the header, the nearest first.
+        first_line: the number of the first line of rows or units.
+        note: what stands above, in words; empty of a table that begins with its names.
+        is_fitting: whether rows of as many cells were found right below.
+    """
+
+    header: Line
+    delimiter: str
+    above: tuple[str, ...]
+    first_line: int
+    note: str = ""
+    is_fitting: bool = True
+
+
+def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
+    """The header of the table in a text; None where there is none.
+
+    Args:
+        path: for messages.
+        data: the bytes of the file.
+        blanks: whether blanks alone may stand between cells.
+
+    Raises:
+        InputError: there are several tables.
+    """
+    plain = header_line(data)
+    if plain is None:
+        return None
+    separator = _SEPARATOR.fullmatch(plain.text)
+    if separator:
+        # Excel's own word for what stands between cells.
+        below = header_line(data, Line("", plain.number, plain.after))
+        if below is None:
+            return None
+        return Head(below, separator[1], (), below.number + 1)
+    near = [line for line in lines_in(data, plain, _LOOKED_AT, _NEAR) if line.text.strip()]
+    delimiter = find_delimiter(plain.text, near[1].text if len(near) > 1 else "")
+    if _is_header(near, delimiter, blanks):
+        return Head(plain, delimiter, (), plain.number + 1)
+    lines = [line for line in lines_in(data, plain, _LOOKED_AT, _MOST_LINES) if line.text.strip()]
+    unsure = Head(plain, delimiter, (), plain.number + 1, is_fitting=False)
+    return _sought(path, lines, blanks) or unsure
+
+
+def _is_header(lines: Sequence[Line], delimiter: str, blanks: bool) -> bool:
+    """Whether rows, or a line of units and rows, are right below the first line."""
+    header, below = lines[0].text, lines[1:]
+    if not below or (blanks and is_of_blanks(header, below[0].text)):
+        return True
+    if delimiter not in header:
+        return False
+    width = len(_cells(header, delimiter))
+    cells = [_cells(line.text, delimiter) for line in below]
+    # Rows of other lengths are told with their line where the names are above one that fits.
+    row = next((i for i, c in enumerate(cells) if len(c) == width and _is_row(c)), None)
+    if row is None:
+        return False
+    return all(_is_row(c) or _are_units(c) for c in cells[:row])
+
+
+def _sought(path: str, lines: Sequence[Line], blanks: bool) -> Head | None:
+    """The table further down."""
+    for delimiter in (*DELIMITERS, " ") if blanks else DELIMITERS:
+        cells = [_cells(line.text, delimiter) for line in lines]
+        heads = _heads(lines, cells, delimiter)
+        if len(heads) > 1:
+            first, second = (head.header.number for head in heads[:2])
+            problem = f"holds tables with names in line {first} and in line {second}"
+            raise wrong(path, f"{problem}, expected one; make a file of each")
+        if heads:
+            return heads[0]
+    return None
+
+
+def _heads(lines: Sequence[Line], cells: Sequence[list[str]], delimiter: str) -> list[Head]:
+    """The headers above runs of rows of as many cells."""
+    heads, at = [], 0
+    while at < len(lines):
+        end = at
+        while end < len(lines) and _is_row(cells[end]) and len(cells[end]) == len(cells[at]):
+            end += 1
+        if end - at >= _FEWEST and (head := _head_above(lines, cells, at, delimiter)):
+            heads.append(head)
+        at = max(end, at + 1)
+    return heads
+
+
+def _head_above(
+    lines: Sequence[Line], cells: Sequence[list[str]], row: int, delimiter: str
+) -> Head | None:
+    """The header of rows that begin at a line; None where no names stand above them."""
+    width, begin = len(cells[row]), row
+    if row and len(cells[row - 1]) == width and _are_units(cells[row - 1]):
+        begin = row - 1
+    header = begin - 1
+    # A rule, a word on what follows, or types of the columns, between names and rows.
+    if header > 0 and (len(cells[header]) == 1 or all(map(_TYPE.fullmatch, cells[header]))):
+        header -= 1
+    if header < 0 or not _fits(cells[header], cells[row]):
+        return None
+    if delimiter == " " and not is_of_blanks(lines[header].text, lines[row].text):
+        return None
+    top = header
+    while top and _is_group(lines, cells, top - 1, width) and delimiter != " ":
+        top -= 1
+    found, note = lines[header], ""
+    if top:
+        first, last = lines[0].number, lines[top - 1].number
+        above = f"line {first}" if first == last else f"lines {first} to {last}"
+        note = f"the names of the columns were found in line {found.number}, below {above}"
+    return Head(
+        Line(found.text, found.number, lines[begin - 1].after),
+        "\t" if delimiter == " " else delimiter,
+        tuple(line.text for line in reversed(lines[top:header])),
+        lines[begin - 1].number + 1,
+        note,
+    )
+
+
+def _is_group(lines: Sequence[Line], cells: Sequence[list[str]], at: int, width: int) -> bool:
+    """Whether a line may hold names of groups of the columns, or their numbers."""
+    filled = [cell for cell in cells[at] if cell.strip()]
+    together = lines[at].number + 1 == lines[at + 1].number
+    alike = len(cells[at]) == width and not _are_units(cells[at])
+    return together and alike and bool(filled) and not is_date(filled[0])
+
+
+def _fits(names: Sequence[str], row: Sequence[str]) -> bool:
+    """Whether a line names the cells of a row; one name more may stand there for comments."""
+    surplus = len(names) - len(row)
+    return surplus in (0, 1) and (not surplus or is_for_comments(names[-1])) and _are_names(names)
+
+
+def is_for_comments(name: str) -> bool:
+    """Whether a name is that of a column which rows need not have, as LabVIEW's."""
+    return name.strip().lower() in ("", "comment", "comments")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    if '"' in line:
+        try:
+            return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+        except (csv.Error, StopIteration):
+            pass
+    return line.split(delimiter)
+
+
+def _is_value(cell: str) -> bool:
+    return bool(_NUMBER.fullmatch(cell)) or is_number(cell) or is_date(cell) or is_day(cell)
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether cells are those of a sample: the first is a number or a time, or most are."""
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    if len(cells) < 2 or not filled:
+        return False
+    values = sum(map(_is_value, filled))
+    return 2 * values > len(filled) or (_is_value(filled[0]) and 3 * values >= len(filled))
+
+
+def _are_names(cells: Sequence[str], fewest: int = 2) -> bool:
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    return len(cells) >= fewest and 2 * sum(map(_is_value, filled)) < len(filled)
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    return row_of_units(cells) is not None
+
+
+def qualified(names: Sequence[str], above: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Names with those of the groups above them, where it takes them to tell columns apart.
+
+    Args:
+        names: of the columns.
+        above: names of groups, the nearest line first; a blank goes with the group on its left.
+    """
+    for line in above:
+        groups, group = [], ""
+        for cell in line:
+            group = cell.strip() or group
+            groups.append(group)
+        repeated = len(set(names)) < len(names)
+        spans = len(set(groups)) < len(groups)
+        if not (repeated or (spans and line is above[0])):
+            break
+        if all(_IDENTITY.fullmatch(group) for group in groups if group):
+            continue
+        names = [f"{g}.{n}" if g and n else n or g for g, n in zip(groups, names, strict=True)]
+    return tuple(names)
+
+
+def require_names(path: str, names: Sequence[str], delimiter: str, line: str) -> None:
+    """Refuse a first line that holds a sample.
+
+    Args:
+        path: for the message.
+        names: what stands in it.
+        delimiter: between them.
+        line: which it is, in words.
+
+    Raises:
+        InputError: with what to write above.
+    """
+    numbers = [name for name in names if is_number(name)]
+    if len(numbers) < len(names) and not any(map(is_date, names)):
+        return
+    listed = delimiter.join(["time", *(f"column{i}" for i in range(2, len(names) + 1))][:6])
+    what = "numbers" if len(numbers) == len(names) else f"{shown(next(filter(is_date, names)))}"
+    problem = f"got {what}, expected the names of the columns; write a line of names above"
+    raise wrong(path, f"{problem}, such as {shown(listed)}", line)
+
+
+def as_wide(names: tuple[str, ...], body: Body) -> tuple[str, ...]:
+    """The names as many as rows have cells, where only a delimiter at the end, or a column for
+    comments, makes the difference.
+
+    Args:
+        names: in the header.
+        body: the rows.
+    """
+    first = body.beginning(LONGEST_HEADER)
+    if body.size > len(first):
+        first = first[: first.rfind(b"\n") + 1]
+    rows = dataclasses.replace(body, rows=memoryview(first))
+    try:
+        cells = [cells for _, cells in itertools.islice(rows.records(), _FIRST)]
+    # What is wrong with the quotes is told where the cells are read.
+    except InputError:
+        return names
+    widths = {len(row) for row in cells}
+    if widths == {len(names) + 1} and not any(row[-1].strip() for row in cells):
+        return (*names, "")
+    if widths == {len(names) - 1} and is_for_comments(names[-1]):
+        return names[:-1]
+    return names

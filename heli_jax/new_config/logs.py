@@ -1,0 +1,112 @@
+"""A log as `heli-jax new` looks at it, whatever its format."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heli_jax.flights.array_clocks import by_clocks
+from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.describe import LogInfo, describe_table
+from heli_jax.flights.log import as_floats
+from heli_jax.flights.marks import without_marks
+from heli_jax.flights.open_log import chosen_flights, open_flights
+from heli_jax.flights.table import Table, shown, wrong
+from heli_jax.flights.table_view import without_copies
+from heli_jax.new_config.guess import Series
+
+_FEWEST = 8
+"""samples of a signal"""
+
+
+class Log(NamedTuple):
+    """A flight as `new` looks at it."""
+
+    path: str
+    format: str
+    series: Mapping[str, Series]
+    time: Any
+    """`TimeInfo` of a table; None where topics have clocks of their own"""
+    flight: int | None
+    several: bool
+    notes: Sequence[str] = ()
+    """what of the log is not looked at"""
+
+
+def read_log(path: Path, number: int | None) -> Log:
+    """The channels of a log that hold samples.
+
+    Args:
+        path: of any format that is read.
+        number: of the flight, of a log that holds several, from 1.
+
+    Raises:
+        InputError: it cannot be read, or holds no times.
+    """
+    opened = chosen_flights(path, open_flights(path), number)
+    if not isinstance(opened, tuple):
+        # Arrays may have clocks of their own, by where they stand in the file.
+        grouped = by_clocks(opened) if isinstance(opened, ArrayTable) else None
+        if grouped is None:
+            return _read_table(opened)
+        opened = (grouped,)
+    first, *others = opened
+    series = {
+        name: Series(topic.times, without_marks(as_floats(values)), topic.units.get(name, ""))
+        for topic in first.topics
+        if topic.clock and topic.times.size >= _FEWEST
+        for name, values in topic.columns.items()
+        if np.asarray(values).dtype.kind in "biuf" and _is_known(as_floats(values))
+    }
+    flight = first.flight[0] if others or first.flight[1] > 1 else None
+    notes = tuple(n for n in first.notes if n.startswith("left out, since"))
+    return Log(
+        str(path),
+        first.format,
+        series,
+        None,
+        flight,
+        flight is not None,
+        notes,
+    )
+
+
+def _read_table(table: Table) -> Log:
+    info: LogInfo = describe_table(table, None, None)
+    if info.time is None or info.time.problem:
+        why = info.time.problem if info.time is not None else _without_time(info)
+        raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
+    clock = info.time.column
+    table = without_copies(table, clock)
+    names = [c.name for c in info.columns if c.kind == "number"]
+    # Of two columns of one name neither can be asked for.
+    names = [n for n in names if table.names.count(n) == 1]
+    # Of arrays those that are as long as the clock.
+    rows = {c.name: c.rows for c in info.columns}
+    others = [n for n in names if rows[n] != rows[clock]]
+    names = [n for n in names if n not in others]
+    values = table.numbers([clock, *(n for n in names if n != clock)])
+    # Seconds from the first stamp: their count does not matter to a guess.
+    times = np.linspace(0.0, info.time.duration, values[clock].size)
+    series = {
+        n: Series(times, without_marks(values[n]), table.units.get(n, ""))
+        for n in names
+        if n != clock and _is_known(values[n])
+    }
+    notes = ()
+    if others:
+        listed = ", ".join(map(shown, others[:6]))
+        notes = (f"left out, since they are not as long as {shown(clock)}: {listed}",)
+    return Log(table.path, table.format, series, info.time, None, False, notes)
+
+
+def _without_time(info: LogInfo) -> str:
+    """Why none of a table's columns is a time, in words."""
+    strays = next((f"{shown(c.name)}: {c.strays}" for c in info.columns if c.strays), "")
+    notes = [strays, *(note for note in info.notes if "taken for no time" in note)]
+    return "; ".join(filter(None, ("none of its columns is a time", *notes)))
+
+
+def _is_known(values: np.ndarray) -> bool:
+    return int(np.sum(np.isfinite(values))) >= _FEWEST

@@ -1,0 +1,153 @@
+"""Times and numbers as spreadsheets, loggers and people of several countries write them."""
+
+import datetime
+
+import numpy as np
+import pytest
+
+from heli_jax.errors import InputError
+from heli_jax.flights import describe_log
+from heli_jax.flights.csv_dates import Dates, seconds_of_dates
+from heli_jax.flights.csv_table import open_csv
+from heli_jax.flights.flight import Signal
+from heli_jax.flights.read import read_flight
+from heli_jax.flights.time_units import likely_unit
+
+N, DT = 300, 0.01
+T = DT * np.arange(N)
+U, P = np.sin(7.0 * T), np.cos(5.0 * T)
+BEGIN = datetime.datetime(2024, 3, 4, 23, 59, 58)
+
+
+def stamps(form: str, digits: int = 3) -> list[str]:
+    """Of the log's samples, `%F` being the fraction of a second."""
+    times = [BEGIN + datetime.timedelta(microseconds=round(1e6 * t)) for t in T]
+    return [t.strftime(form.replace("%F", f"{t.microsecond:06d}"[:digits])) for t in times]
+
+
+def written(tmp_path, lines, encoding="utf-8"):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines) + "\n", encoding=encoding)
+    return path
+
+
+def read(path, time="Time"):
+    one = {"u": Signal("u", "1", "1")}, {"p": Signal("p", "1", "1")}
+    return read_flight(path, time=time, inputs=one[0], outputs=one[1])
+
+
+def comma(x: float) -> str:
+    return f"{x:.4f}".replace(".", ",")
+
+
+@pytest.mark.parametrize(
+    ("form", "digits", "note"),
+    [
+        ("%d.%m.%Y %H:%M:%S,%F", 3, ""),
+        ("%d.%m.%y %H:%M:%S.%F", 3, ""),
+        ("%Y/%m/%d %H:%M:%S.%F", 3, ""),
+        ("%Y-%m-%d, %H:%M:%S.%F", 6, ""),
+        ("%d-%b-%Y %H:%M:%S.%F", 3, ""),
+        ("%m/%d/%Y %I:%M:%S.%F %p", 2, "taken as month and day"),
+        ("%d/%m/%Y %H:%M:%S.%F", 2, "taken as day and month"),
+        ("%M:%S.%F", 2, "minutes and seconds"),
+        ("%I:%M:%S.%F %p", 2, ""),
+        ("%H:%M:%S:%F", 3, ""),
+    ],
+)
+def test_times_as_they_are_written_go_on_over_midnight(tmp_path, form, digits, note):
+    rows = [
+        f"{s};{comma(u)};{comma(p)}" for s, u, p in zip(stamps(form, digits), U, P, strict=True)
+    ]
+    flight = read(written(tmp_path, ["Time;u;p", *rows]))
+    assert (flight.n_samples, flight.dt) == (N, DT)
+    np.testing.assert_allclose(flight.outputs["p"], P, atol=1e-4)
+    assert flight.source is not None
+    assert note in " ".join(flight.source.notes)
+
+
+def test_the_day_of_an_ambiguous_date_matters_only_where_the_log_leaves_it():
+    def seconds(*cells):
+        found = seconds_of_dates(cells)
+        assert isinstance(found, Dates)
+        return found.seconds.tolist(), found.note
+
+    assert seconds("3/4/2024 0:00:01", "3/4/2024 0:00:02") == ([1.0, 2.0], "")
+    assert seconds("13/4/2024 23:59:59", "14/4/2024 0:00:00") == ([86399.0, 86400.0], "")
+    assert seconds("12/31/2024 11:59:59 PM", "1/1/2025 12:00:00 AM")[0] == [86399.0, 86400.0]
+    # Month and day, which makes a day of it and not a month.
+    times, note = seconds("3/4/2024 23:59:59", "3/5/2024 0:00:00")
+    assert times == [86399.0, 86400.0]
+    assert "month and day" in note
+    assert seconds_of_dates(["31/12/2024 1:00:00", "12/31/2024 1:00:00"]) == 1
+    assert seconds_of_dates(["1:00:00 PM", "13:00:00 PM"]) == 1
+    assert seconds_of_dates(["2024-02-29 1:00:00", "2024-02-30 1:00:00"]) == 1
+
+
+def test_a_column_of_dates_beside_times_of_day_counts_them_on(tmp_path):
+    # The second flight of a card: a day later, and earlier in the day.
+    later = [d.replace("2024-03", "2024-04") for d in stamps("%Y-%m-%d")]
+    rows = [f"{d},{s},1,2" for d, s in zip(stamps("%Y-%m-%d"), stamps("%H:%M:%S.%F"), strict=True)]
+    rows += [f"{d},12:00:{t:05.2f},1,2" for d, t in zip(later, T, strict=True)]
+    table = open_csv(written(tmp_path, ["Date,Time,u,p", *rows]))
+    times = table.numbers(["Time"])["Time"]
+    np.testing.assert_allclose(times[:N] - times[0], T, atol=1e-6)
+    assert times[N] - times[0] == pytest.approx(31 * 86400 - 43200 + 2 - 0)
+    assert "by the dates beside them" in " ".join(table.notes)
+
+
+def test_times_with_their_unit_behind_them_are_seconds(tmp_path):
+    rows = [f"{1e3 * t:g} ms,{u:.6f},{p:.6f}" for t, u, p in zip(T, U, P, strict=True)]
+    flight = read(written(tmp_path, ["Time,u,p", *rows]))
+    assert flight.dt == DT
+    info = describe_log(written(tmp_path, ["Time,u,p", *rows])).time
+    assert info is not None
+    assert (info.unit, info.guessed) == ("s", False)
+
+
+@pytest.mark.parametrize(
+    ("space", "delimiter", "decimal"),
+    [(".", ";", ","), ("\u00a0", ";", ","), (" ", "\t", ","), ("'", ";", "."), (",", ",", ".")],
+)
+def test_marks_between_thousands_are_no_decimal_signs(tmp_path, space, delimiter, decimal):
+    def number(x, digits):
+        marks = str.maketrans(",.", f"#{decimal}")
+        text = f"{x:,.{digits}f}".translate(marks).replace("#", space)
+        return f'"{text}"' if delimiter == "," else text
+
+    rpm = 1577.0 + np.arange(N) % 7
+    cells = zip(T, U, rpm, 1577.25 + P, strict=True)
+    rows = [
+        delimiter.join((number(t, 2), number(u, 4), number(w, 0), number(h, 2)))
+        for t, u, w, h in cells
+    ]
+    path = written(tmp_path, [delimiter.join(("Time", "u", "rpm", "h")), *rows])
+    columns = {c.name: c for c in describe_log(path).columns}
+    # By itself too, where 1.577 could be one and a half.
+    assert (columns["rpm"].min, columns["rpm"].max) == (1577.0, 1583.0)
+    table = open_csv(path)
+    np.testing.assert_allclose(table.numbers(["rpm"])["rpm"], rpm)
+    np.testing.assert_allclose(table.numbers(["h", "u"])["h"], np.round(1577.25 + P, 2))
+    assert "'rpm' has marks between thousands" in " ".join(table.notes)
+
+
+def test_points_among_decimal_commas_that_end_no_thousands_are_refused(tmp_path):
+    rows = [f"{comma(t)};{u:.4f};{comma(p)}" for t, u, p in zip(T, U, P, strict=True)]
+    path = written(tmp_path, ["Time;u;p", *rows])
+    with pytest.raises(InputError, match=r"column 'u': got '0.0000', expected one decimal sign"):
+        read(path)
+    columns = {c.name: c.kind for c in describe_log(path).columns}
+    assert columns == {"Time": "number", "u": "text", "p": "number"}
+
+
+@pytest.mark.parametrize(
+    ("step", "rows", "unit"),
+    [
+        *((0.01, 6000, "s"), (1.0, 6000, "s"), (0.1, 100_000, "s")),
+        *((10, 6000, "ms"), (200, 3000, "ms"), (1, 60_000, "ms"), (2, 9000, "ms")),
+        *((2500, 9000, "us"), (500, 40_000, "us"), (125, 200_000, "us")),
+        (10_000_000, 900, "ns"),
+    ],
+)
+def test_ticks_without_a_unit_are_of_the_one_that_makes_a_flight(step, rows, unit):
+    assert likely_unit(step * np.arange(rows) + 12345.0) == unit
