@@ -242,7 +242,9 @@ def by_responses(
         remarks, doubts = agreement.sentences, (agreement.doubt,)
         less = any(m.vaf < 0 for m in (simulated or {}).values())
         return Adequacy(False, less, (), misfit, remarks=remarks, doubts=doubts)
-    return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
+    return Adequacy(
+        True, False, (), remarks=(*misfit, *agreement.sentences), limited=agreement.limit
+    )
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
+from heli_jax.dynamics.kinematics import FORCES
 from heli_jax.identification.validation.metrics import cross_correlation
 
 _SECONDS = 0.4
@@ -32,8 +33,10 @@ _FEWEST = 10
 """samples for each regressor"""
 _OF_A_MACHINE = (
     "the model lacks dynamics between the two, which its estimates then stand for. Is a servo, a "
-    "rate loop or a filter missing (onboard)?"
+    "rate loop or a filter missing (onboard)? Or is this a poor optimum? Several starts "
+    "(fit.starts) tell."
 )
+_OF_AN_ACCELERATION = " Is the sensor away from the centre of gravity (x_imu, y_imu, z_imu)?"
 _OF_SENSORS = (
     "bias, scale and delay do not account for it, and their estimates take up a part. Is one of "
     "the two filtered, or an estimator's and not a sensor's?"
@@ -109,7 +112,9 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
             "of the model) or follows the response (feedback); no servo or filter that is missing "
             "does that."
         )
-    return begun + f"{one.lag:.2g} s after it moved: {remedy}"
+    # What turning adds to an accelerometer is an answer to the inputs too.
+    away = _OF_AN_ACCELERATION if output in FORCES and remedy is _OF_A_MACHINE else ""
+    return begun + f"{one.lag:.2g} s after it moved: {remedy}{away}"
 
 
 def explained_by(
