@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from decimal import Decimal
 
 NOTHING = "–"
+WORST = -10.0
+"""VAF below which its digits say nothing but that a simulation is far off"""
 _LONG = 1e5
 """per cent from which a power of ten is taken out, as `number` takes it"""
 _UP = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -36,6 +38,23 @@ def percent(value: float | None, digits: int = 2) -> str:
     if abs(share) >= _LONG:
         return f"{number(share, 3)} %"
     return f"{_signed(f'{share:.{digits}f}')} %"
+
+
+def vaf_percent(value: float | None, digits: int = 2) -> str:
+    """A VAF or a fit (1 is 100 %) as a percentage: that of a simulation which is off is a bound."""
+    if value is not None and value < WORST:
+        return f"below {percent(WORST, 0)}"
+    return percent(value, digits)
+
+
+def vaf_text(value: float, form: str = ".3g") -> str:
+    """A VAF as a number in ASCII, bounded as `vaf_percent` does it."""
+    return f"below {WORST:g}" if value < WORST else f"{value:{form}}"
+
+
+def explained_text(share: float) -> str:
+    """A share that is explained (1 is 100 %); none where all is worse than with the mean."""
+    return "none" if share < 0 else f"{100 * share:.0f} %"
 
 
 def relative(sd: float | None, value: float) -> str:

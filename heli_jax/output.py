@@ -18,7 +18,7 @@ from heli_jax.identification.validation.excited_band import NOTHING_FOLLOWS
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import plain_words, rounded, terse
+from heli_jax.numbers import WORST, plain_words, rounded, terse, vaf_text
 from heli_jax.report import files
 from heli_jax.report import tables as report_tables
 from heli_jax.report.card import card, summary
@@ -92,7 +92,7 @@ def _print_outcome(fit: Fit) -> None:
     if fit.status == "not-converged":
         # What "the data determine" is a property of an optimum.
         text = "the optimiser stopped before an optimum, and these numbers are no result."
-    worse = [f"{n} ({terse(m.vaf, 2)})" for n, m in fit.validation.items() if not m.vaf >= 0]
+    worse = [f"{n} ({vaf_text(m.vaf, '.2g')})" for n, m in fit.validation.items() if not m.vaf >= 0]
     held = f". Held out, worse than the mean (VAF): {', '.join(worse)}" if worse else ""
     arrived = "converged, not-identifiable" if fit.status == "not-identifiable" else fit.status
     # Reasons have a line each below: they are said once.
@@ -186,12 +186,17 @@ def _print_agreement(what: str, m: Metrics) -> None:
     if diverges(m, FAR):
         print(f"{what}: diverges")
         return
-    print(f"{what}: VAF {m.vaf:.5f}, fit {m.nrmse_fit_percent:.1f} %, TIC {m.tic:.4f}")
+    fit = "worse than the mean" if m.vaf < WORST else f"{m.nrmse_fit_percent:.1f} %"
+    print(f"{what}: VAF {vaf_text(m.vaf, '.5f')}, fit {fit}, TIC {m.tic:.4f}")
 
 
 def _print_baseline(b: Baseline) -> None:
     ratios = ", ".join(f"{n} = {terse(v)}" for n, v in b.combinations.items())
-    vaf = f"VAF {b.metrics.vaf:.5f}" if math.isfinite(b.metrics.vaf) else "its simulation diverges"
+    vaf = (
+        f"VAF {vaf_text(b.metrics.vaf, '.5f')}"
+        if math.isfinite(b.metrics.vaf)
+        else "its simulation diverges"
+    )
     print(f"RLS (order {b.order}, {b.output}): {vaf}" + (f"; {ratios}" if ratios else ""))
     for sentence in b.sentences:
         print(f"  ! {sentence}")

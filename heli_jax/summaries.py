@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import naming
-from heli_jax.numbers import NOTHING, measured, number, percent
+from heli_jax.numbers import NOTHING, measured, number, percent, vaf_percent
 
 type Row = tuple[str, ...]
 
@@ -109,7 +109,7 @@ def of_estimates(estimates: Mapping[str, Any]) -> tuple[Row, tuple[Row, ...]]:
 def of_fit(fit: Any) -> Summary:
     """Status, verdict, estimates with intervals, and agreement by output."""
     head, rows = of_estimates(fit.estimates)
-    agreement = [f"{name}: VAF {percent(m.vaf)}" for name, m in fit.metrics.items()]
+    agreement = [f"{name}: VAF {vaf_percent(m.vaf)}" for name, m in fit.metrics.items()]
     by = f" by instrument ({', '.join(fit.instruments)})" if fit.instruments else ""
     return Summary(
         f"Fit of {fit.model} by {fit.method}{by}: {fit.status}",

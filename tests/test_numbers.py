@@ -65,3 +65,16 @@ def test_numbers_within_a_sentence_are_written_for_the_terminal():
     words = "a delay of 9.72e-05 (-7.7e-05 to inf) s +- 3 %, from x_roll - none"
     assert numbers.plain_words(sentence) == words
     assert numbers.plain_words("coefficient of s^2 in 12.50") == "coefficient of s^2 in 12.50"
+
+
+def test_a_vaf_far_below_zero_is_a_bound():
+    assert numbers.vaf_percent(0.98761) == "98.76 %"
+    assert numbers.vaf_percent(-3571.4) == "below −1000 %"
+    assert numbers.vaf_percent(None) == numbers.NOTHING
+    assert numbers.vaf_text(-3571.4) == "below -10"
+    assert numbers.vaf_text(-0.41) == "-0.41"
+
+
+def test_what_is_worse_than_the_mean_explains_none():
+    assert numbers.explained_text(-3571.35) == "none"
+    assert numbers.explained_text(0.356) == "36 %"

@@ -77,6 +77,16 @@ class ResponseAgreement(NamedTuple):
         return ""
 
     @property
+    def limit(self) -> str:
+        """What keeps a model that explains the responses from a plain yes; empty where nothing."""
+        if self.doubt or not self.chi_squared > self.upper95:
+            return ""
+        return (
+            f"squared errors of the responses are {self.chi_squared:.3g} times what their random "
+            f"errors let expect, at most {self.upper95:.3g}"
+        )
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """What takes no part."""
         words = list(self.notes)
@@ -107,7 +117,8 @@ class ResponseAgreement(NamedTuple):
         why = (
             "the model lacks something, the machine is not linear, or an input follows the outputs"
             if self.doubt
-            else "a little more than by chance, too little to call the model not adequate"
+            else "chance makes as much in one of forty; the model lacks something, or its "
+            "intervals are too narrow"
         )
         return (
             f"Squared errors of the responses are {self.chi_squared:.4g} times what their random "

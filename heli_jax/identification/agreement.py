@@ -10,6 +10,7 @@ from heli_jax.identification.validation.metrics import (
     NO_METRICS,
     Metrics,
     Whiteness,
+    diverges,
     metrics,
     whiteness,
 )
@@ -37,6 +38,9 @@ def correlated_residuals(signals: tuple[Signals, ...]) -> dict[str, float]:
             seen = np.isfinite(x) & np.isfinite(y)
             n = int(seen.sum())
             if n < _FEWEST or not (np.std(x[seen]) > 0 and np.std(y[seen]) > 0):
+                continue
+            # Two errors that grow go together whatever the noise does.
+            if any(diverges(metrics(s.measured[m], s.simulated[m])) for m in (a, b)):
                 continue
             rho = float(np.corrcoef(x[seen], y[seen])[0, 1])
             # Of independent white residuals rho has the standard deviation 1 / sqrt(n).

@@ -210,7 +210,7 @@ def assemble(
     )
     if layout.estimator.noise_spectrum:
         adequacy = unless_unrelated(problem, adequacy)
-    verdict = unless_explains_nothing(errors.verdict, adequacy)
+    verdict, lacking = unless_explains_nothing(errors.verdict, adequacy), ()
     if bool(best.converged) and verdict is not errors.verdict:
         errors = errors._replace(verdict=verdict, limits={})
         numbers = _numbers(problem, solution, e, errors, absent)
@@ -226,7 +226,11 @@ def assemble(
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += [*limit_notes(errors.limits), *excitation.aliasing(fast)]
     status = _status(best, e, numbers, errors.verdict)
-    missing = () if all_white else _missing(problem, signals, adequacy)
+    told = any(not f.by_amplitude for f in lacking)
+    notes += [*closed_loop, *feedback_trust_notes(moved, Loop(found, instruments, stays))]
+    notes += [*weak_note(weak), *adequacy.sentences]
+    # Of several outputs and flights the same is said once.
+    notes += [*(() if all_white else _missing(problem, signals, adequacy, told=told)), *held.notes]
     return Fit(
         model=problem.model.name,
         method=problem.method,
@@ -256,15 +260,7 @@ def assemble(
         starts=table(layout, data, run.points, run.optima),
         steps=sum(s for s, _ in optimum.trace),
         trace=optimum.trace,
-        notes=(
-            *notes,
-            *closed_loop,
-            *feedback_trust_notes(moved, Loop(found, instruments, stays)),
-            *weak_note(weak),
-            *adequacy.sentences,
-            *missing,
-            *held.notes,
-        ),
+        notes=tuple(dict.fromkeys(notes)),
         reached=solution,
         feedback=found,
         moved_by_feedback=moved,
@@ -313,7 +309,7 @@ def _feedback(
 
 
 def _missing(
-    problem: Problem, signals: tuple[Signals, ...], adequacy: Adequacy
+    problem: Problem, signals: tuple[Signals, ...], adequacy: Adequacy, *, told: bool
 ) -> list[str] | tuple[()]:
     """What inputs still explain of the residuals (innovations)."""
     # Where the model is inadequate its own sentences say more.
@@ -325,6 +321,7 @@ def _missing(
             for s, flight in zip(signals, problem.training, strict=True)
         ),
         sensors=is_kinematic(problem.model),
+        told=told,
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from heli_jax.identification.result import Fit
-from heli_jax.numbers import measured, number, percent
+from heli_jax.numbers import measured, number, percent, vaf_percent
 from heli_jax.report.drawings import Analysis
 from heli_jax.report.figures.samples import MOST, share_within
 from heli_jax.report.pictures import Picture
@@ -67,7 +67,7 @@ def alt_text(picture: Picture, analysis: Analysis) -> str:
         return f"{picture.title}. {_sampled(picture.name, analysis)}."
     for output, m in fit.metrics.items():
         if picture.name.startswith("response") and picture.name.endswith(f"_{output}"):
-            return f"{picture.alt} Over the fitted flights: VAF {percent(m.vaf)}."
+            return f"{picture.alt} Over the fitted flights: VAF {vaf_percent(m.vaf)}."
     return picture.alt
 
 

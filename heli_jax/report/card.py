@@ -13,7 +13,7 @@ from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.adequacy import EXPECTED
 from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import number, percent
+from heli_jax.numbers import number, percent, vaf_percent
 from heli_jax.report import frequency
 from heli_jax.report.coherence import COHERENT, Coherence, coherences
 from heli_jax.report.frequency import FittedFlight
@@ -109,7 +109,7 @@ def shown(gate: Gate) -> str:
     if math.isnan(gate.value):
         return "none"
     if gate.what == _VAF:
-        return percent(gate.value)
+        return vaf_percent(gate.value)
     text = number(gate.value, 3)
     if gate.what == _CORRELATED:
         # Two digits of what is missing to one, where three in all would say 1.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate
 from heli_jax.identification.validation.metrics import FAR, Metrics, diverges
-from heli_jax.numbers import measured, number, percent, rounded
+from heli_jax.numbers import measured, number, rounded, vaf_percent
 from heli_jax.report.saved_fit import SavedFit, load_fit
 from heli_jax.report.unit_symbols import pretty
 from heli_jax.summaries import Summary, as_html, as_text
@@ -22,8 +22,8 @@ NOT_DETERMINED = "not determined"
 NOT_CONVERGED = "not converged"
 _ABSENT = "–"
 _METRICS: tuple[tuple[str, str, Callable[[float | None], str]], ...] = (
-    ("VAF", "vaf", percent),
-    ("fit", "nrmse_fit_percent", lambda v: percent(None if v is None else v / 100)),
+    ("VAF", "vaf", vaf_percent),
+    ("fit", "nrmse_fit_percent", lambda v: vaf_percent(None if v is None else v / 100)),
     ("TIC", "tic", lambda v: number(v, 3)),
 )
 _LATEX = str.maketrans(

@@ -148,6 +148,17 @@ def test_a_stick_that_is_logged_late_is_no_missing_servo():
     assert "Is a servo, a rate loop or a filter missing" in sentence
 
 
+def test_the_remedy_of_missing_dynamics_is_said_once():
+    u, answer, _, answer_late, noise = a_stick_and_its_answer(8)
+    left = (answer_late - answer + noise)[50:]
+    servo = Left(DT, {"p": left, "q": 2.0 * left}, {"u": u[50:]})
+    of_p, of_q = missing_dynamics((servo,))
+    assert "Several starts" in of_p
+    assert of_q.endswith("s after it moved.")
+    # The score test has said it then.
+    assert all(s.endswith("s after it moved.") for s in missing_dynamics((servo,), told=True))
+
+
 def test_an_output_before_its_stick_is_said_before_any_fit():
     u, answer, u_late, _, noise = a_stick_and_its_answer(8)
     cut = slice(50, None)

@@ -40,11 +40,13 @@ def combinations(
     # One that takes no part in any null direction is determined by itself.
     part = [i for i in range(W.shape[1]) if i not in pivots and np.any(abs(W[:, i]) >= TAKES_PART)]
     # What may be zero or change its sign has no power.
-    return tuple(
+    products = (
         _combination(exponents, covariance, unknowns)
         for exponents in (_exponents(W, i, pivots) for i in part)
         if all(unknowns[k].logarithmic for k in np.flatnonzero(exponents))
     )
+    # An interval from nothing to anything determines a product as little as a parameter.
+    return tuple(c for c in products if c.is_bounded)
 
 
 def _exponents(W: np.ndarray, i: int, pivots: list[int]) -> np.ndarray:
@@ -144,7 +146,7 @@ def sums(
             continue
         if all(u.logarithmic for u in members):
             found.append(_sum(factors, covariance, unknowns, to_value))
-    return tuple(found)
+    return tuple(c for c in found if c.is_bounded)
 
 
 def _sum(

@@ -9,10 +9,10 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.identification.estimation.evaluation import Evaluation
 from heli_jax.identification.identifiability.analysis import NULL, analyse
-from heli_jax.identification.identifiability.combinations import Elsewhere, combinations
+from heli_jax.identification.identifiability.combinations import Elsewhere, Tied, combinations
 from heli_jax.identification.identifiability.directions import WithoutWeakPriors, projected
 from heli_jax.identification.identifiability.valley import Valley
-from heli_jax.identification.identifiability.verdict import Unknown, Verdict
+from heli_jax.identification.identifiability.verdict import Combination, Unknown, Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns import transforms
 from heli_jax.identification.unknowns.layout import Layout
@@ -232,6 +232,21 @@ class Around(NamedTuple):
     """the parameters that the likelihood does not bound within the factor of ten"""
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
     """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
+    open_combinations: frozenset[str] = frozenset()
+    """names of combinations whose intervals, as they are reported, determine nothing"""
+
+    @property
+    def tied(self) -> Tied:
+        """What is determined along null directions."""
+        asked = self.valley.tied if self.valley is not None else combinations
+
+        def tied(
+            null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
+        ) -> tuple[Combination, ...]:
+            found = asked(null, covariance, unknowns)
+            return tuple(c for c in found if c.name not in self.open_combinations)
+
+        return tied
 
 
 NOTHING_ELSE = Around()
@@ -278,6 +293,5 @@ def verdict_of(
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
         reported = reported * np.outer(to_relative, to_relative)
     remedies = _remedies(problem) | dict.fromkeys(around.aliased, _WITHOUT_ALIASES)
-    tied = around.valley.tied if around.valley is not None else combinations
-    elsewhere = Elsewhere(around.twins, tied, around.null, around.one_sided, around.limits)
+    elsewhere = Elsewhere(around.twins, around.tied, around.null, around.one_sided, around.limits)
     return analyse(sensitivity, unknowns, remedies, null_below, without, reported, elsewhere)

@@ -1,5 +1,6 @@
 """What the identifiability analysis says: plain data."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -53,6 +54,16 @@ class Combination(NamedTuple):
     lower95: float
     upper95: float
     kind: Literal["product", "sum"] = "product"
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether its 95 % interval is one: of a product within the factor of ten, as of a
+        parameter."""
+        if not all(map(math.isfinite, (self.value, self.sd, self.lower95, self.upper95))):
+            return False
+        if self.kind == "sum":
+            return True
+        return 0.0 < self.value <= FACTOR * self.lower95 and self.upper95 <= FACTOR * self.value
 
 
 class Pair(NamedTuple):

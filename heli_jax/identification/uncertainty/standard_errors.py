@@ -118,8 +118,14 @@ def _by_slopes(
     # Few independent parts of a spectrum tell a variance poorly; never better than all samples.
     quantiles = np.maximum(errors.quantile(), quantile)
     # The rule of the factor of ten has to see the intervals that are reported.
-    verdict = verdict_of(problem, layout, e, _reported(errors, layout, quantiles), around)
+    reported = _reported(errors, layout, quantiles)
+    verdict = verdict_of(problem, layout, e, reported, around)
     verdict = _widened(verdict, errors, _along(verdict, layout, e))
+    wide = frozenset(c.name for c in verdict.combinations if not c.is_bounded)
+    if wide:
+        around = around._replace(open_combinations=wide)
+        verdict = verdict_of(problem, layout, e, reported, around)
+        verdict = _widened(verdict, errors, _along(verdict, layout, e))
     return StandardErrors(verdict, errors.inflation(), quantiles, True)
 
 

@@ -33,6 +33,7 @@ from heli_jax.identification.validation.advice import (
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.moves_against import moves_against
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
+from heli_jax.numbers import explained_text, vaf_text
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 
@@ -112,7 +113,7 @@ class Adequacy(NamedTuple):
             return words
         bad = [output for output in self.judged if not output.adequate]
         words = list(self.doubts) + [
-            f"VAF of {output.output} is {output.vaf:.3g}"
+            f"VAF of {output.output} is {vaf_text(output.vaf)}"
             + (", less than its mean" if output.vaf < 0 else "")
             for output in bad
         ]
@@ -130,7 +131,7 @@ class Adequacy(NamedTuple):
     @property
     def _simulated_worse(self) -> list[str]:
         return [
-            f"VAF of {o.output}, simulated, is {o.vaf:.3g}, less than its mean"
+            f"VAF of {o.output}, simulated, is {vaf_text(o.vaf)}, less than its mean"
             for o in self.judged
             if o.disturbed_below_mean
         ]
@@ -144,7 +145,7 @@ class Adequacy(NamedTuple):
         words = coloured if self.coloured else []
         # Between what is adequate and what the acceptance card asks for.
         return words + [
-            f"VAF of {output.output} is {output.vaf:.3g}"
+            f"VAF of {output.output} is {vaf_text(output.vaf)}"
             for output in self.judged
             if output.doubtful
         ]
@@ -242,13 +243,15 @@ def by_responses(
         remarks, doubts = agreement.sentences, (agreement.doubt,)
         less = any(m.vaf < 0 for m in (simulated or {}).values())
         return Adequacy(False, less, (), misfit, remarks=remarks, doubts=doubts)
-    return Adequacy(True, False, (), remarks=(*misfit, *agreement.sentences))
+    return Adequacy(
+        True, False, (), remarks=(*misfit, *agreement.sentences), limited=agreement.limit
+    )
 
 
 def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> list[str]:
     """What looks bad and is what the estimated disturbance makes."""
     if ahead is not None:
-        vafs = ", ".join(f"{output.output} {output.vaf:.3g}" for output in outputs)
+        vafs = ", ".join(f"{output.output} {vaf_text(output.vaf)}" for output in outputs)
         return [
             "The model is unstable over the length of the record, so that no simulation of it can "
             f"follow the record: it is judged by predictions up to {ahead:g} s ahead from the "
@@ -256,8 +259,8 @@ def _as_expected(outputs: tuple[OutputAdequacy, ...], ahead: float | None) -> li
         ]
     return [
         f"Driven by the inputs alone, the model follows {output.output} worse than its mean does "
-        f"(VAF {output.vaf:.3g}), as the estimated disturbance lets expect. If none acted, are the "
-        "columns, signs and units the right ones?"
+        f"(VAF {vaf_text(output.vaf)}), as the estimated disturbance lets expect. If none acted, "
+        "are the columns, signs and units the right ones?"
         for output in outputs
         if output.disturbed_below_mean
     ]
@@ -304,14 +307,16 @@ def _of_noise(output: OutputAdequacy, evidence: Evidence) -> bool:
 def _unexplained(output: OutputAdequacy) -> str:
     if output.against_disturbance is not None:
         return (
-            f"The model explains nothing of {output.output}: simulated VAF {output.vaf:.2g}, and "
-            "one step ahead the filter predicts it hardly better than its mean or the sample "
-            "before. Either nothing moves it, or what the log has there is noise or vibration."
+            f"The model explains nothing of {output.output}: simulated VAF "
+            f"{vaf_text(output.vaf, '.2g')}, and one step ahead the filter predicts it hardly "
+            "better than its mean or the sample before. Either nothing moves it, or what "
+            "the log has there is noise or vibration."
         )
     return (
-        f"The model explains nothing of {output.output} (VAF {output.vaf:.2g}), no more than as "
-        "many unknowns explain of noise alone; the other outputs carry the fit. Its residuals are "
-        "white: either the inputs do not move it, or what the log has there is no measurement."
+        f"The model explains nothing of {output.output} (VAF {vaf_text(output.vaf, '.2g')}), no "
+        "more than as many unknowns explain of noise alone; the other outputs carry the fit. Its "
+        "residuals are white: either the inputs do not move it, or what the log has there is no "
+        "measurement."
     )
 
 
@@ -328,7 +333,9 @@ def _of_all_flights(name: str, records: tuple[Record, ...]) -> np.ndarray:
 
 
 def _nothing_shown(outputs: tuple[OutputAdequacy, ...]) -> Adequacy:
-    words = " and ".join(f"{output.output} (VAF {output.vaf:.2g})" for output in outputs)
+    words = " and ".join(
+        f"{output.output} (VAF {vaf_text(output.vaf, '.2g')})" for output in outputs
+    )
     return Adequacy(
         False,
         False,
@@ -400,27 +407,29 @@ def _reason(output: OutputAdequacy, ahead: float | None) -> str:
         return (
             f"{name} predicted up to {ahead:g} s ahead misses the measured one by "
             f"{np.sqrt(ratio or np.nan):.2g} times what the estimated disturbance explains (VAF "
-            f"{vaf:.3g}, autocorrelation of the innovations {output.lag1:+.2f} at one sample)."
+            f"{vaf_text(vaf)}, autocorrelation of the innovations {output.lag1:+.2f} at one "
+            "sample)."
         )
     if not np.isfinite(vaf):
         return f"The simulated {name} is not finite: nothing of it is explained."
     if vaf < 0:
         return (
             f"Driven by the inputs alone, the model follows {name} worse than its mean does (VAF "
-            f"{vaf:.3g}): its parameters mean little. Are the columns, signs and units the right "
-            "ones, and the start values near?"
+            f"{vaf_text(vaf)}): its parameters mean little. Are the columns, signs and units the "
+            "right ones, and the start values near?"
         )
     if ratio is not None and ratio > EXPECTED:
         return (
             f"The simulated {name} misses the measured one by {ratio**0.5:.2g} times what the "
-            f"estimated disturbance explains (VAF {vaf:.3g})."
+            f"estimated disturbance explains (VAF {vaf_text(vaf)})."
         )
     if ratio is not None:
         return (
             f"The innovations of {name} are far from white (autocorrelation {output.lag1:+.2f} "
-            f"at one sample) and its simulation explains little (VAF {vaf:.3g})."
+            f"at one sample) and its simulation explains little (VAF {vaf_text(vaf)})."
         )
     return (
-        f"The model explains {output.explained:.0%} of what in {name} is not white noise, expected "
-        f"at least {EXPLAINED:.0%} (VAF {vaf:.3g}); the acceptance card asks for a VAF of 0.9."
+        f"The model explains {explained_text(output.explained)} of what in {name} is not white "
+        f"noise, expected at least {EXPLAINED:.0%} (VAF {vaf_text(vaf)}); the acceptance card asks "
+        "for a VAF of 0.9."
     )

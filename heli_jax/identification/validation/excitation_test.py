@@ -25,6 +25,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
+from heli_jax.numbers import explained_text
 
 LEVEL = 0.01
 """of the test of all outputs together"""
@@ -62,7 +63,8 @@ def by_excitation(
     bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
     what = "the excitation" if at.data.flights[0].by_instrument is not None else "the inputs"
     numbers = ", ".join(
-        f"{n} (p {f.p_value:.2g}, {100 * f.explained:.0f} % explained)" for n, f in failed.items()
+        f"{n} (p {f.p_value:.2g}, {explained_text(f.explained)} explained)"
+        for n, f in failed.items()
     )
     said = (
         f"The residual still follows {what} in {numbers}: the model, or its estimates, are wrong "

@@ -125,6 +125,7 @@ def cross_correlation(u: np.ndarray, residual: np.ndarray, lags: int) -> np.ndar
     return both / scale if scale > 0 else np.zeros(2 * lags + 1)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a simulation that diverges
 def _centred(signal: np.ndarray) -> np.ndarray:
     # A missing sample at the mean adds nothing to any sum of products.
     centred = np.where(np.isnan(signal), 0.0, signal - np.nanmean(signal))

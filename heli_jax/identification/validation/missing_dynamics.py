@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
+from heli_jax.dynamics.kinematics import FORCES
 from heli_jax.identification.validation.metrics import cross_correlation
 
 _SECONDS = 0.4
@@ -32,8 +33,11 @@ _FEWEST = 10
 """samples for each regressor"""
 _OF_A_MACHINE = (
     "the model lacks dynamics between the two, which its estimates then stand for. Is a servo, a "
-    "rate loop or a filter missing (onboard)?"
+    "rate loop or a filter missing (onboard)? Or is this a poor optimum? Several starts "
+    "(fit.starts) tell."
 )
+_OF_AN_ACCELERATION = " Is the sensor away from the centre of gravity (x_imu, y_imu, z_imu)?"
+"""What turning adds to an accelerometer is an answer to the inputs too."""
 _OF_SENSORS = (
     "bias, scale and delay do not account for it, and their estimates take up a part. Is one of "
     "the two filtered, or an estimator's and not a sensor's?"
@@ -62,13 +66,16 @@ class Explained(NamedTuple):
     """where the response to the input is largest [s]; negative where it comes before the input"""
 
 
-def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> list[str]:
+def missing_dynamics(
+    flights: tuple[Left, ...], *, sensors: bool = False, told: bool = False
+) -> list[str]:
     """Sentences on what inputs still explain of the residuals.
 
     Args:
         flights: those that were fitted.
         sensors: whether inputs and outputs are sensors that are compared with each other, between
             which there are no dynamics; of each output the input that explains most is named.
+        told: whether it is said elsewhere already that dynamics are missing.
     """
     pairs = [(f, output, name) for f in flights for output in f.residuals for name in f.inputs]
     # By output and input over all flights, so that one missing servo is one sentence.
@@ -87,8 +94,13 @@ def missing_dynamics(flights: tuple[Left, ...], *, sensors: bool = False) -> lis
             for output, _ in found
         }
         found = {pair: e for pair, e in found.items() if e.share == most[pair[0]]}
-    remedy = _OF_SENSORS if sensors else _OF_A_MACHINE
-    sentences = [_sentence(output, name, one, remedy) for (output, name), one in found.items()]
+    remedy = "" if told else _OF_SENSORS if sensors else _OF_A_MACHINE
+    sentences = []
+    for (output, name), one in found.items():
+        away = output in FORCES and not sensors
+        sentences.append(_sentence(output, name, one, remedy + away * _OF_AN_ACCELERATION))
+        # The remedy of all of them is the same: the first one says it.
+        remedy = remedy if one.lag < 0 else ""
     gappy = {n: None for f in flights for n, r in f.residuals.items() if not np.isfinite(r).all()}
     if gappy:
         sentences.append(
@@ -109,7 +121,7 @@ def _sentence(output: str, name: str, one: Explained, remedy: str) -> str:
             "of the model) or follows the response (feedback); no servo or filter that is missing "
             "does that."
         )
-    return begun + f"{one.lag:.2g} s after it moved: {remedy}"
+    return begun + f"{one.lag:.2g} s after it moved{f': {remedy.strip()}' if remedy else '.'}"
 
 
 def explained_by(

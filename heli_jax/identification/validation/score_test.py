@@ -10,8 +10,8 @@ The largest gain of the bank is compared with those of the same residual with ph
 each line. That keeps its spectrum, lines and humps of a disturbance too, and destroys nothing but
 what goes together with the drives, so that no shape of the noise has to be assumed.
 
-Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; Theiler et
-al. (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
+Sources: Ljung (1999), 16.6, for residuals against inputs; Rao (1948) for score tests; Theiler and
+others (1992) for surrogates; Gumbel (1958) for the distribution of maxima.
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,8 @@ _SAME = 1e-4
 """part of a column beyond which it says something that those before it do not"""
 _AT_LEAST = 14.0
 """gain below which no p value is asked for: by one filter alone chance makes it in 1 of 1000"""
+_ROUNDING = 1e-9
+"""part of a column below which nothing is left of it"""
 _EULER = 0.5772156649015329
 
 
@@ -46,6 +48,8 @@ class Lines(NamedTuple):
     drives: Complex[np.ndarray, "K d"]
     angles: Float[np.ndarray, " K"]
     """of the lines [rad a sample]"""
+    size: float
+    """of the residual, whitened and before it was scaled to one"""
 
 
 class Strongest(NamedTuple):
@@ -62,6 +66,8 @@ class Strongest(NamedTuple):
     """of the filter [rad a sample]"""
     shift: Float[np.ndarray, " q"]
     """by which the unknowns move where the filter is in the model"""
+    step: Float[np.ndarray, " q"]
+    """of the unknowns to where the whitened residual is least without it"""
 
 
 def lines_of(
@@ -81,15 +87,19 @@ def lines_of(
         return None
     h = whitening(e - e.mean())
     columns = np.concatenate([e[:, None], J, drives], axis=1)
+    scales = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns - columns.mean(axis=0)
     # Differences with the filter's own order left out have no samples from before the record.
     white = np.stack([np.convolve(c, h)[ORDER : e.size] for c in columns.T], axis=1)
-    v = np.fft.rfft(white, axis=0)[1 : 1 + (n - 1) // 2]
+    v = np.fft.rfft(white, axis=0)[1 : 1 + (n - 1) // 2] / np.sqrt(n)
+    # Of a bias rounding alone is left, which no step of it makes up for.
+    v = np.where(np.sqrt(np.mean(np.abs(v) ** 2, axis=0)) > _ROUNDING * scales, v, 0.0)
     # Of one size in all records: their noise differs.
-    v = v / np.sqrt(np.mean(np.abs(v[:, 0]) ** 2))
+    size = float(np.sqrt(np.mean(np.abs(v[:, 0]) ** 2)))
+    v = v / size
     q = J.shape[1]
     angles = 2.0 * np.pi * np.arange(1, len(v) + 1) / n
-    return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles)
+    return Lines(v[:, 0], v[:, 1 : 1 + q], v[:, 1 + q :], angles, size)
 
 
 def strongest(
@@ -110,8 +120,10 @@ def strongest(
         plain: whether the drives are tried without any filter as well.
     """
     most = _LINES // len(records)
-    records = [Lines(*(v[:most] for v in record)) for record in records]
-    e, J, X, angles = (np.concatenate(v) for v in zip(*records, strict=True))
+    records = [
+        Lines(r.e[:most], r.J[:most], r.drives[:most], r.angles[:most], r.size) for r in records
+    ]
+    e, J, X, angles = (np.concatenate([record[i] for record in records]) for i in range(4))
     known = _span(_real(J))
     white = _without(known, _real(e[:, None]))
     freedom = 2 * e.size - known.shape[1]
@@ -128,7 +140,7 @@ def strongest(
     gain = float(gains.reshape(-1)[k] * freedom / np.sum(white**2))
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > _AT_LEAST:
-        return Strongest(gain, 1.0, drive, *one, np.zeros(J.shape[1]))
+        return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])))
     # The same phases for the same residual, whoever asks.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
     anew = _without(known, _real(_complex(white) * np.exp(2j * np.pi * turns)))
@@ -136,7 +148,7 @@ def strongest(
     chance = _by_chance(gain, _gains(asked, _complex(anew)).max(axis=(0, 1)))
     G = asked.filters[k // len(drives), :, None]
     columns = _real(G * np.concatenate([asked.beside, asked.drives[k % len(drives)]], axis=1))
-    return Strongest(gain, chance, drive, *one, _shift(_real(J), columns, _real(e[:, None])))
+    return Strongest(gain, chance, drive, *one, *_steps(_real(J), columns, _real(e[:, None])))
 
 
 class _Asked(NamedTuple):
@@ -245,18 +257,19 @@ def _ends(records: Sequence[Lines], back: np.ndarray) -> list[Complex[np.ndarray
     return columns
 
 
-def _shift(
+def _steps(
     J: Float[np.ndarray, "K2 q"], more: Float[np.ndarray, "K2 c"], e: Float[np.ndarray, "K2 1"]
-) -> Float[np.ndarray, " q"]:
-    """The step of the unknowns beside further columns, less that without."""
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    """The step of the unknowns beside further columns less that without, and that without."""
     columns = np.concatenate([J, more], axis=1)
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
     q = J.shape[1]
-    alone = np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-8)[0]
-    beside = np.linalg.lstsq(columns, e[:, 0], rcond=1e-8)[0][:q]
     # e falls by J times the step.
-    return (alone - beside) / np.where(sizes[:q] > 0, sizes[:q], np.inf)
+    alone = -np.linalg.lstsq(columns[:, :q], e[:, 0], rcond=1e-6)[0]
+    beside = -np.linalg.lstsq(columns, e[:, 0], rcond=1e-6)[0][:q]
+    over = np.where(sizes[:q] > 0, sizes[:q], np.inf)
+    return (beside - alone) / over, alone / over
 
 
 def _real(v: Complex[np.ndarray, "K c"]) -> Float[np.ndarray, "K2 c"]:

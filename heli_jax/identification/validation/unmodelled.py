@@ -16,7 +16,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.identification.estimation.estimator import Evaluation
-from heli_jax.identification.estimation.evaluation import simulated_outputs
+from heli_jax.identification.estimation.evaluation import evaluate, simulated_outputs
 from heli_jax.identification.estimation.measured_signals import signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.unknowns.layout import Solution
@@ -24,7 +24,6 @@ from heli_jax.identification.validation.adequacy import Adequacy
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
-    Lines,
     Strongest,
     lines_of,
     strongest,
@@ -44,6 +43,10 @@ _ROUNDING = 1e-5
 """part of an output's sd below which its residual is no noise"""
 _STEP = 1e-4
 """of an unknown's coordinate, for differences"""
+_ROUNDS = 6
+"""steps at most to where a whitened residual is least"""
+_ENOUGH = 1.0
+"""of twice the log-likelihood, by which a further step says nothing else"""
 
 
 class Unmodelled(NamedTuple):
@@ -118,22 +121,54 @@ def unmodelled(
         sds: of the estimates of interest, as they are reported.
         coloured: whether the residuals in time are autocorrelated.
     """
-    layout, level = at.layout, IN_COLOUR if coloured else LEVEL
+    layout = at.layout
     if is_kinematic(layout.model) or any(count > 1 for count, _ in layout.windows):
         return ()
     flights = _longest(at)
     names = sorted({n for i in flights for n in layout.outputs[i] if _usable(at, e, i, n)})
     if not names:
         return ()
-    J = _sensitivities(at, e)
-    found = []
+    level = (IN_COLOUR if coloured else LEVEL) / (2 * len(names))
+    found, J = [], _sensitivities(at, e)
     for name in names:
-        one = _of_output(at, e, name, [i for i in flights if _usable(at, e, i, name)], J)
-        # Of two answers the better one: each takes up a part of the other.
-        one = max(one, key=lambda f: f[0].statistic, default=None)
-        if one is not None and one[0].p_value < level / (2 * len(names)):
+        asked = _of_output(at, e, name, J)
+        one = None if asked is None else _where_least(at, asked, name, level)
+        if one is not None and one.strong.p_value < level:
             found.append(_said(at, e, name, one, sds))
     return tuple(found)
+
+
+class _Asked(NamedTuple):
+    """The stronger answer of an output, and how large its whitened residual is."""
+
+    strong: Strongest
+    by_amplitude: bool
+    deviance: float
+    """of the whitened residual: twice its negative log-likelihood but for a constant"""
+
+
+def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked:
+    """The answer where the output's whitened residual is least, if it is significant before.
+
+    With coloured residuals a fit ends elsewhere: its unknowns are off by more than sensitivities
+    are straight, and what these cannot take up would pass for something that the model lacks.
+    """
+    part = 1.0
+    for _ in range(_ROUNDS):
+        if not asked.strong.p_value < level:
+            break
+        there = at._replace(z=at.z + part * jnp.asarray(asked.strong.step, at.z.dtype))
+        e = evaluate(*there)
+        again = None
+        if any(_usable(there, e, i, name) for i in _longest(at)):
+            again = _of_output(there, e, name, _sensitivities(there, e))
+        if again is None or not again.deviance < asked.deviance:
+            part *= 0.25
+            continue
+        gained, at, asked, part = asked.deviance - again.deviance, there, again, 1.0
+        if gained < _ENOUGH:
+            break
+    return asked
 
 
 def with_unmodelled(adequacy: Adequacy, found: tuple[Unmodelled, ...]) -> Adequacy:
@@ -214,26 +249,26 @@ def _blocks(at: Solution) -> list[np.ndarray]:
 
 
 def _of_output(
-    at: Solution,
-    e: Evaluation,
-    name: str,
-    flights: list[int],
-    J: Mapping[tuple[int, str], np.ndarray],
-) -> list[tuple[Strongest, bool]]:
-    """The strongest linear answer and the strongest that depends on amplitude, as there are."""
+    at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
+) -> _Asked | None:
+    """The strongest answer of an output, linear or not; None where nothing can be asked."""
     moving = _moving(at)
-    lines: list[Lines] = []
-    for i in flights:
-        one = lines_of(np.asarray(e.raw[i][name]), J[i, name], _drives(at, e, i, name, moving))
-        lines += [] if one is None else [one]
+    flights = [i for i in _longest(at) if _usable(at, e, i, name)]
+    each = [
+        lines_of(np.asarray(e.raw[i][name]), J[i, name], _drives(at, e, i, name, moving))
+        for i in flights
+    ]
+    lines = [one for one in each if one is not None]
     if not lines or not moving:
-        return []
-    m = len(moving)
+        return None
+    m, columns = len(moving), lines[0].drives.shape[1]
     linear = strongest(lines, range(m), NARROW)
-    curved = strongest(
-        lines, range(m, lines[0].drives.shape[1]), BROAD, beside=range(m), plain=True
-    )
-    return [(linear, False), (curved, True)]
+    curved = strongest(lines, range(m, columns), BROAD, beside=range(m), plain=True)
+    # Two numbers a line, each of the variance size**2.
+    deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
+    # Of two answers the better one: each takes up a part of the other.
+    by_amplitude = curved.statistic > linear.statistic
+    return _Asked(curved if by_amplitude else linear, by_amplitude, float(deviance))
 
 
 def _moving(at: Solution) -> list[str]:
@@ -262,10 +297,10 @@ def _said(
     at: Solution,
     e: Evaluation,
     name: str,
-    one: tuple[Strongest, bool],
+    one: _Asked,
     sds: Mapping[str, float | None],
 ) -> Unmodelled:
-    strong, by_amplitude = one
+    strong, by_amplitude, _ = one
     moving, moved = _moving(at), {}
     for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
         sd = sds.get(parameter)

@@ -9,7 +9,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import metrics
-from heli_jax.numbers import percent
+from heli_jax.numbers import vaf_percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.style import label, legend_above, line, samples, subtitle
@@ -63,7 +63,7 @@ def _agreement(signals: Signals, output: str) -> str:
     agreement = metrics(signals.measured[output], signals.simulated[output])
     source = "held out, simulated" if signals.hold_out else "simulated"
     # NaN where the measured output never moves: it has no variance to account for.
-    vaf = f", VAF {percent(agreement.vaf)}" if np.isfinite(agreement.vaf) else ""
+    vaf = f", VAF {vaf_percent(agreement.vaf)}" if np.isfinite(agreement.vaf) else ""
     return f"{output}, {signals.flight}: {source}{vaf}"
 
 

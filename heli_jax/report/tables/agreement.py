@@ -10,7 +10,7 @@ from heli_jax.identification.model_selection import Choice
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.metrics import Metrics, Whiteness, diverges
-from heli_jax.numbers import NOTHING, number, percent
+from heli_jax.numbers import NOTHING, number, percent, vaf_percent
 from heli_jax.report.card import Gate, shown
 from heli_jax.report.tables.table import Table
 from heli_jax.report.unit_symbols import pretty
@@ -61,8 +61,8 @@ def _metrics(fit: Fit, baseline: Baseline | None, output: str) -> Iterator[tuple
 
 
 def _cells(m: Metrics) -> tuple[str, ...]:
-    fit_percent = percent(m.nrmse_fit_percent / 100)
-    return (percent(m.vaf), fit_percent, number(m.rmse), number(m.tic, 3))
+    fit_percent = vaf_percent(m.nrmse_fit_percent / 100)
+    return (vaf_percent(m.vaf), fit_percent, number(m.rmse), number(m.tic, 3))
 
 
 def responses(fit: Fit) -> Table | None:

@@ -36,17 +36,20 @@ def _adequate(fit: Fit) -> str:
         what = "simulation" if ahead is None else f"predictions up to {ahead:g} s ahead"
         return (
             f"yes where the innovations of all outputs are white and the error of the {what} "
-            f"has at most {EXPECTED:g} times the power that the estimated disturbance makes; in "
-            "size only where innovations are not white but have an autocorrelation below "
-            f"{FAR_FROM_WHITE:g} at one sample, or the simulation explains "
-            f"{percent(EXPLAINED, 0)} of what is not white noise; one step ahead only where that "
-            "holds, but the simulation by the inputs alone is worse than the mean; no otherwise."
+            f"has at most {EXPECTED:g} times the power that the estimated disturbance makes, and "
+            "nothing is found that the model lacks; in size only where innovations are not white "
+            f"but have an autocorrelation below {FAR_FROM_WHITE:g} at one sample, or the "
+            f"simulation explains {percent(EXPLAINED, 0)} of what is not white noise; one step "
+            "ahead only where that holds, but the simulation by the inputs alone is worse than the "
+            "mean; no otherwise."
         )
     return (
-        "yes where the residuals of all outputs are white (Ljung-Box at 1 %); in size only where "
-        f"they are not, but the simulation explains at least {percent(EXPLAINED, 0)} of what is "
-        f"not white noise, or at most {percent(NEARLY_WHITE, 0)} of the residual's variance is "
-        f"other than that (a VAF below {GATE:g} is then stated with it); no otherwise."
+        "yes where the residuals of all outputs are white (Ljung-Box at 1 %) and nothing is found "
+        "that the model lacks, a mode or a dependence on amplitude (1 %); in size only where "
+        "something is, or they are not white, but the simulation explains at least "
+        f"{percent(EXPLAINED, 0)} of what is not white noise, or at most "
+        f"{percent(NEARLY_WHITE, 0)} of the residual's variance is other than that (a VAF below "
+        f"{GATE:g} is then stated with it); no otherwise."
     )
 
 
