@@ -1,18 +1,18 @@
 """What a drawn figure shows, as plain data: its lines, error bars, bands and limits, panel by
 panel. The page draws it anew, so that it can be zoomed, and words about it come from it."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_hex
-from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon, Rectangle
 
-_PIXELS = 88.0
+# Imported where a figure of Matplotlib is read: the charts of most pages come from sketches.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.container import ErrorbarContainer
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+PIXELS = 88.0
 """of the page in an inch of a figure"""
 
 
@@ -63,9 +63,11 @@ class Chart(NamedTuple):
     panels: tuple[Panel, ...]
     of: str = ""
     """what its x belongs to, as a flight: charts of the same share cursor and zoom"""
+    whole: bool = False
+    """whether x counts things: its numbers are whole"""
 
 
-def chart_of(figure: Figure) -> Chart:
+def chart_of(figure: "Figure") -> Chart:
     """A figure of panels below each other as plain data.
 
     Args:
@@ -88,14 +90,14 @@ def chart_of(figure: Figure) -> Chart:
     )
 
 
-def _panel(ax: Axes, height: float) -> Panel:
+def _panel(ax: "Axes", height: float) -> Panel:
     low, high = ax.get_ylim()
     flat, upright, lines = _straight(ax)
     first, last = ax.get_xlim()
     return Panel(
         label=ax.get_ylabel(),
         limits=(float(low), float(high)),
-        height=round(float(ax.get_position().height) * height * _PIXELS),
+        height=round(float(ax.get_position().height) * height * PIXELS),
         series=(*_bands(ax), *_lines(ax, lines)),
         levels=flat,
         marks=upright,
@@ -104,7 +106,7 @@ def _panel(ax: Axes, height: float) -> Panel:
     )
 
 
-def _straight(ax: Axes) -> tuple[tuple[float, ...], tuple[float, ...], list[Line2D]]:
+def _straight(ax: "Axes") -> tuple[tuple[float, ...], tuple[float, ...], list["Line2D"]]:
     """Heights of the lines across the axes, places of those from top to bottom, and all others."""
     flat, upright, lines = [], [], []
     for line in ax.get_lines():
@@ -119,12 +121,17 @@ def _straight(ax: Axes) -> tuple[tuple[float, ...], tuple[float, ...], list[Line
     return tuple(flat), tuple(upright), lines
 
 
-def _lines(ax: Axes, lines: list[Line2D]) -> list[Series]:
+def _lines(ax: "Axes", lines: list["Line2D"]) -> list[Series]:
+    from matplotlib.container import ErrorbarContainer
+
     bars = {c.lines[0]: c for c in ax.containers if isinstance(c, ErrorbarContainer)}
     return [_line(line, bars.get(line), ax) for line in lines if np.size(line.get_xdata())]
 
 
-def _line(line: Line2D, bars: ErrorbarContainer | None, ax: Axes) -> Series:
+def _line(line: "Line2D", bars: "ErrorbarContainer | None", ax: "Axes") -> Series:
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_hex
+
     x, y = np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)
     kind = "step" if line.get_drawstyle() == "steps-post" else "line"
     # The container of error bars has their label, not the line in it.
@@ -149,12 +156,15 @@ def _line(line: Line2D, bars: ErrorbarContainer | None, ax: Axes) -> Series:
     )
 
 
-def _name(label: str, ax: Axes) -> str:
+def _name(label: str, ax: "Axes") -> str:
     """A line's label; that of the axis without its unit where it has none."""
     return label if label and not label.startswith("_") else ax.get_ylabel().partition(" [")[0]
 
 
-def _bands(ax: Axes) -> list[Series]:
+def _bands(ax: "Axes") -> list[Series]:
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_hex
+
     bands = []
     for collection in ax.collections:
         if not isinstance(collection, PolyCollection):
@@ -170,7 +180,9 @@ def _bands(ax: Axes) -> list[Series]:
     return bands
 
 
-def _shades(ax: Axes) -> tuple[tuple[float, float], ...]:
+def _shades(ax: "Axes") -> tuple[tuple[float, float], ...]:
+    from matplotlib.patches import Polygon, Rectangle
+
     shades = []
     for patch in ax.patches:
         by_x, by_y = patch.get_transform().contains_branch_seperately(ax.transData)

@@ -52,7 +52,7 @@ def bode_overlay(
         above.plot(response.omega, _decibels(response), label=label, **look)
         below.plot(response.omega, phase(response.H), label=label, **look)
     above.set_xscale("log")
-    style.plain_log_ticks(above.xaxis)
+    style.plain_log_ticks(above)
     above.set_title(f"{input} to {output}, {flight}", loc="left")
     above.set_ylabel("magnitude [dB]")
     below.set_ylabel("phase [deg]")

@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from heli_jax import naming, units
 from heli_jax.flights.flight import Signal
@@ -15,10 +15,16 @@ from heli_jax.identification.fit import Fit
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.report import figures
+from heli_jax.report.charts import Chart
 from heli_jax.report.embedded import Logged
 from heli_jax.report.files import SupplementaryAnalyses
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.matrix_svg import correlation_svg
+from heli_jax.report.pictures import Draw, sketched
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_FLIGHTS = 6
 """flights that get figures of their own; signals.csv has them all"""
@@ -33,9 +39,6 @@ class Analysis(NamedTuple):
     supplementary: SupplementaryAnalyses = SupplementaryAnalyses()
 
 
-type Draw = Callable[[], Figure | None]
-
-
 def drawings(analysis: Analysis) -> dict[str, Draw]:
     """Every figure of the report by its file name, not yet drawn."""
     fit, problem, baseline, supplementary = analysis
@@ -47,10 +50,10 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     for i in _drawn([s.hold_out for s in fit.signals]):
         s, part = fit.signals[i], parts[i]
         for output in s.measured:
-            drawings[f"response{part}_{output}"] = _drawing(figures.response, s, output, model)
+            drawings[f"response{part}_{output}"] = _panels(figures.response, s, output, model)
             # The fit did nothing to make the residuals of a flight held out white.
             if not s.hold_out:
-                drawings[f"residual{part}_{output}"] = _drawing(
+                drawings[f"residual{part}_{output}"] = _panels(
                     figures.residual_correlation,
                     s,
                     output,
@@ -62,10 +65,14 @@ def drawings(analysis: Analysis) -> dict[str, Draw]:
     for pair in supplementary.responses.pairs if supplementary.responses else ():
         drawings[f"match_{pair.output}-{pair.input}"] = _match(pair, analysis)
     if len(fit.verdict.names) > 1:
-        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)
-    drawings["starts"] = _drawing(figures.waterfall, fit.starts)
+        drawings["correlation"] = _drawing(figures.correlation_matrix, fit.verdict)._replace(
+            svg=partial(correlation_svg, fit.verdict)
+        )
+    drawings["starts"] = _drawing(figures.waterfall, fit.starts)._replace(
+        chart=partial(figures.waterfall_chart, fit.starts)
+    )
     if baseline is not None:
-        drawings["rls"] = _drawing(
+        drawings["rls"] = _panels(
             figures.rls_history, baseline, log_start=_log_start(fit, baseline.flight)
         )
     return drawings
@@ -162,11 +169,20 @@ def _parts(flights: list[str]) -> list[str]:
 
 def _drawing(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
     # Drawn when it is asked for: `FitRun.figure` wants one of them and draws no other.
-    def draw() -> Figure | None:
+    def draw() -> "Figure | None":
         axes = function(*args, **options)
         return axes[0].figure if axes else None  # type: ignore[return-value]
 
-    return draw
+    return Draw(draw)
+
+
+def _panels(function: Callable[..., figures.Panels], *args: Any, **options: Any) -> Draw:
+    """What can be drawn on a sketch too."""
+
+    def chart() -> Chart | None:
+        return sketched(lambda sketch: function(*args, **options, figure=sketch))
+
+    return _drawing(function, *args, **options)._replace(chart=chart)
 
 
 def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
@@ -178,7 +194,7 @@ def _bode(fit: Fit, problem: Problem, baseline: Baseline | None) -> Draw:
     known = problem.training[i].known if i < len(problem.training) else {}
     params = naming.replace(fit.params, **{n: jnp.asarray(v) for n, v in known.items()})
     flight = FittedFlight(problem.model, params, fit, fit.signals[i])
-    return _drawing(figures.bode, flight, baseline)
+    return _panels(figures.bode, flight, baseline)
 
 
 def _match(pair: FittedPair, analysis: Analysis) -> Draw:
@@ -187,4 +203,4 @@ def _match(pair: FittedPair, analysis: Analysis) -> Draw:
     about = f"model linearised about {responses.about}" if responses.about else "continuous model"
     note = f"{about}; data without the hold of the input, flights together"
     unit = figures.bode_unit(analysis.problem.model, pair.output, pair.input)
-    return _drawing(figures.match, pair, unit, note)
+    return _panels(figures.match, pair, unit, note)

@@ -23,7 +23,7 @@ _POINTS = 1000
 """of a line: more than pixels between the axes"""
 _LETTER = 0.56
 """width of a letter, in parts of its size: of common fonts without serifs on average"""
-_INK, _QUIET, _GRID = "#333333", "#6B6B6B", "#E4E4E4"
+_INK, QUIET, _GRID = "#333333", "#6B6B6B", "#E4E4E4"
 _BELOW = 46
 """pixels below the last panel: numbers and label of its x axis"""
 
@@ -74,17 +74,21 @@ def chart_svg(chart: Chart) -> Drawing:
         x_limits = panel.x_limits or chart.x_limits
         logarithmic = chart.logarithmic
         x = _Scale(*x_limits, _LEFT, WIDTH - _RIGHT, logarithmic)
-        parts += _panel(panel, x, top, f"p{i}", numbered=last or apart)
+        parts += _panel(panel, x, top, f"p{i}", numbered=last or apart, whole=chart.whole)
         y = top + panel.height + (20 if apart and not last else 6)
     if chart.x_label:
         parts.append(_text(_middle(), y + 32, chart.x_label, 12))
     height = round(y + _BELOW)
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{height}" '
-        f'viewBox="0 0 {WIDTH} {height}" font-family="DejaVu Sans, Verdana, Arial, sans-serif" '
+    return Drawing(opened(WIDTH, height) + "".join(parts) + "</svg>\n", (WIDTH, height))
+
+
+def opened(width: int, height: int) -> str:
+    """The begin of an SVG of so many pixels, with letters and a white ground."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="DejaVu Sans, Verdana, Arial, sans-serif" '
         f'font-size="11" fill="{_INK}"><rect width="100%" height="100%" fill="white"/>'
     )
-    return Drawing(head + "".join(parts) + "</svg>\n", (WIDTH, height))
 
 
 def _head(chart: Chart) -> tuple[list[str], float]:
@@ -95,7 +99,7 @@ def _head(chart: Chart) -> tuple[list[str], float]:
         parts.append(_text(_LEFT, y, chart.title, 13, "start", ' font-weight="bold"'))
     for line in _wrapped(chart.note, 11.0):
         y += 15
-        parts.append(_text(_LEFT, y, line, 11, "start", f' fill="{_QUIET}"'))
+        parts.append(_text(_LEFT, y, line, 11, "start", f' fill="{QUIET}"'))
     return parts, y + 4
 
 
@@ -103,7 +107,8 @@ def _middle() -> float:
     return 0.5 * (_LEFT + WIDTH - _RIGHT)
 
 
-def _width(words: str, size: float) -> float:
+def width_of(words: str, size: float) -> float:
+    """Of words in letters of that size [pixel], about."""
     return _LETTER * size * len(words)
 
 
@@ -111,7 +116,7 @@ def _wrapped(words: str, size: float) -> list[str]:
     """Lines that fit beside the axes."""
     lines: list[str] = []
     for word in words.split():
-        if lines and _width(f"{lines[-1]} {word}", size) <= WIDTH - _LEFT - _RIGHT:
+        if lines and width_of(f"{lines[-1]} {word}", size) <= WIDTH - _LEFT - _RIGHT:
             lines[-1] += f" {word}"
         else:
             lines.append(word)
@@ -123,7 +128,7 @@ def _text(
 ) -> str:
     # A title may have a log's name in it, of any length: letters closer together, and none cut.
     room = 2 * min(x, WIDTH - x) if anchor == "middle" else WIDTH - x - _RIGHT
-    if "transform" not in more and _width(words, size) > room:
+    if "transform" not in more and width_of(words, size) > room:
         more += f' textLength="{room:.0f}" lengthAdjust="spacingAndGlyphs"'
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}"{more}>'
@@ -136,7 +141,7 @@ def _legend(panel: Panel, names: set[str], y: float) -> tuple[list[str], int]:
     named = [s for s in panel.series if s.label in names]
     parts, x, row = [], float(_LEFT), 0
     for s in named:
-        wide = 30.0 + _width(s.label, 11.0)
+        wide = 30.0 + width_of(s.label, 11.0)
         if x + wide > WIDTH - _RIGHT and x > _LEFT:
             x, row = float(_LEFT), row + 1
         at = y + 16 * row
@@ -168,7 +173,9 @@ def _radius(s: Series) -> float:
     return 0.67 * max(s.width, 1.5)
 
 
-def _panel(panel: Panel, x: _Scale, top: float, name: str, *, numbered: bool) -> list[str]:
+def _panel(
+    panel: Panel, x: _Scale, top: float, name: str, *, numbered: bool, whole: bool
+) -> list[str]:
     """One pair of axes with all that is drawn in it."""
     bottom = top + panel.height
     y = _Scale(*panel.limits, bottom, top)
@@ -177,7 +184,7 @@ def _panel(panel: Panel, x: _Scale, top: float, name: str, *, numbered: bool) ->
         f'<clipPath id="{name}"><rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
         f'height="{panel.height:.1f}"/></clipPath>'
     ]
-    parts += _grid(panel, x, y, numbered=numbered)
+    parts += _grid(panel, x, y, numbered=numbered, whole=whole)
     parts.append(f'<g clip-path="url(#{name})" stroke-linejoin="round">')
     for a, b in panel.shades:
         x0, x1 = float(x(a)), float(x(b))
@@ -190,7 +197,7 @@ def _panel(panel: Panel, x: _Scale, top: float, name: str, *, numbered: bool) ->
     lines += [f"M{float(x(v)):.1f} {top:.1f}V{bottom:.1f}" for v in panel.marks]
     if lines:
         parts.append(
-            f'<path d="{"".join(lines)}" stroke="{_QUIET}" stroke-width="0.8" '
+            f'<path d="{"".join(lines)}" stroke="{QUIET}" stroke-width="0.8" '
             'stroke-dasharray="4 3"/>'
         )
     parts.append("</g>")
@@ -200,8 +207,10 @@ def _panel(panel: Panel, x: _Scale, top: float, name: str, *, numbered: bool) ->
     return [*parts, frame, _label(panel, top)]
 
 
-def _grid(panel: Panel, x: _Scale, y: _Scale, *, numbered: bool) -> list[str]:
+def _grid(panel: Panel, x: _Scale, y: _Scale, *, numbered: bool, whole: bool) -> list[str]:
     across = (decades if x.logarithmic else ticks)(x.low, x.high, 9)
+    if whole:
+        across = [v for v in across if v == round(v)]
     up = ticks(y.low, y.high, max(3, round(panel.height / 30)))
     lines = [f"M{float(x(v)):.1f} {y.begin:.1f}V{y.end:.1f}" for v in across]
     lines += [f"M{x.begin:.1f} {float(y(v)):.1f}H{x.end:.1f}" for v in up]
@@ -218,10 +227,10 @@ def _grid(panel: Panel, x: _Scale, y: _Scale, *, numbered: bool) -> list[str]:
 def _label(panel: Panel, top: float) -> str:
     """The y axis's, turned; in two lines where its panel is too low for one."""
     lines, size = [panel.label], 12.0
-    if _width(panel.label, size) > panel.height + 8 and " [" in panel.label:
+    if width_of(panel.label, size) > panel.height + 8 and " [" in panel.label:
         name, _, unit = panel.label.partition(" [")
         lines = [name, f"[{unit}"]
-    longest = max(_width(line, size) for line in lines)
+    longest = max(width_of(line, size) for line in lines)
     size = max(8.0, min(size, size * (panel.height + 8) / max(longest, 1.0)))
     middle, parts = top + 0.5 * panel.height, []
     for k, line in enumerate(lines):

@@ -72,7 +72,7 @@ def test_page_holds_everything_itself(sound_page):
     anchors = {v[1:] for v in links.addresses if v.startswith("#")}
     assert anchors <= set(re.findall(r'id="([^"]+)"', text))
     for name in names:
-        assert (folder / "figures" / f"{name}.svg").stat().st_size > 2000
+        assert (folder / "figures" / f"{name}.svg").stat().st_size > 1000
     assert len(text) < 500_000
 
 

@@ -1,20 +1,28 @@
 """Figures of the estimates: their correlation, their intervals, and what each start reached."""
 
+from typing import TYPE_CHECKING, NamedTuple
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.result import Fit, StartRow
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.profile_likelihood import Profile
 from heli_jax.report import style
+from heli_jax.report.charts import Chart, Panel, Series
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.style import legend_above, subtitle
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-def correlation_matrix(verdict: Verdict, *, figure: Figure | None = None) -> Panels:
+
+MATRIX_TITLE = "Correlation of the estimates"
+LEFT_OUT = "directions that are not identifiable are left out"
+
+
+def correlation_matrix(verdict: Verdict, *, figure: "Figure | None" = None) -> Panels:
     """How the estimates of the parameters are correlated: near +1 or -1 the data cannot tell two
     of them apart."""
     names, r = verdict.names, verdict.correlation
@@ -30,13 +38,13 @@ def correlation_matrix(verdict: Verdict, *, figure: Figure | None = None) -> Pan
     ax.set_aspect("equal")
     _name_cells(ax, names)
     _write_correlations(ax, r)
-    ax.set_title("Correlation of the estimates", loc="left")
+    ax.set_title(MATRIX_TITLE, loc="left")
     if verdict.undetermined:
-        subtitle(ax, "directions that are not identifiable are left out")
+        subtitle(ax, LEFT_OUT)
     return (ax,)
 
 
-def _name_cells(ax: Axes, names: tuple[str, ...]) -> None:
+def _name_cells(ax: "Axes", names: tuple[str, ...]) -> None:
     # The first parameter on top, as a matrix is read; pcolormesh counts from below.
     ax.invert_yaxis()
     centres = np.arange(len(names)) + 0.5
@@ -47,39 +55,33 @@ def _name_cells(ax: Axes, names: tuple[str, ...]) -> None:
     ax.spines[:].set_visible(False)
 
 
-def _write_correlations(ax: Axes, r: np.ndarray) -> None:
+def _write_correlations(ax: "Axes", r: np.ndarray) -> None:
     size = 8.5 if len(r) < 9 else 6.0
     for (i, j), value in np.ndenumerate(r):
         color = "white" if abs(value) > 0.6 else "black"  # to be read on a dark cell
-        text = _correlation(float(value), i == j)
+        text = cell_text(float(value), i == j)
         ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", size=size, color=color)
 
 
-def _correlation(r: float, diagonal: bool) -> str:
-    """Two digits, five where the last ones count."""
+def cell_text(r: float, diagonal: bool) -> str:
+    """A correlation in two digits, five where the last ones count; 1 on the diagonal."""
     if diagonal:
         return "1"
+    if not np.isfinite(r):
+        return ""
     # 0.996 and 0.99996 differ by a factor of ten in what an interval gains from the other
     # parameter, sqrt(1 - r^2); at two digits both are 1.00.
     text = f"{r:+.5f}" if abs(r) > 0.995 else f"{r:+.2f}"
     return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
 
 
-def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> Panels:
+def waterfall(starts: tuple[StartRow, ...], *, figure: "Figure | None" = None) -> Panels:
     """The cost that each start reached, best first; () where there is one start or none."""
     if len(starts) < 2:
         return ()
-    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
-    cost = np.array([s.cost for s in rows])
-    finite = np.isfinite(cost)
-    ok = np.array([s.converged for s in rows])
     [ax] = panels(figure, 2.8, [1.0])
-    low, top = _cost_range(cost[finite])
-    logarithmic = low > 0 and top > 30 * low
-    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
-    # differences where there are none.
-    span = max(top - low, 0.02 * abs(top), 1e-300)
-    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
+    rows, shown, finite, low, top, span, logarithmic = _ranked(starts)
+    ok = np.array([s.converged for s in rows])
     x = np.arange(1, len(rows) + 1)
     ax.plot(x[finite], shown[finite], color=style.PALE, lw=0.8, zorder=1)
     ax.plot(x[ok], shown[ok], "o", ms=6, color=style.BLUE, label="converged")
@@ -88,21 +90,96 @@ def waterfall(starts: tuple[StartRow, ...], *, figure: Figure | None = None) -> 
     _number_optima(ax, rows, x, shown)
     _scale_cost(ax, 0.5 * (top + low), span, logarithmic=logarithmic)
     ax.set_xlim(0.4, len(rows) + 0.6)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=16))
+    style.few_ticks(ax, "x", 16, integer=True)
     ax.set_xlabel("start, sorted by cost")
     ax.set_ylabel("cost")
     ax.set_title(_starts_title(rows), loc="left")
     if not finite.all():
-        subtitle(ax, "starts that ended without a finite cost are drawn on top")
+        subtitle(ax, _ON_TOP)
     legend_above(ax, raised=not finite.all())
     return (ax,)
 
 
-def _scale_cost(ax: Axes, middle: float, span: float, *, logarithmic: bool) -> None:
+_ON_TOP = "starts that ended without a finite cost are drawn on top"
+
+
+class _Ranked(NamedTuple):
+    """Starts by their cost, the best first, and the range of what they cost."""
+
+    rows: list[StartRow]
+    shown: np.ndarray
+    """heights at which they are drawn"""
+    finite: np.ndarray
+    """whether their cost is a number"""
+    low: float
+    top: float
+    span: float
+    """of an axis that is not logarithmic"""
+    logarithmic: bool
+
+
+def _ranked(starts: tuple[StartRow, ...]) -> _Ranked:
+    rows = sorted(starts, key=lambda s: s.cost if np.isfinite(s.cost) else np.inf)
+    cost = np.array([s.cost for s in rows])
+    finite = np.isfinite(cost)
+    low, top = _cost_range(cost[finite])
+    logarithmic = low > 0 and top > 30 * low
+    # Where all starts agree to rounding, 2 % of the cost: an axis over rounding errors would show
+    # differences where there are none.
+    span = max(top - low, 0.02 * abs(top), 1e-300)
+    shown = np.where(finite, cost, 3.0 * top if logarithmic else top + 0.4 * span)
+    return _Ranked(rows, shown, finite, low, top, span, logarithmic)
+
+
+def waterfall_chart(starts: tuple[StartRow, ...]) -> Chart | None:
+    """`waterfall` as plain data: each optimum has a colour and a name; None where it draws none.
+
+    Args:
+        starts: where each of them led.
+    """
+    if len(starts) < 2:
+        return None
+    ranked = _ranked(starts)
+    x, y = np.arange(1.0, len(starts) + 1.0), ranked.shown
+    label, middle = "cost", 0.5 * (ranked.top + ranked.low)
+    limits = (middle - 0.9 * ranked.span, middle + 0.9 * ranked.span)
+    if ranked.logarithmic:
+        y, label = np.log10(y), "log10 of the cost"
+        room = 0.25 * float(np.ptp(y))
+        limits = (float(y.min()) - room, float(y.max()) + room)
+    finite = ranked.finite
+    series = [Series("", "line", style.PALE, 0.8, False, x[finite], y[finite])]
+    optimum = np.array([row.optimum for row in ranked.rows])
+    ok = np.array([row.converged for row in ranked.rows])
+    colours = [c for c in style.CYCLE if c != style.VERMILLION]
+    # 0 is no optimum: what failed there has a name of its own.
+    for k, number in enumerate(dict.fromkeys(optimum[ok & (optimum > 0)].tolist())):
+        at, colour = ok & (optimum == number), colours[k % len(colours)]
+        name = f"optimum {number}" if k < _NAMED else "further optima"
+        series.append(Series(name, "points", colour, 6.0, False, x[at], y[at]))
+    rest = ~ok | (optimum == 0)
+    if rest.any():
+        series.append(Series("failed", "points", style.VERMILLION, 6.0, False, x[rest], y[rest]))
+    return Chart(
+        _starts_title(ranked.rows),
+        "" if finite.all() else _ON_TOP,
+        "start, sorted by cost",
+        False,
+        (0.4, len(starts) + 0.6),
+        (Panel(label, limits, 160.0, tuple(series)),),
+        whole=True,
+    )
+
+
+_NAMED = 6
+"""optima that have a name of their own"""
+
+
+def _scale_cost(ax: "Axes", middle: float, span: float, *, logarithmic: bool) -> None:
     if logarithmic:
         ax.set_yscale("log")
         ax.margins(y=0.25)
-        style.plain_log_ticks(ax.yaxis)
+        style.plain_log_ticks(ax, "y")
     else:
         # More room above, where the optima's names stand.
         ax.set_ylim(middle - 0.9 * span, middle + 1.1 * span)
@@ -114,7 +191,7 @@ def _cost_range(cost: np.ndarray) -> tuple[float, float]:
     return (float(cost.min()), float(cost.max())) if cost.size else (1.0, 1.0)
 
 
-def _number_optima(ax: Axes, rows: list[StartRow], x: np.ndarray, shown: np.ndarray) -> None:
+def _number_optima(ax: "Axes", rows: list[StartRow], x: np.ndarray, shown: np.ndarray) -> None:
     """Name each optimum once, at the first start that reached it."""
     named: set[int] = set()
     for i, row in enumerate(rows):
@@ -146,7 +223,7 @@ _METHODS = {
 }
 
 
-def intervals(comparison: Intervals, fit: Fit, *, figure: Figure | None = None) -> Panels:
+def intervals(comparison: Intervals, fit: Fit, *, figure: "Figure | None" = None) -> Panels:
     """95 % intervals by every method, and the likelihood of the profile; one panel a parameter.
 
     Args:
@@ -174,13 +251,13 @@ def intervals(comparison: Intervals, fit: Fit, *, figure: Figure | None = None) 
         ax.set_yticks([-k for k in range(len(present))], [_METHODS[m][0] for m in present])
         ax.tick_params(axis="y", labelleft=name == names[0])
         ax.set_ylim(-len(present) + 0.4, 0.6)
-        ax.xaxis.set_major_locator(MaxNLocator(nbins=3))
+        style.few_ticks(ax, "x", 3)
         ax.set_xlabel(style.label(name, estimate.unit))
     axes[0].set_title("95 % intervals", loc="left")
     return tuple(axes)
 
 
-def _draw_likelihood(ax: Axes, profile: Profile, rows: int) -> None:
+def _draw_likelihood(ax: "Axes", profile: Profile, rows: int) -> None:
     # A deviance of 9 is three standard deviations: further out lies what sets no interval.
     near = profile.deviance < 9.0
     # The likelihood, exp(-deviance/2), from 1 above the first row down to 0 at the last.

@@ -1,11 +1,8 @@
 """The Bode figure: fit, recursive least squares and the record's own response."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from heli_jax import naming
 from heli_jax.analysis.operating_point import OperatingPoint
@@ -16,7 +13,12 @@ from heli_jax.report import frequency, style
 from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import Panels, panels, sample_time
 from heli_jax.report.frequency import FittedFlight
+from heli_jax.report.sketch import Sketch, SketchAxes
 from heli_jax.report.style import legend_above, line, subtitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _CONTINUOUS = "fit, continuous"
 _RLS = "RLS"
@@ -30,7 +32,7 @@ def bode(
     *,
     output: str | None = None,
     input: str | None = None,
-    figure: Figure | None = None,
+    figure: "Figure | Sketch | None" = None,
 ) -> Panels:
     """Magnitude and phase of the fit, of the RLS and of the record, and the record's coherence.
 
@@ -71,7 +73,7 @@ def bode(
     return axes
 
 
-def _bode_panels(figure: Figure | None, *, with_coherence: bool) -> Panels:
+def _bode_panels(figure: "Figure | Sketch | None", *, with_coherence: bool) -> Panels:
     """With one row more above them than other figures have: title, subtitle and a legend of four
     entries are too long to stand beside each other."""
     height, ratios = (6.0, [1.4, 1.2, 0.6]) if with_coherence else (4.6, [1.2, 1.0])
@@ -181,27 +183,27 @@ def _finish_bode(
         ax.axvline(nyquist, color=style.GREY, lw=0.9, ls="-.", label=_NYQUIST)
     axes[0].set_xscale("log")
     axes[0].set_xlim(*limits)
-    style.plain_log_ticks(axes[0].xaxis)
+    style.plain_log_ticks(axes[0])
     axes[0].set_ylim(*_within(axes[0], 40.0))
     axes[1].set_ylim(*_within(axes[1], 180.0))
-    axes[0].annotate(
-        "Nyquist ",
-        (nyquist, 0.03),
-        xycoords=("data", "axes fraction"),
-        ha="right",
-        fontsize=8,
-        color=style.GREY,
-    )
+    if not isinstance(axes[0], SketchAxes):
+        axes[0].annotate(
+            "Nyquist ",
+            (nyquist, 0.03),
+            xycoords=("data", "axes fraction"),
+            ha="right",
+            fontsize=8,
+            color=style.GREY,
+        )
     axes[0].set_ylabel(f"magnitude [{unit}]")
     axes[1].set_ylabel("phase [deg]")
-    # Steps of 15, 30, 45 and 90 degrees: a phase is read in parts of a right angle.
-    axes[1].yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 1.5, 3, 4.5, 9, 10]))
+    style.phase_ticks(axes[1])
     axes[-1].set_xlabel("frequency [rad/s]")
     legend_above(axes[0])
     subtitle(axes[0], note, raised=True)
 
 
-def _within(ax: Axes, beyond: float) -> tuple[float, float]:
+def _within(ax: "Axes", beyond: float) -> tuple[float, float]:
     """Limits that hold what can be seen of fit and record, and the rest no more than `beyond`
     further: the RLS, and the continuous fit past the Nyquist frequency."""
     # Poles and zeros of the RLS near the unit circle would else press the fit flat. The Nyquist

@@ -1,9 +1,8 @@
 """Bode figure of a fitted model over the flights' response, and of the error between both."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from heli_jax.analysis.mismatch import unnoticeable
 from heli_jax.report import style
@@ -11,7 +10,12 @@ from heli_jax.report.coherence import COHERENT
 from heli_jax.report.figures.panels import Panels, panels
 from heli_jax.report.fitted_responses import FittedPair
 from heli_jax.report.frequency import phase
+from heli_jax.report.sketch import Sketch
 from heli_jax.report.style import legend_above, subtitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _DB = 20.0 / np.log(10.0)
 _Z95 = 1.959963984540054
@@ -21,7 +25,9 @@ _GAINS, _PHASES = 12.0, 90.0
 """[dB], [deg] that the panels of the error show at most to either side"""
 
 
-def match(pair: FittedPair, unit: str, note: str) -> Panels:
+def match(
+    pair: FittedPair, unit: str, note: str, *, figure: "Figure | Sketch | None" = None
+) -> Panels:
     """Gain, phase and partial coherence of data and model, and their quotient, all with 95 %
     intervals; the quotient within the envelopes of what pilots do not notice.
 
@@ -29,8 +35,9 @@ def match(pair: FittedPair, unit: str, note: str) -> Panels:
         pair: what is drawn.
         unit: of gain, such as `dB re rad`.
         note: below the title.
+        figure: to draw on; a new one where None.
     """
-    axes = panels(None, 8.4 + style.ROW, [1.4, 1.2, 0.6, 0.9, 0.9], top=style.TOP + style.ROW)
+    axes = panels(figure, 8.4 + style.ROW, [1.4, 1.2, 0.6, 0.9, 0.9], top=style.TOP + style.ROW)
     known = np.isfinite(pair.H) & (pair.sd < _WIDE * np.abs(pair.H))
     modelled = np.isfinite(pair.model.log_gain) & np.isfinite(pair.model.phase)
     _draw_model(axes, pair, modelled)
@@ -41,7 +48,7 @@ def match(pair: FittedPair, unit: str, note: str) -> Panels:
     _draw_error(axes[3:], pair, known & modelled)
     axes[0].set_xscale("log")
     axes[0].set_xlim(pair.omega[0], pair.omega[known][-1] if known.any() else pair.omega[-1])
-    style.plain_log_ticks(axes[0].xaxis)
+    style.plain_log_ticks(axes[0])
     labels = (f"gain [{unit}]", "phase [deg]", "coherence", "error [dB]", "error [deg]")
     for ax, words in zip(axes, labels, strict=True):
         ax.set_ylabel(words)
@@ -90,7 +97,9 @@ def _draw_data(axes: Panels, pair: FittedPair, known: np.ndarray, modelled: np.n
 _STYLE: dict[str, Any] = {"fmt": "o", "ms": 2.2, "mew": 0, "elinewidth": 0.6, "capsize": 0}
 
 
-def _bars(ax: Axes, w: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str = "") -> None:
+def _bars(
+    ax: "Axes", w: np.ndarray, gain: np.ndarray, relative: np.ndarray, label: str = ""
+) -> None:
     # Where the error is large the two ends of the gain are not as far away in decibels.
     down = -20.0 * np.log10(np.maximum(1.0 - relative, 1e-2))
     up = 20.0 * np.log10(1.0 + relative)

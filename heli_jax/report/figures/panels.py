@@ -1,11 +1,14 @@
 """What every figure of a fit begins with: panels below each other, their labels in line."""
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.transforms import ScaledTranslation
+from typing import TYPE_CHECKING, Any
 
 from heli_jax.identification.result import Signals
 from heli_jax.report import style
+from heli_jax.report.sketch import Sketch
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 type Panels = tuple[Axes, ...]
 
@@ -15,30 +18,37 @@ _LABELS_LEFT = 0.57
 
 
 def panels(
-    figure: Figure | None,
+    figure: "Figure | Sketch | None",
     height: float,
     ratios: list[float],
     *,
     sharex: bool = True,
     right: float = 0.2,
     top: float = style.TOP,
-) -> Panels:
+) -> "Panels":
     """Panels below each other in a given figure or a new one.
 
     Args:
-        figure: to draw on, with the margins it has; a new one where None.
-        height: of a new figure [inch].
+        figure: to draw on, with the margins it has, or a sketch; a new one where None.
+        height: of a new figure or a sketch [inch].
         ratios: heights of the panels, relative to each other.
         sharex: whether the panels have one x axis.
         right: margin of a new figure [inch].
         top: likewise, above the first panel.
     """
     n = len(ratios)
+    # Panels with an x axis each need room for its tick labels.
+    gap = 0.22 if sharex else 0.36
+    if isinstance(figure, Sketch):
+        each = style.panel_height(height, n, gap=gap, top=top)
+        sketched: Any = figure.panels([each * n * r / sum(ratios) for r in ratios])
+        return sketched
+    from matplotlib.transforms import ScaledTranslation
+
     drawing = style.figure(height) if figure is None else figure
     axes = drawing.subplots(n, 1, sharex=sharex, squeeze=False, height_ratios=ratios)[:, 0]
     if figure is None:
-        # Panels with an x axis each need room for its tick labels.
-        style.place(drawing, n, right=right, gap=0.22 if sharex else 0.36, top=top)
+        style.place(drawing, n, right=right, gap=gap, top=top)
     for ax in axes:
         at = ax.transAxes + ScaledTranslation(-_LABELS_LEFT, 0.0, drawing.dpi_scale_trans)
         ax.yaxis.set_label_coords(0.0, 0.5, transform=at)

@@ -1,8 +1,8 @@
 """Whether residuals are white: their autocorrelation, and their correlation with the inputs."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from heli_jax.identification.result import Signals
 from heli_jax.identification.validation.metrics import (
@@ -18,7 +18,12 @@ from heli_jax.identification.validation.metrics import (
 from heli_jax.numbers import number, percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels, sample_time
+from heli_jax.report.sketch import Sketch
 from heli_jax.report.style import subtitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def residual_correlation(
@@ -27,7 +32,7 @@ def residual_correlation(
     *,
     together: int = 1,
     test: Whiteness | None = None,
-    figure: Figure | None = None,
+    figure: "Figure | Sketch | None" = None,
 ) -> Panels:
     """Autocorrelation of the residual (filter error: the innovations) and its correlation with each
     input, with 99 % bands.
@@ -68,7 +73,7 @@ def residual_correlation(
     return axes
 
 
-def _head(ax: Axes, signals: Signals, output: str, test: Whiteness) -> None:
+def _head(ax: "Axes", signals: Signals, output: str, test: Whiteness) -> None:
     """Title and subtitle: what of which flight, and the test of whiteness."""
     what = "Residual" if signals.innovations is None else "Innovations"
     result = "white" if test.white else "not white"
@@ -81,7 +86,7 @@ def _head(ax: Axes, signals: Signals, output: str, test: Whiteness) -> None:
     )
 
 
-def _stems(ax: Axes, x: np.ndarray, y: np.ndarray, band: np.ndarray) -> None:
+def _stems(ax: "Axes", x: np.ndarray, y: np.ndarray, band: np.ndarray) -> None:
     """Stems from zero over a band (lags,); those outside it in another colour and thicker."""
     ax.fill_between(x, -band, band, color=style.SKY, alpha=0.35, lw=0, label="99 % band")
     outside = np.abs(y) > band

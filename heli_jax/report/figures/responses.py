@@ -68,7 +68,7 @@ def draw_response(
     axes[2].set_ylim(0.0, 1.05)
     axes[0].set_xscale("log")
     axes[0].set_xlim(hz[0], hz[known][-1] if known.any() else hz[-1])
-    style.plain_log_ticks(axes[0].xaxis)
+    style.plain_log_ticks(axes[0])
     axes[0].set_ylabel(f"gain [dB re {unit}]" if unit != "1" else "gain [dB]")
     axes[1].set_ylabel("phase [deg]")
     axes[2].set_ylabel("coherence")

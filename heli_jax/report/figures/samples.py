@@ -2,12 +2,10 @@
 Gaussian approximation."""
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.bootstrap import Bootstrap
@@ -15,6 +13,10 @@ from heli_jax.identification.uncertainty.nuts import Posterior
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels
 from heli_jax.report.style import subtitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MOST = 6
 """parameters that are drawn: of more the cells are too small to be read"""
@@ -25,7 +27,7 @@ _DOTS = 1500
 """samples of which dots are drawn: of more they hide one another"""
 
 
-def trace(posterior: Posterior, fit: Fit, *, figure: Figure | None = None) -> Panels:
+def trace(posterior: Posterior, fit: Fit, *, figure: "Figure | None" = None) -> Panels:
     """The chains by draw, one panel for each of the first parameters.
 
     Args:
@@ -43,7 +45,7 @@ def trace(posterior: Posterior, fit: Fit, *, figure: Figure | None = None) -> Pa
         for i, chain in enumerate(posterior.draws[name]):
             style.line(ax, np.arange(chain.size), chain, color=style.CYCLE[i], lw=0.5)
         ax.axhline(fit.estimates[name].value, color=style.GREY, lw=0.9, ls=":")
-        ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
+        style.few_ticks(ax, "y", 4)
         ax.set_ylabel(style.label(name, fit.estimates[name].unit))
     _mark_divergent(axes[-1], posterior)
     axes[-1].set_xlabel("draw")
@@ -52,7 +54,7 @@ def trace(posterior: Posterior, fit: Fit, *, figure: Figure | None = None) -> Pa
     return axes
 
 
-def _mark_divergent(ax: Axes, posterior: Posterior) -> None:
+def _mark_divergent(ax: "Axes", posterior: Posterior) -> None:
     diverging = posterior.statistics.get("diverging")
     if diverging is None or not np.any(diverging):
         return
@@ -62,7 +64,7 @@ def _mark_divergent(ax: Axes, posterior: Posterior) -> None:
     ax.plot(at, np.zeros(at.size), "|", color=style.BLACK, ms=9, transform=foot, clip_on=False)
 
 
-def posterior_pairs(posterior: Posterior, fit: Fit, *, figure: Figure | None = None) -> Panels:
+def posterior_pairs(posterior: Posterior, fit: Fit, *, figure: "Figure | None" = None) -> Panels:
     """Draws by pairs of parameters, divergent ones marked.
 
     Args:
@@ -76,7 +78,7 @@ def posterior_pairs(posterior: Posterior, fit: Fit, *, figure: Figure | None = N
     return _pairs(draws, fit, "Draws from the posterior", style.PURPLE, marked, figure)
 
 
-def bootstrap_pairs(booted: Bootstrap, fit: Fit, *, figure: Figure | None = None) -> Panels:
+def bootstrap_pairs(booted: Bootstrap, fit: Fit, *, figure: "Figure | None" = None) -> Panels:
     """Estimates from simulated records by pairs of parameters; () where fewer than two were fitted.
 
     Args:
@@ -95,7 +97,7 @@ def _pairs(
     title: str,
     color: str,
     marked: np.ndarray | None,
-    figure: Figure | None,
+    figure: "Figure | None",
 ) -> Panels:
     names = list(samples)[:MOST]
     n = len(names)
@@ -140,11 +142,11 @@ def _label(grid: np.ndarray, names: list[str], fit: Fit) -> None:
         power = grid[-1, i].xaxis.get_offset_text()
         power.set_horizontalalignment("left")
         for ax in grid[i:, i]:
-            ax.xaxis.set_major_locator(MaxNLocator(nbins=3))
+            style.few_ticks(ax, "x", 3)
             ax.tick_params(axis="x", rotation=30)
             _interval_lines(ax.axvline, fit.estimates[name])
         for j, ax in enumerate(grid[i, :i]):
-            ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
+            style.few_ticks(ax, "y", 4)
             ax.tick_params(axis="y", labelleft=j == 0)
         if i:
             grid[i, 0].set_ylabel(label)
@@ -160,7 +162,7 @@ def _interval_lines(draw: Callable[..., object], e: Estimate) -> None:
             draw(end, color=style.BLUE, lw=0.8, ls=":")
 
 
-def _histogram(ax: Axes, values: np.ndarray, e: Estimate, color: str) -> None:
+def _histogram(ax: "Axes", values: np.ndarray, e: Estimate, color: str) -> None:
     ax.hist(values, bins=min(40, max(8, round(values.size**0.5))), density=True, color=color)
     x = np.linspace(*ax.get_xlim(), 200)
     sd = e.sd

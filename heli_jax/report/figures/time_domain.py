@@ -1,8 +1,8 @@
 """Figures over time: an output with its residual and inputs, and the coefficients of the RLS."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from heli_jax import naming
 from heli_jax.dynamics.model import Model
@@ -12,11 +12,16 @@ from heli_jax.identification.validation.metrics import metrics
 from heli_jax.numbers import vaf_percent
 from heli_jax.report import style
 from heli_jax.report.figures.panels import Panels, panels
+from heli_jax.report.sketch import Sketch, SketchAxes
 from heli_jax.report.style import label, legend_above, line, samples, subtitle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def response(
-    signals: Signals, output: str, model: Model, *, figure: Figure | None = None
+    signals: Signals, output: str, model: Model, *, figure: "Figure | Sketch | None" = None
 ) -> Panels:
     """Measured and simulated output, the residual, and the inputs, over time.
 
@@ -68,7 +73,7 @@ def _agreement(signals: Signals, output: str) -> str:
 
 
 def rls_history(
-    baseline: Baseline, *, log_start: float | None = None, figure: Figure | None = None
+    baseline: Baseline, *, log_start: float | None = None, figure: "Figure | Sketch | None" = None
 ) -> Panels:
     """Every coefficient of the recursive least squares over time, the a's above the b's.
 
@@ -101,7 +106,7 @@ def rls_history(
     return axes
 
 
-def _draw_coefficients(ax: Axes, t: np.ndarray, values: np.ndarray, names: list[str]) -> None:
+def _draw_coefficients(ax: "Axes", t: np.ndarray, values: np.ndarray, names: list[str]) -> None:
     """Columns of values (N, k) over t (N,), by their names."""
     ax.set_ylim(*_settled_range(values))
     for k, name in enumerate(names):
@@ -111,6 +116,8 @@ def _draw_coefficients(ax: Axes, t: np.ndarray, values: np.ndarray, names: list[
         # The first samples, with P(0) = 1e12 I, throw coefficients over many powers of ten.
         inside = np.clip(values[:, k], *_widened(ax.get_ylim()))
         line(ax, t, inside, color=color, ls=dashes, label=name)
+    if isinstance(ax, SketchAxes):
+        return  # a chart places its own legend
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), borderaxespad=0.3, handletextpad=1.0)
 
 
