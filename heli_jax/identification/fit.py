@@ -52,7 +52,7 @@ from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.misread import dropouts, misread
+from heli_jax.identification.validation.misread import clipped, dropouts, misread
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
@@ -254,7 +254,7 @@ def fit(
     points = _starts(guess, problem, starts, seed)
     with stage(words):
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
-    doubted = [one.finding for one in (*misread(problem), *dropouts(problem))]
+    doubted = [one.finding for one in (*misread(problem), *dropouts(problem), *clipped(problem))]
     doubted += rate_against_angle(problem)
     doubted += [one.finding for one in odd_flights(problem.training)]
     said = (*cautions(problem), *(f.sentence for f in doubted))

@@ -7,7 +7,7 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
-from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
+from heli_jax.identification.validation.misread import clipped, dropouts, misread, record_doubts
 
 DT, N = 0.02, 1000
 T = DT * np.arange(N)
@@ -106,3 +106,38 @@ def test_a_stick_that_drops_out():
     np.testing.assert_array_equal(np.flatnonzero(at), np.sort(gone))
     # A stick between three positions rests where it is.
     assert stick_dropouts(np.repeat([0.0, 0.1, 0.0, -0.1] * 25, 10)) is None
+
+
+def test_flat_tops_are_no_measurements(load):
+    rng = np.random.default_rng(2)
+    noisy = P + 0.01 * rng.standard_normal(N)
+    for limit, reasons in ((0.4, ["p is cut off in "]), (np.inf, [])):
+        problem = of(flights(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s")))
+        assert len(clipped(problem)) == len(reasons)
+        assert [said[: len(reasons[0])] for said in record_doubts(problem) if reasons] == reasons
+
+
+def test_a_roll_that_was_flown_is_no_wrong_unit():
+    from types import SimpleNamespace
+
+    from heli_jax import Flight, linear_model
+    from heli_jax.flights.flight import Signal, Source
+
+    p = np.where((T > 5) & (T < 8), 1.9, 0.0) + 0.1 * np.sin(3 * T)
+    phi = np.cumsum(p) * DT
+    signals = {
+        "p": Signal("p", "rad/s", "rad/s"),
+        "phi": Signal("phi", "rad", "rad"),
+    }
+    for of_rate, sure in ((1.0, 0), (1 / 57.3, 1)):
+        flight = Flight(
+            dt=DT,
+            inputs={"lat": U},
+            outputs={"p": p * of_rate, "phi": phi},
+            source=Source("log.csv", "", outputs=signals),
+        )
+        problem = SimpleNamespace(training=[flight], model=linear_model("roll-flybarless").model)
+        [found] = misread(problem)
+        assert "5.7" in found.finding.sentence
+        assert bool(found.words) is bool(sure)
+        assert ("upside down" in found.finding.sentence) is not bool(sure)

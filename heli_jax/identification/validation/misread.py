@@ -20,13 +20,15 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.odd_flights import odd_flights
-from heli_jax.identification.validation.signal_quality import dropout_words, facts_of
+from heli_jax.identification.validation.signal_quality import cut_off, dropout_words, facts_of
 from heli_jax.identification.validation.signal_signs import contradictions
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
 """rad and rad/s that a small helicopter does not exceed, but for its heading"""
 _LINEAR_ANGLE, _LINEAR_RATE = np.pi / 2, 8.0
 """rad and rad/s up to which a linear model may mean something"""
+_FLOWN_TURNS = 5.0
+"""turns that rolls and loops may add up to in an angle without jumps"""
 _HEADING_TURNS = 20.0
 """turns in one sense, of a heading without jumps"""
 _MOST = 99.0
@@ -60,7 +62,7 @@ def misread(problem: Problem) -> list[Misread]:
 
 def record_doubts(problem: Problem) -> list[str]:
     """Why no model of these numbers is adequate, each reason in a few words."""
-    found = (*misread(problem), *dropouts(problem))
+    found = (*misread(problem), *dropouts(problem), *clipped(problem))
     words = dict.fromkeys(one.words for one in found if one.words)
     odd = [one.words for one in odd_flights(problem.training)]
     return [*words, *contradictions(problem), *odd]
@@ -78,6 +80,13 @@ def dropouts(problem: Problem) -> list[Misread]:
         for (name, kind), facts in facts_of(flight).items()
         if facts.dropouts is not None and (kind == "input" or facts.dropped >= DROP_SHARE)
     ]
+
+
+def clipped(problem: Problem) -> list[Misread]:
+    """The outputs whose flat tops are taken for measurements."""
+    flights = problem.training
+    found = cut_off(list(zip(labels(flights), flights, strict=True)))
+    return [Misread(finding, words) for finding, words in found]
 
 
 def _contradicted(label: str, flight: Flight) -> Iterator[Misread]:
@@ -129,10 +138,31 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
             f"unit: {unit}."
         )
         criterion = f"{_MOST:g} % of the samples below, {most:.4g} {signal.unit}"
-        # What the file says of it makes sure what its size alone does not.
-        certain = size > impossible or signal.contradicted == unit
+        # What the file says of it makes sure what its size alone does not. An angle past pi that
+        # its own rate leads to may have been flown: then the size says nothing.
+        flown = _flown(problem, flight, name, size)
+        if flown and signal.contradicted != unit:
+            words = (
+                f"{label}: {name} is up to {size:.3g} rad ({np.degrees(size):.0f} deg): it was "
+                f"flown upside down, or {shown(signal.name)} and its rate are in deg and read as "
+                "rad, with every estimate off by 57; state unit: deg if so."
+            )
+        certain = (size > impossible and not flown) or signal.contradicted == unit
         sure = f"{name} looks like {unit} read as {signal.unit}" if certain else ""
         yield Misread(Finding("signs and units", "doubt", words, size, criterion), sure)
+
+
+def _flown(problem: Problem, flight: Flight, name: str, size: float) -> bool:
+    """Whether an angle of some turns is what its rate, of a size that a helicopter has, adds up to:
+    so it is in aerobatics, and where both are in degrees."""
+    rate = next((a.rate for a in axes_of(problem.model) if a.angle == name), None)
+    p, phi = flight.outputs.get(rate or ""), flight.outputs[name]
+    if p is None or size > _FLOWN_TURNS * 2 * np.pi or np.nanmax(np.abs(p)) > _LARGEST_RATE:
+        return False
+    moved, by_rate = np.diff(phi), 0.5 * (p[1:] + p[:-1]) * flight.dt
+    both = np.isfinite(moved) & np.isfinite(by_rate)
+    power = float(np.sum(by_rate[both] ** 2))
+    return power > 0 and abs(float(np.sum(moved[both] * by_rate[both])) / power - 1.0) < 0.3
 
 
 def _sticks(label: str, flight: Flight) -> Iterator[Misread]:

@@ -26,9 +26,21 @@ from heli_jax.flights.strays import stray_words
 from heli_jax.flights.table import sample_count
 from heli_jax.identification.validation.finding import Finding
 
-__all__ = ["Rails", "facts_of", "quantisation", "quantum", "rails", "saturation", "strays", "stuck"]
+__all__ = [
+    "Rails",
+    "cut_off",
+    "facts_of",
+    "quantisation",
+    "quantum",
+    "rails",
+    "saturation",
+    "strays",
+    "stuck",
+]
 
 _RAIL_LIMIT = f"share of the samples at a rail, {RAIL_SHARE}"
+_CUT_OFF = 0.02
+"""part of an output's samples at its rails from which on no model of them is adequate"""
 _COARSE = 16
 """distinct values of a moving signal below which it is called coarse"""
 _MOVES = 0.2
@@ -85,6 +97,26 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
         return [Finding("saturation", "ok", words, 0.0, _RAIL_LIMIT)]
     found.sort(key=lambda f: -f[0])
     return [_saturated(*f) for f in found[:_MOST_NAMED]]
+
+
+def cut_off(flights: Sequence[tuple[str, Flight]]) -> list[tuple[Finding, str]]:
+    """Outputs that rest at an end of their range, each with a few words where it is enough of them
+    to move the estimates.
+
+    Args:
+        flights: by what each is called.
+    """
+    return [
+        (
+            _saturated(sum(facts.shares), label, kind, name, facts),
+            f"{name} is cut off in {100 * sum(facts.shares):.2g} % of its samples"
+            if sum(facts.shares) >= _CUT_OFF
+            else "",
+        )
+        for label, flight in flights
+        for (name, kind), facts in facts_of(flight).items()
+        if kind == "output" and sum(facts.shares) > 0
+    ]
 
 
 def _near(rail: Rail) -> str:
