@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from heli_jax.errors import InputError
-from heli_jax.flights.csv_cells import is_number, row_of_units
+from heli_jax.flights.csv_cells import MISSING, is_number, row_of_units
 from heli_jax.flights.csv_dates import is_date, is_day
 from heli_jax.flights.csv_text import (
     DELIMITERS,
@@ -39,7 +39,7 @@ _FIRST = 100
 _NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]+)?")
 """with any decimal sign, and with marks between thousands"""
 _TYPE = re.compile(r"\s*(?:u?int|long|float|double|single|real|string|bool|boolean)\d*\s*", re.I)
-_SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
+_SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
 _IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
 """of a body, in place of its name"""
 
@@ -200,7 +200,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _is_value(cell: str) -> bool:
-    return bool(_NUMBER.fullmatch(cell)) or is_number(cell) or is_date(cell) or is_day(cell)
+    numbers = bool(_NUMBER.fullmatch(cell)) or is_number(cell) or cell in MISSING
+    return numbers or is_date(cell) or is_day(cell)
 
 
 def _is_row(cells: Sequence[str]) -> bool:
@@ -212,9 +213,12 @@ def _is_row(cells: Sequence[str]) -> bool:
     return 2 * values > len(filled) or (_is_value(filled[0]) and 3 * values >= len(filled))
 
 
-def _are_names(cells: Sequence[str], fewest: int = 2) -> bool:
+def _are_names(cells: Sequence[str]) -> bool:
     filled = [cell.strip() for cell in cells if cell.strip()]
-    return len(cells) >= fewest and 2 * sum(map(_is_value, filled)) < len(filled)
+    # A sample of which all but the time is text is no line of names.
+    if len(cells) < 2 or not filled or _is_value(filled[0]):
+        return False
+    return 2 * sum(map(_is_value, filled)) < len(filled)
 
 
 def _are_units(cells: Sequence[str]) -> bool:

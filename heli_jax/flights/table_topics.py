@@ -11,7 +11,7 @@ from heli_jax.flights.grid import without_overflow
 from heli_jax.flights.joined import joined_note, row_groups, takes_turns, topics_of
 from heli_jax.flights.log import ChannelLog, Topic, as_floats
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.flights.table_view import without_copies
+from heli_jax.flights.table_view import numbers_once
 
 _MOST_NAMED = 6
 """columns that notes name"""
@@ -101,8 +101,6 @@ def _table_topic(
         elif texts := [c.name for c in info.columns if c.kind == "text"]:
             why += f" ({_left_out(table, texts[:1])[0].removeprefix('left out: ')})"
         raise wrong(table.path, f"{why}, {remedy}")
-    # As `info` has counted them.
-    table = without_copies(table, clock.column)
     if clock.guessed:
         notes.append(f"column {shown(clock.column)} is taken for a clock in {clock.unit}")
     rows = next(c.count for c in info.columns if c.name == clock.column)
@@ -116,9 +114,9 @@ def _table_topic(
     # The columns are keyed by name from here on, and one of the two would be lost without a word.
     if twice is not None:
         raise wrong(table.path, f"two columns are named {shown(twice)}, expected different names")
-    numbers = dict(table.numbers(names))
+    numbers, copies = numbers_once(table, clock.column, names)
     stamps, more = without_overflow(numbers.pop(clock.column))
-    notes += more
+    notes += (*copies, *more)
     # By the clock's own measure of its length, which knows its unit.
     scale = clock.duration / float(stamps[-1] - stamps[0])
     topic = Topic("the table", (stamps - stamps[0]) * scale, numbers, {}, clock.column)

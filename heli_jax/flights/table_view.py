@@ -144,27 +144,38 @@ def seen_once(table: Table, rows: np.ndarray) -> TableView:
     return TableView(table, rows, note=note)
 
 
-def without_copies(table: Table, clock: str, surveys: Sequence[Survey] | None = None) -> Table:
+def without_copies(table: Table, clock: str, surveys: Sequence[Survey]) -> Table:
     """A table without rows that are there twice, all of its numbers being the same.
 
     Args:
         table: of rows.
         clock: the column of times.
-        surveys: of all columns, where they are at hand.
+        surveys: of all columns.
     """
-    stamps = table.numbers([clock])[clock] if surveys is None else _of(surveys, clock)
-    if stamps is None or np.all(stamps[1:] > stamps[:-1]):
-        return table
-    values = [s.values for s in surveys or table.survey() if s.values is not None]
+    values = [s.values for s in surveys if s.values is not None]
+    stamps = next(s.values for s in surveys if s.name == clock)
     # Arrays may have lengths of their own.
-    if any(x.size != stamps.size for x in values):
+    if stamps is None or any(x.size != stamps.size for x in values):
         return table
     rows = first_of_copies(stamps, values)
     return table if rows is None else seen_once(table, rows)
 
 
-def _of(surveys: Sequence[Survey], name: str) -> np.ndarray | None:
-    return next((s.values for s in surveys if s.name == name), None)
+def numbers_once(
+    table: Table, clock: str, names: Sequence[str]
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Columns (N,) of one length, and a note where rows that are there twice were left out.
+
+    Args:
+        table: of rows.
+        clock: the column of times.
+        names: of the columns, the clock's among them.
+    """
+    numbers = table.numbers(names)
+    rows = first_of_copies(numbers[clock], list(numbers.values()))
+    if rows is None:
+        return numbers, ()
+    return {n: x[rows] for n, x in numbers.items()}, seen_once(table, rows).notes[-1:]
 
 
 def with_joined_clock(table: Table) -> Table:

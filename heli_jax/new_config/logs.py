@@ -13,7 +13,7 @@ from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
 from heli_jax.flights.open_log import chosen_flights, open_flights
 from heli_jax.flights.table import Table, shown, wrong
-from heli_jax.flights.table_view import without_copies
+from heli_jax.flights.table_view import numbers_once
 from heli_jax.new_config.guess import Series
 
 _FEWEST = 8
@@ -78,7 +78,6 @@ def _read_table(table: Table) -> Log:
         why = info.time.problem if info.time is not None else _without_time(info)
         raise wrong(table.path, f"expected a column of increasing times, got none: {why}")
     clock = info.time.column
-    table = without_copies(table, clock)
     names = [c.name for c in info.columns if c.kind == "number"]
     # Of two columns of one name neither can be asked for.
     names = [n for n in names if table.names.count(n) == 1]
@@ -86,7 +85,7 @@ def _read_table(table: Table) -> Log:
     rows = {c.name: c.rows for c in info.columns}
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
-    values = table.numbers([clock, *(n for n in names if n != clock)])
+    values, _ = numbers_once(table, clock, [clock, *(n for n in names if n != clock)])
     # Seconds from the first stamp: their count does not matter to a guess.
     times = np.linspace(0.0, info.time.duration, values[clock].size)
     series = {

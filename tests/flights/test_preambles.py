@@ -120,3 +120,19 @@ def test_two_tables_in_a_file_and_samples_without_names_are_refused(tmp_path):
         match=r"line 2: 4 cells, expected 3 as in the header in line 1; no line of names",
     ):
         open_csv(path).numbers(["t"])
+
+
+@pytest.mark.parametrize("cell", ["NA", "auto", ""])
+def test_samples_without_numbers_at_the_beginning_are_no_names(tmp_path, cell):
+    path = tmp_path / "a.csv"
+    first = [f"{0.01 * i - 1:.2f},{cell},{cell},{cell}" for i in range(20)]
+    path.write_text("\n".join(("t,u,p,q", *first, *(f"{row},1" for row in rows()))))
+    table = open_csv(path)
+    assert table.names == ("t", "u", "p", "q")
+    assert table.numbers(["t"])["t"].size == 20 + N
+
+
+def test_only_what_can_stand_between_cells_is_a_separator(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(("sep=\u00a7", "t,u,p", *rows())))
+    assert open_csv(path).names == ("t", "u", "p")
