@@ -1,5 +1,7 @@
 """Numbers that are hardly what they are taken for, from the table to the first line of a fit."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -7,8 +9,11 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
+from heli_jax.identification.validation.late_angles import lateness
 from heli_jax.identification.validation.misread import clipped, dropouts, misread, record_doubts
+from heli_jax.identification.validation.signal_signs import angle_over_rate
 
+TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
 DT, N = 0.02, 1000
 T = DT * np.arange(N)
 U = 0.1 * np.sign(np.sin(2.3 * T) + 0.5 * np.sin(5.1 * T)) + 0.02 * np.sin(11.0 * T)
@@ -141,3 +146,14 @@ def test_a_roll_that_was_flown_is_no_wrong_unit():
         assert "5.7" in found.finding.sentence
         assert bool(found.words) is bool(sure)
         assert ("upside down" in found.finding.sentence) is not bool(sure)
+
+
+@pytest.mark.skipif(not TREX.exists(), reason="the real logs are not at ../shared/data")
+@pytest.mark.parametrize("name", ["Pitchtest.csv", "Hovertest.csv"])
+def test_nothing_is_wrong_with_the_sticks_and_angles_of_a_real_log(name):
+    log = np.genfromtxt(TREX / name, delimiter=",", names=True)
+    assert all(stick_dropouts(log[n]) is None for n in ("lat", "lon", "ped", "col"))
+    for angle, rate in (("phi", "p"), ("theta", "q"), ("psi", "r")):
+        assert lateness(log[angle], log[rate], 0.01) is None
+        ratio = angle_over_rate(log[angle], log[rate], 0.01)
+        assert ratio is None or ratio[0] > 0
