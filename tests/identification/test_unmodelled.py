@@ -115,6 +115,17 @@ def test_a_saturation_that_is_left_out_is_named(method):
     assert any("a saturation, a rate limit, a deadband" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_machine_that_changes_over_the_record_leaves_no_plain_yes(method):
+    def slows_down(u):
+        """p of a rotor that loses a fifth of its moment steadily."""
+        return linear(np.array([[-4.0]]), np.array([[20.0]]), u * np.linspace(1.1, 0.9, N))
+
+    found = fitted(slows_down, method, noise=0.02)
+    assert "the response of p changes over the record" in found.adequacy.summary
+    assert any("Fit shorter windows" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("coloured", [0.0, 0.02])
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_is_missed_of_a_right_model(method, coloured):

@@ -1,10 +1,12 @@
-"""What a model lacks, asked of its residuals: a mode, or an answer that depends on amplitude.
+"""What a model lacks, asked of its residuals: a mode, an answer that depends on amplitude, or one
+that changes over the record.
 
 Of every output the residual in time is tested against the inputs through a bank of filters, beyond
 what the sensitivities explain (`score_test`): the simulation and its residual are there by any
 method. Then against cubes and signed squares of inputs, of the simulated output and of its rate,
 beyond what the input through the same filter explains: a saturation, a rate limit and a deadband
-answer large and small inputs differently, and no linear model does.
+answer large and small inputs differently, and no linear model does. Then against the sensitivities
+times the time: a rotor that slows down and a mass that changes leave what no constant takes up.
 """
 
 from collections.abc import Mapping
@@ -30,7 +32,7 @@ from heli_jax.identification.validation.score_test import (
 )
 
 LEVEL, IN_COLOUR = 0.01, 1e-3
-"""of all outputs and both questions together; and where residuals in time are autocorrelated, as in
+"""of all outputs and questions together; and where residuals in time are autocorrelated, as in
 strong gusts: what whitens them is then too short to leave nothing"""
 _MATTERS = 0.5
 """standard deviations of an estimate by which a significant misfit has to move it to count: with
@@ -65,12 +67,15 @@ class Unmodelled(NamedTuple):
     """of twice the log-likelihood"""
     moved: Mapping[str, float]
     """by estimate how far it moves where that is in the model, in its standard deviations"""
+    over_time: bool = False
+    """whether it is an answer that changes over the record"""
 
     @property
     def matters(self) -> bool:
         """Whether some estimate moves by a good part of its interval, or none has one."""
-        # What depends on amplitude changes what an estimate means, whatever the fit makes of it.
-        if self.by_amplitude or not self.moved:
+        # What depends on amplitude or time changes what an estimate means, whatever the fit makes
+        # of it.
+        if self.by_amplitude or self.over_time or not self.moved:
             return True
         return max(abs(v) for v in self.moved.values()) > _MATTERS
 
@@ -79,6 +84,8 @@ class Unmodelled(NamedTuple):
         """What is missing, in a few words."""
         if self.by_amplitude:
             return f"the response of {self.output} depends on amplitude"
+        if self.over_time:
+            return f"the response of {self.output} changes over the record"
         return f"the residual of {self.output} still follows {self.input}{self._where}"
 
     @property
@@ -93,6 +100,12 @@ class Unmodelled(NamedTuple):
             said = (
                 f"The response of {self.output} depends on amplitude ({chance}): a saturation, a "
                 "rate limit, a deadband or another nonlinearity is missing."
+            )
+        elif self.over_time:
+            said = (
+                f"The response of {self.output} changes over the record ({chance}): rotor speed, "
+                "mass or speed did, or the log's clock, and the estimates are means of what they "
+                "were. Fit shorter windows, and compare (heli-jax compare)."
             )
         else:
             what = "a mode or a lag" if self.damping < 1.0 else "dynamics"
@@ -128,7 +141,7 @@ def unmodelled(
     names = sorted({n for i in flights for n in layout.outputs[i] if _usable(at, e, i, n)})
     if not names:
         return ()
-    level = (IN_COLOUR if coloured else LEVEL) / (2 * len(names))
+    level = (IN_COLOUR if coloured else LEVEL) / (3 * len(names))
     found, J = [], _sensitivities(at, e)
     for name in names:
         asked = _of_output(at, e, name, J)
@@ -139,10 +152,11 @@ def unmodelled(
 
 
 class _Asked(NamedTuple):
-    """The stronger answer of an output, and how large its whitened residual is."""
+    """The strongest answer of an output, and how large its whitened residual is."""
 
     strong: Strongest
     by_amplitude: bool
+    over_time: bool
     deviance: float
     """of the whitened residual: twice its negative log-likelihood but for a constant"""
 
@@ -251,24 +265,46 @@ def _blocks(at: Solution) -> list[np.ndarray]:
 def _of_output(
     at: Solution, e: Evaluation, name: str, J: Mapping[tuple[int, str], np.ndarray]
 ) -> _Asked | None:
-    """The strongest answer of an output, linear or not; None where nothing can be asked."""
+    """The strongest answer of an output: linear, by amplitude or over time; None where nothing can
+    be asked."""
     moving = _moving(at)
     flights = [i for i in _longest(at) if _usable(at, e, i, name)]
+    changing = _changing(at, J, name, flights)
     each = [
-        lines_of(np.asarray(e.raw[i][name]), J[i, name], _drives(at, e, i, name, moving))
+        lines_of(
+            np.asarray(e.raw[i][name]),
+            J[i, name],
+            np.concatenate([_drives(at, e, i, name, moving), changing[i]], axis=1),
+        )
         for i in flights
     ]
     lines = [one for one in each if one is not None]
     if not lines or not moving:
         return None
     m, columns = len(moving), lines[0].drives.shape[1]
+    constant = columns - changing[flights[0]].shape[1]
     linear = strongest(lines, range(m), NARROW)
-    curved = strongest(lines, range(m, columns), BROAD, beside=range(m), plain=True)
+    curved = strongest(lines, range(m, constant), BROAD, beside=range(m), plain=True)
+    changed = strongest(lines, range(constant, columns), (), plain=True)
     # Two numbers a line, each of the variance size**2.
     deviance = 4.0 * sum(one.e.size * np.log(one.size) for one in lines)
-    # Of two answers the better one: each takes up a part of the other.
-    by_amplitude = curved.statistic > linear.statistic
-    return _Asked(curved if by_amplitude else linear, by_amplitude, float(deviance))
+    # Of three answers the best one: each takes up a part of the others.
+    best = max((linear, curved, changed), key=lambda s: s.statistic)
+    return _Asked(best, best is curved, best is changed, float(deviance))
+
+
+def _changing(
+    at: Solution, J: Mapping[tuple[int, str], np.ndarray], name: str, flights: list[int]
+) -> dict[int, np.ndarray]:
+    """By flight (N, 2 k) what a change of each parameter over time does to the residual: a steady
+    one over the flights in their order, and one halfway."""
+    k, sizes = len(at.layout.of_interest), [J[i, name].shape[0] for i in flights]
+    t = np.linspace(-1.0, 1.0, sum(sizes))
+    each = zip(flights, np.split(t, np.cumsum(sizes)[:-1]), strict=True)
+    return {
+        i: np.concatenate([J[i, name][:, :k] * shape[:, None] for shape in (s, np.sign(s))], axis=1)
+        for i, s in each
+    }
 
 
 def _moving(at: Solution) -> list[str]:
@@ -300,7 +336,7 @@ def _said(
     one: _Asked,
     sds: Mapping[str, float | None],
 ) -> Unmodelled:
-    strong, by_amplitude, _ = one
+    strong, by_amplitude, over_time, _ = one
     moving, moved = _moving(at), {}
     for k, (parameter, slope) in enumerate(zip(at.layout.of_interest, e.slopes, strict=True)):
         sd = sds.get(parameter)
@@ -316,4 +352,5 @@ def _said(
         strong.p_value,
         strong.statistic,
         moved,
+        over_time,
     )

@@ -45,8 +45,8 @@ def _adequate(fit: Fit) -> str:
         )
     return (
         "yes where the residuals of all outputs are white (Ljung-Box at 1 %) and nothing is found "
-        "that the model lacks, a mode or a dependence on amplitude (1 %); in size only where "
-        "something is, or they are not white, but the simulation explains at least "
+        "that the model lacks, a mode or a dependence on amplitude or time (1 %); in size only "
+        "where something is, or they are not white, but the simulation explains at least "
         f"{percent(EXPLAINED, 0)} of what is not white noise, or at most "
         f"{percent(NEARLY_WHITE, 0)} of the residual's variance is other than that (a VAF below "
         f"{GATE:g} is then stated with it); no otherwise."
