@@ -18,8 +18,8 @@ from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.filter_error import ESTIMATOR as FILTER_ERROR
 from heli_jax.identification.estimation.fused_runs import FusedRuns, Own
 from heli_jax.identification.estimation.residual import differentiate
-from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.uncertainty.bootstrap import bootstrap
+from heli_jax.identification.uncertainty.refits import refit
 from heli_jax.identification.unknowns.initial_guess import start_vector
 from heli_jax.identification.unknowns.layout import Noise, layout_of
 from tests.fused.emulated_gpu import EmulatedGpu, as_text

@@ -140,7 +140,7 @@ def _degrees(problem: Problem, label: str, flight: Flight) -> Iterator[Misread]:
         criterion = f"{_MOST:g} % of the samples below, {most:.4g} {signal.unit}"
         # What the file says of it makes sure what its size alone does not. An angle past pi that
         # its own rate leads to may have been flown: then the size says nothing.
-        flown = _flown(problem, flight, name, size)
+        flown = _flown(problem, flight, str(name), size)
         if flown and signal.contradicted != unit:
             words = (
                 f"{label}: {name} is up to {size:.3g} rad ({np.degrees(size):.0f} deg): it was "
