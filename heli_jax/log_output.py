@@ -19,6 +19,7 @@ from heli_jax.flights.describe import ColumnInfo, LogInfo, TimeInfo, TopicInfo
 from heli_jax.flights.preset import fitting_presets
 from heli_jax.flights.rotor_lines import LEAST, RotorLines
 from heli_jax.flights.vibration import SMALLEST, line_words
+from heli_jax.numbers import terse
 
 # The width of a terminal that nobody has widened, and one below which nothing is narrowed.
 _WIDTH, _NARROWEST = 80, 44
@@ -143,7 +144,8 @@ def _clock_lines(clock: TimeInfo | None) -> Iterator[str]:
     else:
         uniform = "uniform" if clock.uniform else "not uniform"
         yield (
-            f"time: {clock.column} [{clock.unit}], {clock.duration:.6g} s at {clock.rate:.6g} Hz, "
+            f"time: {clock.column} [{clock.unit}], {terse(clock.duration, 6)} s "
+            f"at {terse(clock.rate, 6)} Hz, "
             f"{uniform}"
         )
         yield f"jitter {_percent(clock.jitter)} of a step, {_gap_words(clock)}"
@@ -170,7 +172,7 @@ def _vibration_lines(found: RotorLines | None) -> Iterator[str]:
         yield f"rotor: {found.channel} is not steady for {LEAST:g} s, no lines are named"
         return
     yield (
-        f"rotor: {found.hz:.4g} Hz by {found.channel}, steady from {found.start:.4g} s to "
+        f"rotor: {terse(found.hz)} Hz by {found.channel}, steady from {found.start:.4g} s to "
         f"{found.end:.4g} s"
     )
     quiet = [each.channel for each in found.signals if not each.lines]
@@ -178,7 +180,7 @@ def _vibration_lines(found: RotorLines | None) -> Iterator[str]:
         for line in each.lines[:_MOST_VIBRATIONS]:
             yield f"  {each.channel}: {line_words(line, found.hz)}"
     if quiet:
-        yield f"  no line above {100 * SMALLEST:g}% of the variance: {', '.join(quiet)}"
+        yield f"  no line above {100 * SMALLEST:g} % of the variance: {', '.join(quiet)}"
 
 
 def _vibration_content(found: RotorLines | None) -> dict[str, Any] | None:
@@ -307,7 +309,7 @@ def _share(channel: ColumnInfo) -> str:
 
 
 def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.4g}"
+    return terse(value)
 
 
 def _percent(share: float) -> str:

@@ -16,6 +16,7 @@ from heli_jax.dynamics.roll import ratios_from_denominator
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error.rls import rls, transfer_function
 from heli_jax.identification.validation.metrics import NO_METRICS, Metrics, metrics, whiteness
+from heli_jax.numbers import terse
 from heli_jax.vehicle import of_helicopter
 
 # scipy.linalg.solve_banded knows no triangular case and would factorise; this one only substitutes.
@@ -284,15 +285,15 @@ def _combinations(
     # reader compares with the fit.
     values = {n: float(v) for n, v in ratios.values.items()}
     doubts = []
-    wrong = [f"{n} = {v:.4g}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]
+    wrong = [f"{n} = {terse(v)}" for n, v in values.items() if not (math.isfinite(v) and v > 0)]
     if wrong:
         doubts.append(f"It gives {' and '.join(wrong)}, which no helicopter has.")
     off = float(ratios.p2) / float(ratios.p2_expected) - 1.0
     # p2 is not used for the ratios, so that it can contradict them.
     if abs(off) > _MEANT:
         doubts.append(
-            f"Its coefficient of s^2 is {float(ratios.p2):.4g} where its other coefficients and "
-            f"the rotor speed ask for {float(ratios.p2_expected):.4g}: it does not have the "
+            f"Its coefficient of s^2 is {terse(float(ratios.p2))} where its other coefficients and "
+            f"the rotor speed ask for {terse(float(ratios.p2_expected))}: it does not have the "
             "structure of eq. 23, and its physical parameters mean little."
         )
     return values, doubts
@@ -329,8 +330,9 @@ def _bias(
     # error of one step, not from the simulation.
     elif agreement.rmse > _WORSE * one_step:
         sentences.append(
-            f"It predicts one sample ahead to {one_step:.2g} but simulates to {agreement.rmse:.2g} "
-            "only: least squares on past measured outputs is biased by their noise."
+            f"It predicts one sample ahead to {terse(one_step, 2)} but simulates to "
+            f"{terse(agreement.rmse, 2)} only: least squares on past measured outputs is biased "
+            "by their noise."
         )
     if not whiteness(errors).white:
         sentences.append(
