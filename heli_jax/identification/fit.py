@@ -52,7 +52,7 @@ from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.misread import dropouts, misread
+from heli_jax.identification.validation.misread import doubt_words, dropouts, misread
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import rate_against_angle
@@ -248,13 +248,13 @@ def fit(
     points = _starts(guess, problem, starts, seed)
     with stage(words):
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
-    doubted = [one.finding for one in (*misread(problem), *dropouts(problem))]
-    doubted += rate_against_angle(problem)
+    doubts = (*misread(problem), *dropouts(problem))
+    doubted = [*(one.finding for one in doubts), *rate_against_angle(problem)]
     said = (*cautions(problem), *(f.sentence for f in doubted))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"):
-        run = OptimizationRun(before, points, optima, seed, timing)
+        run = OptimizationRun(before, points, optima, seed, timing, doubt_words(doubts))
         return assemble(problem, search, optimum, run)
 
 

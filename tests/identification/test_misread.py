@@ -7,7 +7,7 @@ import yaml
 from heli_jax import config as configuration
 from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
-from heli_jax.identification.validation.misread import dropouts, misread, record_doubts
+from heli_jax.identification.validation.misread import doubt_words, dropouts, misread
 
 DT, N = 0.02, 1000
 T = DT * np.arange(N)
@@ -53,6 +53,10 @@ def of(found):
     return SimpleNamespace(training=found, model=linear_model("roll-flybarless").model)
 
 
+def _doubts(found):
+    return doubt_words((*misread(found), *dropouts(found)))
+
+
 def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
     [flight] = flights(load(np.degrees(P), unit="deg/s"))
     np.testing.assert_allclose(flight.outputs["p"], P, rtol=1e-7, atol=1e-9)
@@ -63,17 +67,17 @@ def test_the_unit_of_the_file_is_taken_where_none_is_stated(load):
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):
     found = of(flights(load(np.degrees(P))))
-    assert record_doubts(found) == ["p looks like deg/s read as rad/s"]
+    assert _doubts(found) == ("p looks like deg/s read as rad/s",)
     [one] = misread(found)
     assert "state unit: deg/s" in one.finding.sentence
-    assert record_doubts(of(flights(load(P)))) == []
+    assert _doubts(of(flights(load(P)))) == ()
 
 
 def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
     found = of(flights(load(p)))
-    assert record_doubts(found) == ["dropouts of p are taken for measurements"]
+    assert _doubts(found) == ("dropouts of p are taken for measurements",)
     [one] = dropouts(found)
     assert "state missing: 0 beside its signal" in one.finding.sentence
     [flight] = flights(load(p, missing=0))

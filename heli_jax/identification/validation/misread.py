@@ -5,7 +5,7 @@ What a record says by itself of units is little: degrees fit as well as radians 
 are in them, with every estimate off by 57. Their size is the only evidence.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,10 +51,13 @@ def misread(problem: Problem) -> list[Misread]:
     ]
 
 
-def record_doubts(problem: Problem) -> list[str]:
-    """Why no model of these numbers is adequate, each reason in a few words."""
-    found = (*misread(problem), *dropouts(problem))
-    return list(dict.fromkeys(one.words for one in found if one.words))
+def doubt_words(found: Sequence[Misread]) -> tuple[str, ...]:
+    """Why no model of these numbers is adequate, each reason in a few words.
+
+    Args:
+        found: of `misread` and `dropouts`.
+    """
+    return tuple(dict.fromkeys(one.words for one in found if one.words))
 
 
 def dropouts(problem: Problem) -> list[Misread]:
