@@ -128,7 +128,7 @@ def models() -> tuple[Any, Any]:
 
 
 def truths() -> dict[str, float]:
-    values = naming.asdict(linear_model("r50-hover").vehicle().params)
+    values = naming.asdict(linear_vehicle())
     return {n: float(values[n]) for n in (*ATTITUDE, *SPEED)} | DELAYS
 
 
@@ -136,7 +136,7 @@ def problem(seed: int, method: str, **more: Any) -> Problem:
     rng = np.random.default_rng(10_000 + seed)
     flights = [record(100 * seed + i, ("lat", "lon")[i % 2]) for i in range(4)]
     model = models()[1 if method == "filter-error" else 0]
-    values = naming.asdict(linear_model("r50-hover").vehicle().params) | DELAYS
+    values = naming.asdict(linear_vehicle()) | DELAYS
     free = {
         n: Free(v * float(np.exp(rng.uniform(-1, 1) * np.log(1.5)))) for n, v in truths().items()
     }
@@ -158,16 +158,24 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 
 
+def linear_vehicle() -> Any:
+    """The parameters of the model without delays of its inputs."""
+    return linear_model("r50-hover").vehicle().params
+
+
+def doublet(model: Any, stick: str, N: int) -> Any:
+    """Inputs (N,) with a doublet on one stick."""
+    u = np.zeros(N)
+    u[25:50], u[50:75] = 0.1, -0.1
+    return model.Inputs(**{n: u if n == stick else np.zeros(N) for n in naming.names(model.Inputs)})
+
+
 def doublet_tic(found: dict[str, float]) -> float:
     """Theil's coefficient of a doublet on each cyclic stick in turn, without gusts; the worse."""
-    model, vehicle = models()[0], naming.asdict(linear_model("r50-hover").vehicle().params)
+    model, vehicle = models()[0], naming.asdict(linear_vehicle())
     N, worst = round(4.0 / DT), 0.0
     for stick in ("lat", "lon"):
-        u = np.zeros(N)
-        u[25:50], u[50:75] = 0.1, -0.1
-        inputs = model.Inputs(
-            **{n: u if n == stick else np.zeros(N) for n in naming.names(model.Inputs)}
-        )
+        inputs = doublet(model, stick, N)
         y = [
             np.stack([np.asarray(getattr(run.outputs, n)) / NOISE[n] for n in OUTPUTS])
             for values in (truths(), found)

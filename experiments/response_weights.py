@@ -1,6 +1,6 @@
 """What the estimate of the noise's spectrum costs fits of responses, over the Cramér-Rao bound.
 
-    .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW]
+    .venv/bin/python experiments/response_weights.py [RUNS] [WINDOW] [FIRST]
 
 The records of experiments/frequency_response.py with gusts and pilot steps. `frequency-response` is
 told the spectrum, the mean of that of gusts and noise alone over 150 records in the same windows;
@@ -37,7 +37,7 @@ def density(window: float) -> np.ndarray:
     return (power / RECORDS)[:, :, None].astype(complex)
 
 
-def main(runs: int, window: float) -> None:
+def main(runs: int, window: float, first: int) -> None:
     known = density(window)
 
     def told(w, at, E) -> np.ndarray:
@@ -51,7 +51,7 @@ def main(runs: int, window: float) -> None:
     print("| spectrum | " + " | ".join(NAMES) + " |\n|---|" + "---|" * len(NAMES))
     for name, patches in cases.items():
         rows = []
-        for seed in range(runs):
+        for seed in range(first, first + runs):
             rng = np.random.default_rng(seed)
             u = steps(rng)
             flight = record(rng, u, SIGMA)
@@ -77,5 +77,6 @@ if __name__ == "__main__":
         "three minutes",
         Size("runs", 40, 2, "records"),
         Size("window", 10.0, 10.0, "[s]"),
+        Size("first", 0, 0, "seed of the first record"),
     )
-    main(options.runs, options.window)
+    main(options.runs, options.window, options.first)

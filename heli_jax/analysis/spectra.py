@@ -95,12 +95,20 @@ def partial_coherence(others: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.nd
     """
     # A coherence with the other inputs left in would count theirs as noise, and as u's own where
     # the pilot moves two sticks together.
+    # A coherence has no size, and the squares of a simulation that diverged have none in numbers.
+    u, y = u / size_of(u), y / size_of(y)
     left_u, left_y = without(others, u), without(others, y)
     uu, yy = np.sum(np.abs(left_u) ** 2, axis=1), np.sum(np.abs(left_y) ** 2, axis=1)
     uy = np.abs(np.sum(np.conj(left_u) * left_y, axis=1)) ** 2
     enough = uu > _ROUNDING * np.sum(np.abs(u) ** 2, axis=1)
     enough &= yy > _ROUNDING * np.sum(np.abs(y) ** 2, axis=1)
     return np.where(enough, uy / np.where(enough, uu * yy, 1.0), np.nan)
+
+
+def size_of(x: np.ndarray) -> float:
+    """The largest number, by which what hangs on no unit may be divided; 1 where there is none."""
+    size = float(np.max(np.abs(x), initial=0.0))
+    return size if size > 0 and np.isfinite(size) else 1.0
 
 
 def without(others: np.ndarray, x: np.ndarray) -> np.ndarray:

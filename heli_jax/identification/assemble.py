@@ -69,7 +69,6 @@ from heli_jax.identification.validation.feedback import (
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
 from heli_jax.identification.validation.metrics import Whiteness, metrics
-from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
 from heli_jax.identification.validation.unmodelled import unmodelled, with_unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
@@ -89,6 +88,8 @@ class OptimizationRun(NamedTuple):
     seed: int
     timing: dict[str, float]
     """[s], by what was done"""
+    doubts: tuple[str, ...] = ()
+    """why no model of these records is adequate, in a few words each"""
 
 
 def noise_by_name(
@@ -253,7 +254,7 @@ def assemble(
         whiteness=white,
         adequacy=adequacy.doubted(
             # What is wrong with the record makes any mode: that one is no reason of its own then.
-            record_doubts(problem) or [mode.words for mode in fast if mode.undetermined]
+            run.doubts or [mode.words for mode in fast if mode.undetermined]
         )._replace(at_optimum=status != "not-converged"),
         coloured=errors.coloured,
         responses=responses,

@@ -52,14 +52,12 @@ from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
-from heli_jax.identification.validation.misread import clipped, dropouts, misread
-from heli_jax.identification.validation.odd_flights import odd_flights
+from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.other_hold import other_hold
 from heli_jax.identification.validation.record_windows import Ranking, rank_windows
 from heli_jax.identification.validation.signal_signs import (
     against_start,
     contradictions,
-    rate_against_angle,
     sticks_of,
 )
 from heli_jax.stages import stage
@@ -254,14 +252,12 @@ def fit(
     points = _starts(guess, problem, starts, seed)
     with stage(words):
         search, optima, optimum = _search(problem, guess, points, max_steps, report)
-    doubted = [one.finding for one in (*misread(problem), *dropouts(problem), *clipped(problem))]
-    doubted += rate_against_angle(problem)
-    doubted += [one.finding for one in odd_flights(problem.training)]
-    said = (*cautions(problem), *(f.sentence for f in doubted))
+    doubts = record_doubts(problem)
+    said = (*cautions(problem), *(f.sentence for f in doubts.findings))
     optimum = optimum._replace(notes=(*said, *optimum.notes))
     timing = {"fit": time.perf_counter() - began}
     with stage("intervals and verdicts"):
-        run = OptimizationRun(before, points, optima, seed, timing)
+        run = OptimizationRun(before, points, optima, seed, timing, tuple(doubts.words))
         return _with_turned_sticks(problem, guess, assemble(problem, search, optimum, run))
 
 

@@ -12,7 +12,7 @@ import scipy.linalg
 from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint
-from heli_jax.analysis.spectra import partial_coherence, segment_transforms, without
+from heli_jax.analysis.spectra import partial_coherence, segment_transforms, size_of, without
 from heli_jax.dynamics.model import Model
 from heli_jax.identification.fit import Fit
 from heli_jax.identification.result import Signals
@@ -136,9 +136,11 @@ def _coherence(record: _Spectra, j: int, H: np.ndarray) -> Coherence:
     # have its way, and a plain mean over frequencies would be that of the noise.
     # Infinite where a pole lies on the unit circle at one of the frequencies: that one is left out.
     weights = np.nan_to_num(np.abs(H) ** 2 * power, posinf=0.0)
-    total = float(np.sum(np.abs(record.simulated) ** 2))
+    # Over its own size: the squares of a simulation that diverged would be no numbers.
+    size = size_of(record.simulated)
+    total = float(np.sum(np.abs(record.simulated / size) ** 2))
     # By Parseval the sums over frequencies are powers, with the same factor above and below.
-    share = float(np.sum(weights)) / total if total > 0 else 0.0
+    share = float(np.sum(weights)) / size / size / total if total > 0 else 0.0
     # The simulated output has neither noise nor disturbance: its coherence is what could be seen.
     value, expected = (
         _mean(partial_coherence(others, record.inputs[:, :, j], y), weights)

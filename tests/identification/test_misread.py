@@ -74,27 +74,27 @@ def test_a_unit_against_that_of_the_file_is_doubted(load, size):
     assert "p is read as rad/s, as configured, where the file says 'deg/s' of 'p'" in first
     assert "p is 57.3 times as large as it was" in first
     assert len(more) == 1
-    assert record_doubts(found) == ["p looks like deg/s read as rad/s"]
+    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
     # What is small either way is doubted, and no reason by itself.
     small = of(flights(load(0.1 * P, unit="deg/s", unit_of_p="rad/s")))
     assert len(misread(small)) == 1
-    assert record_doubts(small) == []
+    assert record_doubts(small).words == []
     assert misread(of(flights(load(np.degrees(P), unit="deg/s", unit_of_p="deg/s")))) == []
 
 
 def test_degrees_that_are_read_as_radians_are_doubted(load):
     found = of(flights(load(np.degrees(P))))
-    assert record_doubts(found) == ["p looks like deg/s read as rad/s"]
+    assert record_doubts(found).words == ["p looks like deg/s read as rad/s"]
     [one] = misread(found)
     assert "state unit: deg/s" in one.finding.sentence
-    assert record_doubts(of(flights(load(P)))) == []
+    assert record_doubts(of(flights(load(P)))).words == []
 
 
 def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p = P.copy()
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
     found = of(flights(load(p)))
-    assert record_doubts(found) == ["dropouts of p are taken for measurements"]
+    assert record_doubts(found).words == ["dropouts of p are taken for measurements"]
     [one] = dropouts(found)
     assert "state missing: 0 beside its signal" in one.finding.sentence
     [flight] = flights(load(p, missing=0))
@@ -119,7 +119,9 @@ def test_flat_tops_are_no_measurements(load):
     for limit, reasons in ((0.4, ["p is cut off in "]), (np.inf, [])):
         problem = of(flights(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s")))
         assert len(clipped(problem)) == len(reasons)
-        assert [said[: len(reasons[0])] for said in record_doubts(problem) if reasons] == reasons
+        assert [
+            said[: len(reasons[0])] for said in record_doubts(problem).words if reasons
+        ] == reasons
 
 
 def test_a_roll_that_was_flown_is_no_wrong_unit():

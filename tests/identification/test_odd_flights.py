@@ -64,7 +64,7 @@ def test_a_spoilt_flight_is_named(spoilt, count):
         sentences = [f.sentence for f in bands(flights)]
         assert sentences[0] == odd.finding.sentence
         assert NOTHING_FOLLOWS not in sentences
-        assert record_doubts(problem(*flights)) == [
+        assert record_doubts(problem(*flights)).words == [
             f"flight {count} does not answer its inputs as the other flights do"
         ]
 

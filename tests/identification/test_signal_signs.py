@@ -122,8 +122,8 @@ def test_an_angle_against_its_rate_is_a_reason_against_the_model():
         flight = Flight(dt=DT, inputs={"u": u, "v": u}, outputs={"phi": phi, "p": p})
         return problem(flight)
 
-    assert contradictions(of(phi)) == record_doubts(of(phi)) == []
-    assert record_doubts(of(-phi)) == ["phi runs against the integral of p"]
+    assert contradictions(of(phi)) == record_doubts(of(phi)).words == []
+    assert record_doubts(of(-phi)).words == ["phi runs against the integral of p"]
     assert contradictions(of(phi / DEGREE)) == ["phi moves 57.3 times as far as the integral of p"]
 
 

@@ -70,6 +70,16 @@ def gates(flown, **changed):
     return {g.of.removesuffix(", flight 1"): g for g in card._of_excitation(problem, fit)}
 
 
+def test_a_coherence_has_no_size():
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal((2, 5, 12)) + 1j * rng.standard_normal((2, 5, 12))
+    others = rng.standard_normal((5, 12, 1)) + 0j
+    plain = partial_coherence(others, u, y)
+    # The squares of such numbers overflow, as those of a simulation that diverged.
+    np.testing.assert_allclose(partial_coherence(others, u, 1e200 * y), plain, rtol=1e-12)
+    np.testing.assert_allclose(partial_coherence(others, 1e-200 * u, y), plain, rtol=1e-12)
+
+
 def test_a_noise_free_flight_of_the_exact_model_fails_no_gate(flown):
     found = gates(flown)
     assert len(found) == 25

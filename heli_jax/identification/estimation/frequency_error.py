@@ -173,7 +173,9 @@ class FrequencyError(Estimator):
         whitening = whitening_by(machine_of(layout, data, z), errors)
         # Biases and initial states are in none of these rows: the simulation in time has them.
         z = in_time(layout, data, noise, z)
-        logs = np.concatenate([-2.0 * np.linalg.slogdet(W)[1] for W in whitening])
+        # Records of one length have one spectrum.
+        by_id = {id(W): -2.0 * np.linalg.slogdet(W)[1] for W in whitening}
+        logs = np.concatenate([by_id[id(W)] for W in whitening])
         of_flight = [record.flight for record in records_of(layout)]
         sd = []
         for i, names in enumerate(layout.outputs):
@@ -198,7 +200,9 @@ class FrequencyError(Estimator):
         # A row for each unknown of interest, and one for all that is left of the errors.
         rows = np.asarray(e.r)[: len(layout.of_interest) + 1]
         squares = float(np.sum(np.square(rows)))
-        logs = sum(float(np.sum(np.linalg.slogdet(np.asarray(W))[1])) for W in noise.whitening)
+        by_id = {id(W): W for W in noise.whitening}
+        by_id = {k: float(np.sum(np.linalg.slogdet(np.asarray(W))[1])) for k, W in by_id.items()}
+        logs = sum(by_id[id(W)] for W in noise.whitening)
         lines = sum(r.lines * len(layout.outputs[r.flight]) for r in records_of(layout))
         return 2.0 * logs - 0.5 * squares - lines * float(np.log(np.pi))
 

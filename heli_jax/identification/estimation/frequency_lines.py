@@ -25,6 +25,8 @@ from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknown
 from heli_jax.simulation.hold import linear_inputs
 from heli_jax.simulation.stepping import held_columns
 
+_TOGETHER = 4
+"""flights of one machine side by side at most"""
 _NO_END = 1e-10
 """part of the largest effect of an end's state below which a state has none"""
 
@@ -156,21 +158,28 @@ def by_flight(
     common: Any,
     each: Any,
 ) -> Any:
-    """`body(prepared(common), one of each)` of every flight of a group, with a leading axis.
+    """`body(prepared(common), some of each)` over the flights of a group, with a leading axis.
 
     Args:
         data: the numbers of the problem.
         members: the flights' numbers.
         prepared: what of it is the same for flights that have one machine.
-        body: of one flight.
+        body: of a few flights, which have a leading axis in what it is given and what it returns.
         common: of the machine; with a leading axis where each flight has its own.
         each: of the flights, with a leading axis.
     """
-    # One after another: what is on the way to a few sums of a flight is larger than any cache.
-    if _one_machine(data, members):
+    count = len(members)
+    one_machine = _one_machine(data, members)
+    # A few at a time: what is read for every line of a machine is then read once for all of them,
+    # and what is on the way to a few sums of a flight still fits into memory.
+    size = max(n for n in range(1, _TOGETHER + 1) if count % n == 0) if one_machine else 1
+    some = jax.tree.map(lambda v: v.reshape(count // size, size, *v.shape[1:]), each)
+    if one_machine:
         ready = prepared(common)
-        return jax.lax.map(lambda one: body(ready, one), each)
-    return jax.lax.map(lambda one: body(prepared(one[0]), one[1]), (common, each))
+        made = jax.lax.map(lambda of: body(ready, of), some)
+    else:
+        made = jax.lax.map(lambda of: body(prepared(of[0]), of[1]), (common, some))
+    return jax.tree.map(lambda v: v.reshape(count, *v.shape[2:]), made)
 
 
 def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) -> Resolved:
@@ -243,26 +252,31 @@ def at_lines(record: Record, v: Float[Array, "N c"]) -> Complex[Array, "K c"]:
     return jnp.fft.rfft(part, axis=0)[1 : 1 + record.lines] * float(record.samples) ** -0.5
 
 
-def errors(
-    at: Resolved, m: Matrices, record: Record, signals: Signals, y: Float[Array, "N p"]
+def errors_of_some(
+    at: Resolved, m: Matrices, record: Record, signals: Signals, y: Float[Array, "f N p"]
 ) -> Errors:
-    """Of one record.
+    """Of one record of each of a few flights of one machine, with a leading axis.
 
     Args:
-        at: the machine at its lines.
+        at: the machine at the record's lines.
         m: the machine.
         record: which samples it is.
-        signals: over the whole flight.
+        signals: over the whole flights.
         y: what was measured.
     """
-    lines = Signals(*(at_lines(record, v) for v in signals))
-    passing = lines.acting @ m.D.T.astype(at.z.dtype)
-    driving = lines.U @ m.B.T.astype(at.z.dtype)
-    rest = _times(at.W, at_lines(record, y) - passing)
-    white = rest - _times(at.H, driving)
-    d = at.solution @ (at.Q.T @ white.reshape(-1))
-    driving = driving + at.z[:, None] * d.astype(at.z.dtype)[None, :]
-    return Errors(rest - _times(at.H, driving), states(at, driving), lines)
+
+    def of_one(signals: Signals, y: Float[Array, "N p"]) -> Errors:
+        lines = Signals(*(at_lines(record, v) for v in signals))
+        passing = lines.acting @ m.D.T.astype(at.z.dtype)
+        driving = lines.U @ m.B.T.astype(at.z.dtype)
+        rest = _times(at.W, at_lines(record, y) - passing)
+        white = rest - _times(at.H, driving)
+        d = at.solution @ (at.Q.T @ white.reshape(-1))
+        driving = driving + at.z[:, None] * d.astype(at.z.dtype)[None, :]
+        return Errors(rest - _times(at.H, driving), states(at, driving), lines)
+
+    # Under vmap flights are columns of the same products and substitutions.
+    return jax.vmap(of_one)(signals, y)
 
 
 def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"]:
@@ -317,17 +331,18 @@ def errors_of_lines(
         def ready(m: Matrices, parts: Any = parts) -> Any:
             return m, [resolved(m, record, W) for record, W in parts]
 
-        def of_one(common: Any, one: Any, parts: Any = parts) -> list[Array]:
+        def of_some(common: Any, some: Any, parts: Any = parts) -> list[Array]:
             m, ats = common
             made = []
             for at, (record, W) in zip(ats, parts, strict=True):
-                rows = errors(at, m, record, *one).rows.reshape(record.lines, 2, -1)
-                white = jax.lax.complex(rows[:, 0], rows[:, 1])
-                made.append(jnp.linalg.solve(W, white[:, :, None])[:, :, 0])
+                rows = errors_of_some(at, m, record, *some).rows
+                rows = rows.reshape(rows.shape[0], record.lines, 2, -1)
+                white = jax.lax.complex(rows[:, :, 0], rows[:, :, 1])
+                made.append(jnp.einsum("kij,fkj->fki", jnp.linalg.inv(W), white))
             return made
 
         each = (machines.signals, y)
-        made = by_flight(data, members, ready, of_one, machines.matrices, each)
+        made = by_flight(data, members, ready, of_some, machines.matrices, each)
         for k, i in enumerate(members):
             found[i] = [v[k] for v in made]
     return [one for i in range(len(data.flights)) for one in found[i]]

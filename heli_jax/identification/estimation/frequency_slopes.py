@@ -22,7 +22,7 @@ from heli_jax.identification.estimation.frequency_lines import (
     alike,
     at_lines,
     by_flight,
-    errors,
+    errors_of_some,
     machines_of,
     measured,
     parts_of_group,
@@ -48,7 +48,7 @@ class Products(NamedTuple):
 
 
 class _Driven(NamedTuple):
-    """Lines of one record: the states, what drives them, and the derivatives of that."""
+    """Lines of a record: the states, what drives them, and the derivatives of that."""
 
     X: Complex[Array, "K n"]
     lines: Signals
@@ -56,15 +56,21 @@ class _Driven(NamedTuple):
     """(K, c, q); None for those that do not move"""
 
 
-class _Block(NamedTuple):
-    """Lines of one record with all that their products are made of."""
+class _Shared(NamedTuple):
+    """Of a record's lines what flights of one machine have in common."""
 
     H: Float[Array, "K 2p 2n"]
     W: Float[Array, "K 2p 2p"]
     Q: Float[Array, "K 2p n"]
+
+
+class _Own(NamedTuple):
+    """What each flight has of its own."""
+
     e: Float[Array, "K 2p"]
-    own: _Driven
-    by: _Driven | None
+    driven: _Driven
+    by: _Driven | None = None
+    """by instrument, where that is what Z is of"""
 
 
 class _Sums(NamedTuple):
@@ -118,67 +124,95 @@ def products_of_lines(
             m, dm = common
             return m, dm, [resolved(m, record, W) for record, W in parts]
 
-        def of_one(common: Any, one: Any, parts: Any = parts) -> Products:
+        def of_some(common: Any, some: Any, parts: Any = parts) -> Products:
             m, dm, ats = common
-            signals, ds, by, dby, y = one
             made = []
             for at, (record, _) in zip(ats, parts, strict=True):
-                e = errors(at, m, record, signals, y)
-                own, other = _Driven(e.X, e.signals, _lines(record, ds)), None
-                if by is not None:
-                    other = _driven_by(at, m, record, by, dby)
-                Q = at.Q.reshape(*e.rows.shape, -1)
-                whole = _Block(at.H, at.W, Q, e.rows, own, other)
-                made.append(_summed(m, dm, noise.by_instrument, whole).products())
+                sums = _of_record((at, m, dm), record, noise.by_instrument, *some)
+                made.append(jax.vmap(_Sums.products)(sums))
             return jax.tree.map(lambda *v: sum(v), *made)
 
-        each = (machines.signals, slopes.signals, machines.by, slopes.by)
-        each = (*each, measured(layout, data, members))
+        given = (machines.signals, slopes.signals, measured(layout, data, members))
+        each = (given, None if machines.by is None else (machines.by, slopes.by))
         common = (machines.matrices, slopes.matrices)
-        made = by_flight(data, members, ready, of_one, common, each)
+        made = by_flight(data, members, ready, of_some, common, each)
         total.append(jax.tree.map(lambda v: jnp.sum(v, axis=0), made))
     return jax.tree.map(lambda *v: sum(v), *total)
 
 
-def _driven_by(at: Resolved, m: Matrices, record: Record, by: Signals, dby: Signals) -> _Driven:
-    lines = Signals(*(at_lines(record, v) for v in by))
-    X = states(at, lines.U @ m.B.T.astype(at.z.dtype))
-    return _Driven(X, lines, _lines(record, dby))
+def _of_record(
+    common: tuple[Resolved, Matrices, Matrices],
+    record: Record,
+    by_instrument: Array,
+    given: tuple[Signals, Signals, Array],
+    instruments: tuple[Signals, Signals] | None,
+) -> _Sums:
+    """Of one record of a few flights, with a leading axis.
+
+    Args:
+        common: the machine at the lines, itself, and its derivatives.
+        record: which samples it is.
+        by_instrument: whether instruments are used.
+        given: the inputs, their derivatives, and what was measured.
+        instruments: the inputs by instrument and their derivatives.
+    """
+    (at, m, dm), (signals, ds, y) = common, given
+    e = errors_of_some(at, m, record, signals, y)
+    driven = jax.vmap(lambda e, ds: _Driven(e.X, e.signals, _lines(record, ds)))(e, ds)
+    lines = _Shared(at.H, at.W, at.Q.reshape(*e.rows.shape[1:], -1))
+
+    def directly() -> _Sums:
+        return _summed(m, dm, lines, _Own(e.rows, driven))
+
+    if instruments is None:
+        return directly()
+
+    def driven_by(by: Signals, dby: Signals) -> _Driven:
+        of_lines = Signals(*(at_lines(record, v) for v in by))
+        X = states(at, of_lines.U @ m.B.T.astype(at.z.dtype))
+        return _Driven(X, of_lines, _lines(record, dby))
+
+    def with_instruments() -> _Sums:
+        return _summed(m, dm, lines, _Own(e.rows, driven, jax.vmap(driven_by)(*instruments)))
+
+    # One program for both: the direct estimate is where the search by instrument begins.
+    return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
 
 
-def _summed(m: Matrices, dm: Matrices, by_instrument: Array, whole: _Block) -> _Sums:
+def _summed(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
     """Over all lines, some hundred at a time: the derivatives of all would leave every cache."""
-    K = whole.e.shape[0]
+    K = lines.H.shape[0]
     count = -(-K // _BLOCK)
     size = -(-K // count)
 
-    def blocks(v: Array) -> Array:
+    def blocks(v: Array, axis: int) -> Array:
         # Lines of zeros add nothing.
-        v = jnp.pad(v, [(0, count * size - K)] + [(0, 0)] * (v.ndim - 1))
-        return v.reshape(count, size, *v.shape[1:])
+        widths = [(0, 0)] * v.ndim
+        widths[axis] = (0, count * size - K)
+        v = jnp.pad(v, widths).reshape(*v.shape[:axis], count, size, *v.shape[axis + 1 :])
+        return jnp.moveaxis(v, axis, 0)
 
-    def made(block: _Block) -> _Sums:
-        return _sums(m, dm, by_instrument, block)
+    def made(block: tuple[_Shared, _Own]) -> _Sums:
+        return jax.lax.map(lambda one: _sums(m, dm, block[0], one), block[1])
 
-    def more(total: _Sums, block: _Block) -> tuple[_Sums, None]:
+    def more(total: _Sums, block: tuple[_Shared, _Own]) -> tuple[_Sums, None]:
         return jax.tree.map(jnp.add, total, made(block)), None
 
-    stacked_blocks = jax.tree.map(blocks, whole)
+    shared = jax.tree.map(lambda v: blocks(v, 0), lines)
+    stacked_blocks = (shared, jax.tree.map(lambda v: blocks(v, 1), own))
     shapes = jax.eval_shape(made, jax.tree.map(lambda v: v[0], stacked_blocks))
     zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
     return jax.lax.scan(more, zeros, stacked_blocks)[0]
 
 
-def _sums(m: Matrices, dm: Matrices, by_instrument: Array, block: _Block) -> _Sums:
-    J = Z = _slopes(block, m, dm, block.own)
-    if block.by is not None:
-        # One program for both: the direct estimate is where the search by instrument begins.
-        by = block.by
-        Z = jax.lax.cond(by_instrument > 0.5, lambda: _slopes(block, m, dm, by), lambda: J)
+def _sums(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
+    J = Z = _slopes(lines, m, dm, own.driven)
+    if own.by is not None:
+        Z = _slopes(lines, m, dm, own.by)
     # J and Z are minus the derivatives: a sign that `products` gives back to Z e.
     q = J.shape[2]
-    e, J, Z = block.e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
-    Q = block.Q.reshape(e.size, -1)
+    e, J, Z = own.e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
+    Q = lines.Q.reshape(e.size, -1)
     return _Sums(e @ e, e @ Z, Z.T @ Z, Z.T @ J, Q.T @ e, Q.T @ Z, Q.T @ J)
 
 
@@ -192,11 +226,11 @@ def _lines(record: Record, ds: Signals) -> Signals:
     return jax.tree.map(lines, ds)
 
 
-def _slopes(block: _Block, m: Matrices, dm: Matrices, of: _Driven) -> Float[Array, "K a q"]:
+def _slopes(lines: _Shared, m: Matrices, dm: Matrices, of: _Driven) -> Float[Array, "K a q"]:
     """The derivatives of the whitened response, real parts and imaginary ones."""
     driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
     passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
-    made = [M @ v for M, v in ((block.H, driving), (block.W, passing)) if v is not None]
+    made = [M @ v for M, v in ((lines.H, driving), (lines.W, passing)) if v is not None]
     return made[0] if len(made) == 1 else made[0] + made[1]
 
 

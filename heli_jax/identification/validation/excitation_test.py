@@ -25,7 +25,6 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import CHANCE, EXPLAINED, Adequacy
 from heli_jax.identification.validation.metrics import Metrics
-from heli_jax.numbers import explained_text
 
 LEVEL = 0.01
 """of the test of all outputs together"""
@@ -41,6 +40,13 @@ class Followed(NamedTuple):
     p_value: float
     explained: float
     """part of the output's power that follows the excitation which the model explains"""
+
+
+def _in_words(followed: Followed) -> str:
+    part = f"{100 * followed.explained:.0f} % explained"
+    # No share of anything: with no model at all less would be left.
+    part = part if followed.explained >= 0.0 else "the model is worse there than none"
+    return f"p {followed.p_value:.2g}, {part}"
 
 
 def by_excitation(
@@ -62,10 +68,7 @@ def by_excitation(
     failed = {n: f for n, f in followed.items() if f.p_value < LEVEL / len(followed)}
     bad = [n for n, f in failed.items() if not f.explained >= EXPLAINED]
     what = "the excitation" if at.data.flights[0].by_instrument is not None else "the inputs"
-    numbers = ", ".join(
-        f"{n} (p {f.p_value:.2g}, {explained_text(f.explained)} explained)"
-        for n, f in failed.items()
-    )
+    numbers = ", ".join(f"{n} ({_in_words(f)})" for n, f in failed.items())
     said = (
         f"The residual still follows {what} in {numbers}: the model, or its estimates, are wrong "
         "there, and no interval allows for that."

@@ -21,7 +21,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.odd_flights import odd_flights
 from heli_jax.identification.validation.signal_quality import cut_off, dropout_words, facts_of
-from heli_jax.identification.validation.signal_signs import contradictions
+from heli_jax.identification.validation.signal_signs import contradictions, rate_against_angle
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
 """rad and rad/s that a small helicopter does not exceed, but for its heading"""
@@ -60,12 +60,31 @@ def misread(problem: Problem) -> list[Misread]:
     ]
 
 
-def record_doubts(problem: Problem) -> list[str]:
-    """Why no model of these numbers is adequate, each reason in a few words."""
-    found = (*misread(problem), *dropouts(problem), *clipped(problem))
+class RecordDoubts(NamedTuple):
+    """What is wrong with the records themselves."""
+
+    findings: list[Finding]
+    words: list[str]
+    """why no model of these numbers is adequate, each reason in a few words"""
+
+
+def record_doubts(problem: Problem) -> RecordDoubts:
+    """All that is doubtful of the fitted flights, apart from any model's fit.
+
+    Args:
+        problem: the flights, and the model, whose axes name headings.
+    """
+    found = [*misread(problem), *dropouts(problem), *clipped(problem)]
+    odd = odd_flights(problem.training)
     words = dict.fromkeys(one.words for one in found if one.words)
-    odd = [one.words for one in odd_flights(problem.training)]
-    return [*words, *contradictions(problem), *odd]
+    return RecordDoubts(
+        [
+            *(one.finding for one in found),
+            *rate_against_angle(problem),
+            *(one.finding for one in odd),
+        ],
+        [*words, *contradictions(problem), *(one.words for one in odd)],
+    )
 
 
 def dropouts(problem: Problem) -> list[Misread]:
