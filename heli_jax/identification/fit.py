@@ -274,9 +274,11 @@ def _search(
         problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
     )
     # Residuals at the first start are those of the first guess.
-    same = bool(np.array_equal(points[0], guess.z))
+    begun = layout.estimator.begins_with(data)
+    same = begun is data and bool(np.array_equal(points[0], guess.z))
     known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
-    optima = search.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
+    first = starting.Search(problem, layout, begun, search.max_steps)
+    optima = first.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
