@@ -97,7 +97,8 @@ def first_guess(problem: Problem) -> FirstGuess:
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
-    z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
+    begun = layout.estimator.begins_with(data)
+    z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
