@@ -308,4 +308,16 @@ def cautions(problem: Problem) -> tuple[str, ...]:
     return (
         *(f"{label}: {caution}" for caution, label in said.items()),
         *((f"{own_said(own)}; it is not used.",) if own else ()),
+        *_whole_band(problem),
+    )
+
+
+def _whole_band(problem: Problem) -> tuple[str, ...]:
+    """That a band which is stated is none of the fit's."""
+    estimator, band = estimator_of(problem.method), problem.frequency.band
+    if band is None or not estimator.noise_spectrum or estimator.fits_responses:
+        return ()
+    return (
+        f"frequency.band ({band[0]:g} to {band[1]:g} Hz) is that of the report's responses alone: "
+        "frequency error uses all frequencies of a record. frequency-response fits within a band.",
     )

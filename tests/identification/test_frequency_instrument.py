@@ -6,6 +6,7 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
+from heli_jax.analysis.response_options import ResponseOptions
 from heli_jax.identification.estimation.data import data_of
 from heli_jax.identification.estimation.frequency_instrument import (
     as_instruments_have_it,
@@ -18,6 +19,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
 )
+from heli_jax.identification.fit import cautions
 from heli_jax.identification.model_selection import choose
 from heli_jax.identification.result import Fit
 from heli_jax.identification.validation.excitation_test import _in_bands
@@ -166,6 +168,14 @@ def test_an_instrument_that_is_not_there_is_refused(leaning):
         problem(leaning, [flight], instrument=("lot",))
     with pytest.raises(ValueError, match="takes no input by an instrument"):
         problem(leaning, [flight], instrument=("lat",), method="output-error")
+
+
+def test_a_band_that_the_fit_does_not_keep_to_is_told(leaning):
+    band = ResponseOptions(band=(0.2, 5.0))
+    for method, said in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
+        asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
+        assert sum("(0.2 to 5 Hz)" in note for note in cautions(asked)) == said
+    assert not any("Hz" in note for note in cautions(problem(leaning, [flown(1, 1000)])))
 
 
 def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
