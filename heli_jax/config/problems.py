@@ -150,7 +150,8 @@ def _responses(experiment: Experiment) -> ResponseOptions:
                     f"{experiment.path}: frequency.{key}: is for fit.method: frequency-response, "
                     f"got {method.method}"
                 )
-        return ResponseOptions()
+        # Nothing is fitted within it, which the fit says.
+        return ResponseOptions(band=None if config is None else config.band)
     if config is None:
         return ResponseOptions()
     pairs = tuple(PairOptions(**dict(p)) for p in config.pairs or ())

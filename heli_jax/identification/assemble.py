@@ -32,6 +32,7 @@ from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit, Signals, Status
 from heli_jax.identification.uncertainty.estimates import (
+    delay_doubts,
     estimates_of,
     flight_nuisances,
     limit_notes,
@@ -221,6 +222,7 @@ def assemble(
         sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
         lacking = unmodelled(solution, e, sds, coloured=in_colour)
         adequacy = with_unmodelled(adequacy, lacking)
+    adequacy = adequacy.doubted([*adequacy.doubts, *delay_doubts(problem, estimates)])
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False

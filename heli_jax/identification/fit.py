@@ -101,7 +101,8 @@ def first_guess(problem: Problem) -> FirstGuess:
     layout = layout_of(problem, problem.training)
     data = data_of(problem, problem.training, layout)
     noise = first_noise(problem, problem.training)
-    z = starting.first_guess(layout, data, noise, start_vector(layout, data, problem))
+    begun = layout.estimator.begins_with(data)
+    z = starting.first_guess(layout, begun, noise, start_vector(layout, data, problem))
     e = evaluate(layout, data, noise, z)
     level = layout.estimator.with_level(data, e, noise)
     # The same object where a method keeps the noise as it is, so that nothing is evaluated twice.
@@ -290,9 +291,11 @@ def _search(
         problem, layout, data, min(max_steps, _FIRST_STEPS) if disturbed else max_steps
     )
     # Residuals at the first start are those of the first guess.
-    same = bool(np.array_equal(points[0], guess.z))
+    begun = layout.estimator.begins_with(data)
+    same = begun is data and bool(np.array_equal(points[0], guess.z))
     known = (jnp.asarray(guess.e.r), jnp.asarray(guess.e.J)) if same else None
-    optima = search.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
+    first = starting.Search(problem, layout, begun, search.max_steps)
+    optima = first.run(noise, points, report, nearing=layout.estimator.nearing, known=known)
     best, notes = min(optima, key=starting.rank), ()
     # Before the noise is relaxed, which would take the error of a simulation that diverges for it.
     shooting = by_windows(problem, search, noise, guess.e, guess.z, best)
@@ -321,4 +324,16 @@ def cautions(problem: Problem) -> tuple[str, ...]:
     return (
         *(f"{label}: {caution}" for caution, label in said.items()),
         *((f"{own_said(own)}; it is not used.",) if own else ()),
+        *_whole_band(problem),
+    )
+
+
+def _whole_band(problem: Problem) -> tuple[str, ...]:
+    """That a band which is stated is none of the fit's."""
+    estimator, band = estimator_of(problem.method), problem.frequency.band
+    if band is None or not estimator.noise_spectrum or estimator.fits_responses:
+        return ()
+    return (
+        f"frequency.band ({band[0]:g} to {band[1]:g} Hz) is that of the report's responses alone: "
+        "frequency error uses all frequencies of a record. frequency-response fits within a band.",
     )

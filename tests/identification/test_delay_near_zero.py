@@ -9,7 +9,7 @@ import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, fit
 from heli_jax.identification.result import Estimate
-from heli_jax.identification.uncertainty.estimates import delay_notes
+from heli_jax.identification.uncertainty.estimates import delay_doubts, delay_notes
 from heli_jax.naming import Scalar
 from heli_jax.simulation.inputs import random_steps
 
@@ -98,3 +98,7 @@ def test_a_delay_below_zero_is_told():
     assert (
         delay_notes(problem, {"tau": Estimate(0.1, 0.01, 0.08, 0.12, "s", 0.03, 0.0, False)}) == []
     )
+    # By more than a sample no hold explains it, and the model is not adequate.
+    for high, doubts in ((-0.03, ["by tau = -40 ms it answers before its input"]), (-0.01, [])):
+        estimate = Estimate(-0.04, 0.005, -0.05, high, "s", 0.03, 0.0, False)
+        assert delay_doubts(problem, {"tau": estimate}) == doubts

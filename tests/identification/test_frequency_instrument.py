@@ -6,7 +6,12 @@ import pytest
 import scipy.linalg
 
 from heli_jax import Flight, Free, Nuisance, Problem, fit, linear_model
-from heli_jax.identification.estimation.frequency_instrument import following
+from heli_jax.analysis.response_options import ResponseOptions
+from heli_jax.identification.estimation.data import data_of
+from heli_jax.identification.estimation.frequency_instrument import (
+    as_instruments_have_it,
+    following,
+)
 from heli_jax.identification.estimation.frequency_rows import _weighed
 from heli_jax.identification.estimation.frequency_slopes import _Sums
 from heli_jax.identification.estimation.frequency_spectrum import smoothed
@@ -14,8 +19,10 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
 )
+from heli_jax.identification.fit import cautions
 from heli_jax.identification.model_selection import choose
 from heli_jax.identification.result import Fit
+from heli_jax.identification.validation.excitation_test import _in_bands
 
 DT = 0.04
 LEANING = """
@@ -163,6 +170,107 @@ def test_an_instrument_that_is_not_there_is_refused(leaning):
         problem(leaning, [flight], instrument=("lat",), method="output-error")
 
 
+def test_a_band_that_the_fit_does_not_keep_to_is_told(leaning):
+    band = ResponseOptions(band=(0.2, 5.0))
+    for method, said in (("frequency-error", 1), ("frequency-response", 0), ("output-error", 0)):
+        asked = problem(leaning, [flown(1, 1000)], method=method, frequency=band)
+        assert sum("(0.2 to 5 Hz)" in note for note in cautions(asked)) == said
+    assert not any("Hz" in note for note in cautions(problem(leaning, [flown(1, 1000)])))
+
+
 def test_estimates_by_instrument_are_not_compared_by_likelihood(leaning):
     with pytest.raises(ValueError, match="no likelihood to be compared by"):
         choose({"one": problem(leaning, [flown(1, 400)])})
+
+
+HELD = """
+name: held
+states: {phi: rad, p: rad/s, b: rad}
+inputs: {lat: "1"}
+outputs: {phi: rad}
+parameters:
+  Lb: {value: 100.0, unit: 1/s^2, positive: true}
+  tau: {value: 0.1, unit: s, positive: true}
+  B: {value: 0.15, unit: rad}
+A:
+  phi: {p: 1}
+  p: {b: Lb}
+  b: {p: -1, b: -1/tau}
+B: {b: {lat: B/tau}}
+"""
+OF_HELD = {"Lb": 100.0, "tau": 0.1, "B": 0.15}
+
+
+def held(seed: int, n: int = 3000, late: int = 0) -> Flight:
+    """A machine whose attitude a controller with an integral holds in slow gusts, with a sweep; its
+    input acts so many samples after it was logged."""
+    rng = np.random.default_rng(seed)
+    Lb, tau, B = OF_HELD.values()
+    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, Lb], [0.0, -1.0, -1.0 / tau]])
+    M = np.zeros((5, 5))
+    M[:3, :3], M[2, 3], M[1, 4] = A, B / tau, 1.0
+    E, keeps, t = scipy.linalg.expm(M * DT), np.exp(-DT / 0.8), DT * np.arange(n)
+    rate = np.log(4.0 / 0.15) / t[-1]
+    sweep = 0.08 * np.sin(2.0 * np.pi * 0.15 * np.expm1(rate * t) / rate)
+    x, gust, integral, y, u = np.zeros(3), 0.0, 0.0, np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = x[0] + 2e-3 * rng.standard_normal()
+        error = -2.5 * x[0] - x[1]
+        integral += 0.25 * DT * error
+        u[k] = sweep[k] + 0.06 * error + integral
+        x = E[:3, :3] @ x + E[:3, 3] * u[max(k - late, 0)] + E[:3, 4] * gust
+        gust = keeps * gust + np.sqrt(1.0 - keeps**2) * rng.standard_normal()
+    return Flight(dt=DT, inputs={"lat": u}, outputs={"phi": y}, instruments={"lat": sweep})
+
+
+@pytest.mark.parametrize("late", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_search_does_not_go_astray_where_a_loop_holds_the_attitude(tmp_path, late):
+    # Below the sweep the input cancels the gusts and the attitude stays: no machine answers so, and
+    # least squares of the signals as they were measured lead far away, from the truth as well.
+    path = tmp_path / "held.yaml"
+    path.write_text(HELD)
+    made = linear_model(path)
+    free = {n: Free(v) for n, v in OF_HELD.items()}
+    nuisance = Nuisance(initial_state=False, bias=False, input_offset=False, time_shift=late > 0)
+    params, flights = made.vehicle().params, [held(3, late=late)]
+    found = fit(Problem(made.model, params, flights, free, nuisance, method="frequency-error"))
+    assert found.status == "converged"
+    assert found.adequacy.adequate
+    for name, one in found.estimates.items():
+        assert one.sd is not None
+        assert abs(one.value - OF_HELD[name]) < 3.0 * one.sd
+        assert one.sd < (0.2 if late else 0.1) * OF_HELD[name]
+    if late:
+        shift = found.nuisance["time_shift"]
+        assert shift.sd is not None
+        assert abs(shift.value - late * DT) < 3.0 * shift.sd < DT
+
+
+def test_a_response_far_larger_than_the_measured_one_explains_nothing():
+    rng = np.random.default_rng(5)
+    X, noise = (rng.standard_normal((300, 1)) + 1j * rng.standard_normal((300, 1)) for _ in "ab")
+    y = (X + 0.1 * noise)[:, 0]
+    # Of a response that is k X the residual's part of the measured power is (1 - k)^2.
+    for k in (0.0, 0.9, 6.0):
+        statistic, freedom, left, answer = _in_bands(y - k * X[:, 0], y, np.ones(300), X)
+        assert left / answer == pytest.approx((1.0 - k) ** 2, rel=0.02, abs=0.02)
+        assert statistic > 3.0 * freedom
+
+
+def test_outputs_follow_the_instruments_and_nothing_that_is_fed_back(leaning):
+    rng = np.random.default_rng(6)
+    r = np.convolve(rng.standard_normal(1500), np.ones(5) / 5, "same")
+    answer = np.convolve(r, [0.0, 0.5, 0.3, 0.2])[:1500]
+    calm = np.convolve(answer, [0.0, 0.4, 0.4, 0.2])[:1500]
+    gusts = rng.standard_normal(1500) * 0.5
+    outputs = {"p": calm - gusts, "phi": 2.0 * calm + gusts}
+    # Samples are missing: a straight line stands for them.
+    outputs["phi"][1000:1003] = np.nan
+    drive = {"inputs": {"lat": answer + gusts}, "instruments": {"lat": r}}
+    given = problem(leaning, [Flight(dt=DT, outputs=outputs, **drive)])
+    data = data_of(given, given.training)
+    before, after = data.flights[0], as_instruments_have_it(data).flights[0]
+    assert np.array_equal(after.inputs.lat, before.by_instrument.lat)
+    for name, y in (("p", calm), ("phi", 2.0 * calm)):
+        left = after.outputs[name] - np.mean(after.outputs[name]) - (y - y.mean())
+        assert np.std(left) < 0.25 * np.std(y)

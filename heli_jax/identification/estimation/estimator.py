@@ -2,9 +2,8 @@
 
 Everything around it asks only this: the optimiser squares and sums the rows, identifiability and
 intervals come from their Jacobian, the noise is relaxed from them. A method is one class with
-`residuals` and `records`, entered in `heli_jax.identification.methods`. What stands here besides is
-right for rows that are samples of every signal over its noise, one row a sample; a method whose
-rows are something else says what follows from them.
+`residuals` and `records`, entered in `heli_jax.identification.methods`. All else here is right for
+rows that are samples of every signal over its noise; a method of other rows says what follows.
 """
 
 import abc
@@ -162,6 +161,14 @@ class Estimator(abc.ABC):
             flights: those fitted.
         """
         return noise
+
+    def begins_with(self, data: Data) -> Data:
+        """What the first search goes by, other signals where those measured would mislead it.
+
+        Args:
+            data: the numbers.
+        """
+        return data
 
     def as_it_ends(self, data: Data, noise: Noise) -> Noise:
         """The noise to ask at the start values what a fit may determine, where a search begins by

@@ -29,6 +29,7 @@ from heli_jax.identification.estimation.estimator import Estimator, Evaluation, 
 from heli_jax.identification.estimation.frequency_gusts import machine_of, whitening_by
 from heli_jax.identification.estimation.frequency_instrument import (
     absent_instrument,
+    as_instruments_have_it,
     instrument_notes,
     instrumented_inputs,
 )
@@ -140,8 +141,19 @@ class FrequencyError(Estimator):
         # As if all of it were noise: each frequency by its own size. White noise would give all
         # the say to where the record is largest, gusts included.
         whitening = whitening_of(without_shared(s) for s in smoothed(measured))
-        # Directly at first: near that estimate the equations by instrument have one solution.
+        # Least squares at first: near that estimate the equations by instrument have one solution.
         return noise._replace(whitening=whitening, by_instrument=np.zeros(()))
+
+    def begins_with(self, data: Data) -> Data:
+        """By instrument what follows the instruments, of inputs and outputs.
+
+        Args:
+            data: the numbers of the problem.
+        """
+        # The equations by instrument have other solutions, far from the least squares of these, and
+        # what feedback makes of the signals as they were measured may lead to one.
+        by = data.flights[0].by_instrument is not None
+        return as_instruments_have_it(data) if by else data
 
     def as_it_ends(self, data: Data, noise: Noise) -> Noise:
         """By instrument, where there is one.

@@ -8,7 +8,7 @@ Sources: Söderström and Stoica (1983); Pintelon and Schoukens (2012), chapter 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -102,11 +102,51 @@ def following(
         names: the inputs in question.
         signals: by flight the signals, the same ones in each.
     """
-    U = [_lines(np.stack([f.inputs[n] for n in names], axis=1)) for f in flights]
-    R = [_lines(r) for r in signals]
-    m, out = len(names), []
+    made = _parts([np.stack([f.inputs[n] for n in names], axis=1) for f in flights], signals)
+    return tuple(
+        {**f.inputs, **dict(zip(names, columns.T, strict=True))}
+        for f, columns in zip(flights, made, strict=True)
+    )
+
+
+def as_instruments_have_it(data: Data) -> Data:
+    """The same flights as if nothing but the instruments moved them: inputs by instrument, and what
+    of the outputs follows those. Of gusts and noise chance's part alone is in them, and nothing of
+    what feedback makes of both: to begin a search with.
+
+    Args:
+        data: of a fit by instrument.
+    """
+    inputs = [naming.asdict(f.by_instrument) for f in data.flights]
+    moving = [n for n in inputs[0] if any(np.ptp(np.asarray(u[n])) > 0 for u in inputs)]
+    names = list(data.flights[0].outputs)
+    if not moving or any(list(f.outputs) != names for f in data.flights):
+        return data
+    outputs = [np.stack([_filled(f.outputs[n]) for n in names], axis=1) for f in data.flights]
+    made = _parts(outputs, [np.stack([np.asarray(u[n]) for n in moving], axis=1) for u in inputs])
+    flights = []
+    for f, columns in zip(data.flights, made, strict=True):
+        columns = columns.astype(f.outputs[names[0]].dtype)
+        by_name = dict(zip(names, columns.T, strict=True))
+        flights.append(f._replace(inputs=f.by_instrument, outputs=by_name))
+    return data._replace(flights=tuple(flights))
+
+
+def _filled(y: Any) -> Float[np.ndarray, " N"]:
+    """A signal with straight lines over what is missing."""
+    y = np.asarray(y)
+    at, seen = np.arange(y.size), np.isfinite(y)
+    return np.interp(at, at[seen], y[seen])
+
+
+def _parts(
+    of: Sequence[Float[np.ndarray, "N u"]], signals: Sequence[Float[np.ndarray, "N r"]]
+) -> list[Float[np.ndarray, "N u"]]:
+    """By flight what of some columns follows signals, about the columns' means."""
+    U, R = ([_lines(v) for v in one] for one in (of, signals))
+    m, out = U[0].shape[1], []
     spectra = smoothed([np.concatenate(v, axis=1) for v in zip(U, R, strict=True)], PART)
-    for flight, S, lines in zip(flights, spectra, R, strict=True):
+    for whole, S, lines in zip(of, spectra, R, strict=True):
         size = np.sqrt(np.real(np.einsum("kii->ki", S[:, m:, m:])))
         size = np.where(size > 0, size, 1.0)
         # In coherences, so that units do not count; two signals that move as one share an effect.
@@ -114,10 +154,8 @@ def following(
         shared = shared + _ALONE * np.eye(shared.shape[1])
         part = np.linalg.solve(shared, (lines / size)[:, :, None])[:, :, 0]
         estimate = np.einsum("kur,kr->ku", S[:, :m, m:] / size[:, None, :], part)
-        columns = _in_time(estimate, flight.n_samples)
-        by_name = {n: columns[:, j] + np.mean(flight.inputs[n]) for j, n in enumerate(names)}
-        out.append({**flight.inputs, **by_name})
-    return tuple(out)
+        out.append(_in_time(estimate, len(whole)) + whole.mean(axis=0))
+    return out
 
 
 def _lines(v: Float[np.ndarray, "N c"]) -> np.ndarray:

@@ -16,7 +16,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     optimise,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.noise_search import noise_guess_at
+from heli_jax.identification.estimation.noise_search import costs_at, noise_guess_at
 from heli_jax.identification.estimation.simulated_flights import predict
 from heli_jax.identification.estimation.trust_region import Nearing
 from heli_jax.identification.problem import MAX_TIME_SHIFT, Problem
@@ -67,7 +67,13 @@ def first_guess(
     # A misfit has a valley for every period of the motion by which the shift is wrong: the grid
     # finds the deepest. It ends short of the bounds, at which the coordinate is infinite.
     coordinate = np.arctanh(grid / MAX_TIME_SHIFT)
-    costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
+    if data.flights[0].by_instrument is not None and not layout.gains:
+        # By the rows: of a machine that somebody holds a simulation by its inputs drifts off.
+        points = np.tile(np.asarray(z0), (_SHIFTS, 1))
+        points[:, len(layout.free)] = coordinate
+        costs, gains = costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)), coordinate
+    else:
+        costs, gains = _scan(layout, data, noise, z0, jnp.asarray(coordinate, z0.dtype))
     costs = np.where(np.isfinite(costs), costs, np.inf)
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):

@@ -69,7 +69,7 @@ def one_noise_guess(
     points = np.tile(np.asarray(z0), (grid.shape[0], 1))
     for name, kind in kinds.items():
         points[:, layout.disturbance_at(name)] += grid[:, used.index(kind)]
-    costs = np.asarray(_costs(layout, data, noise, jnp.asarray(points, z0.dtype)))
+    costs = np.asarray(costs_at(layout, data, noise, jnp.asarray(points, z0.dtype)))
     # A filter may overflow at the ends of the grid: such a point is no candidate, and no failure.
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     return jnp.asarray(points[best], z0.dtype)
@@ -97,14 +97,24 @@ def noise_guesses_by_tau(
     if d.sigma in layout.disturbance:
         points[..., layout.disturbance_at(d.sigma)] += decades
     flat = jnp.asarray(points.reshape(-1, points.shape[-1]), z0.dtype)
-    costs = np.asarray(_costs(layout, data, noise, flat)).reshape(points.shape[:2])
+    costs = np.asarray(costs_at(layout, data, noise, flat)).reshape(points.shape[:2])
     costs = np.where(np.isfinite(costs), costs, np.inf)
     best = points[np.arange(_TAUS), np.argmin(costs, axis=1)]
     return [jnp.asarray(best[i], z0.dtype) for i in np.argsort(costs.min(axis=1))]
 
 
 @eqx.filter_jit
-def _costs(layout: Layout, data: Data, noise: Noise, points: Array) -> Array:
+def costs_at(
+    layout: Layout, data: Data, noise: Noise, points: Float[Array, "s q"]
+) -> Float[Array, " s"]:
+    """The mean of the squared rows at each of some points.
+
+    Args:
+        layout: what the unknowns are.
+        data: the numbers of the problem.
+        noise: of the measurements.
+        points: in the layout's coordinates.
+    """
     # One point after another: side by side they would need the memory of as many filters, for a
     # search of a few points.
     return jax.lax.map(lambda z: jnp.mean(jnp.square(rows_of(layout, data, noise, z))), points)

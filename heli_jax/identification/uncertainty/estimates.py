@@ -186,6 +186,24 @@ def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     return notes
 
 
+def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
+    """Delays by which the model answers before its input, by more than a sample of every flight.
+
+    Within a sample that may be how the input was held; beyond it no machine does so.
+
+    Args:
+        problem: its model says which parameters are delays.
+        estimates: of the free parameters.
+    """
+    sample = max(f.dt for f in problem.training)
+    found = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
+    return [
+        f"by {n} = {1e3 * e.value:.3g} ms it answers before its input"
+        for n, e in found
+        if e.upper95 is not None and e.upper95 < -sample
+    ]
+
+
 _FAR = 3.0
 """standard deviations of a prior at which an estimate contradicts it"""
 

@@ -182,9 +182,9 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
     return {
         name: Followed(
             float(scipy.special.chdtrc(freedom, statistic)),
-            float(1.0 - left / response) if response > 0 else 1.0,
+            float(1.0 - left / answer) if answer > 0 else 1.0,
         )
-        for name, (statistic, freedom, left, response) in sums.items()
+        for name, (statistic, freedom, left, answer) in sums.items()
         if freedom > 0
     }
 
@@ -201,7 +201,7 @@ def _in_bands(
     X: Complex[np.ndarray, "K m"],
 ) -> np.ndarray:
     """The test's statistic and degrees of freedom, and the powers that follow the excitation of the
-    residual, less what chance makes, and of the model's response."""
+    residual and of what was measured, less what chance makes."""
     first, lines, total = 0, float(max(_FIRST, 4 * X.shape[1])), np.zeros(4)
     while first + int(lines) <= len(e):
         band = slice(first, first + int(lines))
@@ -218,9 +218,13 @@ def _in_bands(
         if not power > followed:
             continue
         statistic = -(2.0 * n - m - 1.0) * np.log1p(-followed / power)
-        response = (y - e)[band] / size[band]
+        # Not the model's response: a wrong model's may be larger than anything that was measured.
+        answer = y[band] / size[band]
+        answered = float(np.sum(np.abs(Q.conj().T @ answer) ** 2))
         scale = float(np.mean(size[band] ** 2))
-        chance = m * (power - followed) / (n - m)
-        answered = float(np.sum(np.abs(Q.conj().T @ response) ** 2))
-        total += [statistic, 2.0 * m, scale * (followed - chance), scale * answered]
+        chance, of_answer = (
+            m * max(whole - part, 0.0) / (n - m)
+            for whole, part in ((power, followed), (float(np.sum(np.abs(answer) ** 2)), answered))
+        )
+        total += [statistic, 2.0 * m, scale * (followed - chance), scale * (answered - of_answer)]
     return total
