@@ -3,22 +3,30 @@
 Sentences about a wrong log are not among it: they name rows of a table, and seconds of a topic.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.flights.flight import Flight, Source
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import Decision, decide, low_passed
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import held_mean, in_gaps, longest_gap, resampled
+from heli_jax.flights.resample import (
+    goes_down,
+    held_low_passed,
+    held_mean,
+    in_gaps,
+    longest_gap,
+    resampled,
+)
 from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
 Key = tuple[str, str]
 """a model's name, and `input` or `output`"""
+_NO_HOLD = Decision("", "")
 FEWEST = 8
 """samples in a run"""
 MOST_UPSAMPLING = 100
@@ -140,17 +148,26 @@ def measured_once(
     return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
 
 
+class OnGrid(NamedTuple):
+    """Signals on a grid: samples (M,) by key, what inputs do between them, and notes."""
+
+    samples: dict[Key, np.ndarray]
+    holds: dict[str, Decision]
+    notes: list[str]
+
+
 def at_times(
     request: Request,
     signals: Mapping[Key, Timed],
     holds: Mapping[str, Decision],
     times: np.ndarray,
-) -> tuple[dict[Key, np.ndarray], list[str]]:
-    """The signals' samples (M,) on a grid, and notes.
+) -> OnGrid:
+    """The signals on a grid.
 
     A held input has the mean of what it was until the grid's next instant. Other inputs and the
     outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
-    than the grid stand at the instants nearest to their own.
+    than the grid stand at the instants nearest to their own. A held input that a low-passed output
+    follows within a sample is low-passed too, and is linear between samples then.
 
     Args:
         request: names them.
@@ -159,15 +176,28 @@ def at_times(
         times: of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    alike = _alike(request, signals, holds, times)
     for (key, kind), signal in signals.items():
         if kind == "input":
             if holds[key].hold != "zero-order":
                 samples[key, kind] = resampled(*signal, times)
-                continue
-            # A low-pass filter would turn a stick that jumps into one that rings.
-            samples[key, kind] = held_mean(*signal, times)
-            if not np.isin(samples[key, kind], signal.values).all():
-                notes.append(f"{key} is held: each step of the grid has its mean over that step")
+            elif key in alike:
+                # A linear machine answers a filtered stick with the filtered motion. The mean of
+                # each step, beside an output that is filtered alone, leaves the ringing of the
+                # output's jumps to be explained by the machine.
+                samples[key, kind] = held_low_passed(*signal, times)
+                outputs = ", ".join(alike[key])
+                follow = "follow" if len(alike[key]) > 1 else "follows"
+                notes.append(
+                    f"{key} is low-passed as well and linear between samples, since {outputs} "
+                    f"{follow} it within a sample: filtered alike, both keep what is between them"
+                )
+            else:
+                # A low-pass filter would turn a stick that jumps into one that rings.
+                samples[key, kind] = held_mean(*signal, times)
+                if not np.isin(samples[key, kind], signal.values).all():
+                    words = f"{key} is held: each step of the grid has its mean over that step"
+                    notes.append(words)
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples
@@ -176,8 +206,54 @@ def at_times(
             own = own_clock(signal)
             # Missing rows are no longer there to say where too much is missing.
             gaps = in_gaps(own.seconds, times) if own is not signal else False
-            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
-    return samples, notes
+            jumps = [n for n in alike if request.options.follows.get((n, key))]
+            early = _early(own.seconds, [signals[n, "input"] for n in jumps])
+            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times - early))
+    decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
+    return OnGrid(samples, decided, notes)
+
+
+def _alike(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+    times: np.ndarray,
+) -> dict[str, list[str]]:
+    """The held inputs that have to be filtered, with the filtered outputs that follow them within a
+    sample of the grid (M,) [s]."""
+    alike: dict[str, list[str]] = {}
+    for name, output in request.options.follows:
+        if holds.get(name, _NO_HOLD).hold == "zero-order" and (output, "output") in signals:
+            own = own_clock(signals[output, "output"])
+            if goes_down(own.seconds, times):
+                alike.setdefault(name, []).append(output)
+    return alike
+
+
+def _early(seconds: np.ndarray, inputs: Sequence[Timed]) -> float:
+    """By how much an output that jumps with inputs shows the jumps too early [s], once filtered.
+
+    A filter takes a sample for the output from half a step before it to half a step behind it. One
+    that has a jump in it the moment that the input jumps was taken behind the jump, not amid.
+
+    Args:
+        seconds: stamps of the output (N,) [s].
+        inputs: held ones that it follows at the very sample.
+    """
+    lags, weights = [], []
+    for stamps, values in inputs:
+        moves = np.abs(np.diff(values))
+        at = stamps[1:][moves > 0]
+        seen = np.searchsorted(seconds, at - 1e-9)
+        inside = (seen > 0) & (seen < seconds.size)
+        lags.append(np.maximum(seconds[seen[inside]] - at[inside], 0.0))
+        # By the square of a jump, as it counts in a fit; of inputs of any units alike.
+        weights.append((moves[moves > 0][inside] / moves.max(initial=1e-300)) ** 2)
+    total = sum(float(w.sum()) for w in weights)
+    if not total > 0:
+        return 0.0
+    lag = sum(float(w @ x) for w, x in zip(weights, lags, strict=True)) / total
+    return 0.5 * float(np.median(np.diff(seconds))) - lag
 
 
 def flight_of(
