@@ -207,7 +207,17 @@ def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
 @pytest.mark.parametrize(
     ("name", "stick"),
     [
-        *((n, "roll") for n in ("Roll_Cmd", "roll_cmd_deg", "aileron_cmd", "cmdRoll", "ail_us")),
+        *(
+            (n, "roll")
+            for n in (
+                "Roll_Cmd",
+                "swashRollCmd",
+                "roll_cmd_deg",
+                "aileron_cmd",
+                "cmdRoll",
+                "ail_us",
+            )
+        ),
         *((n, "pitch") for n in ("elevatorCmd", "pitch_command", "delta_e")),
     ],
 )
