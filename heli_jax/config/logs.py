@@ -66,8 +66,7 @@ def _read_flight(
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
     _check(model, f, where)
-    time = f.signals.time
-    path = experiment.path.parent / f.log
+    time, path = f.signals.time, experiment.path.parent / f.log
     # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
     # window is otherwise told before minutes of reading.
     asked = f.signals.preset is not None or f.signals.ccpm is not None

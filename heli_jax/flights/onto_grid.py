@@ -20,7 +20,7 @@ from heli_jax.flights.resample import (
     longest_gap,
     resampled,
 )
-from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
+from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock, usual_step
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
@@ -197,7 +197,7 @@ def at_times(
                 samples[key, kind] = held_mean(*signal, times)
                 if not np.isin(samples[key, kind], signal.values).all():
                     words = f"{key} is held: each step of the grid has its mean over that step"
-                    notes.append(words)
+                    notes += [words, *_between(request, signals, key, times)]
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples
@@ -207,10 +207,32 @@ def at_times(
             # Missing rows are no longer there to say where too much is missing.
             gaps = in_gaps(own.seconds, times) if own is not signal else False
             jumps = [n for n in alike if request.options.follows.get((n, key))]
-            early = _early(own.seconds, [signals[n, "input"] for n in jumps])
-            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times - early))
+            if jumps:
+                own = _amid_jumps(own, [signals[n, "input"] for n in jumps])
+            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
     decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
     return OnGrid(samples, decided, notes)
+
+
+def _between(
+    request: Request, signals: Mapping[Key, Timed], name: str, times: np.ndarray
+) -> list[str]:
+    """What to say of a held input that moves between the samples of outputs that jump with it."""
+    signal = signals[name, "input"]
+    jump = [o for (i, o), at_once in request.options.follows.items() if i == name and at_once]
+    # What is low-passed is no longer here, and a slower one has its samples where they were.
+    rate = 1.0 / float(times[1] - times[0])
+    jump = [
+        o for o in jump if (o, "output") in signals and not is_slower(signals[o, "output"], rate)
+    ]
+    if not jump or not goes_down(signal.seconds, times):
+        return []
+    hz = 1.0 / usual_step(signal.seconds)
+    return [
+        f"{', '.join(jump)} and {name} jump together, and {name} was logged at about {hz:.4g} Hz: "
+        "its mean over a step is not what they show at the step's beginning, and estimates suffer; "
+        f"a rate as high as that of {name} keeps both as they are"
+    ]
 
 
 def _alike(
@@ -230,30 +252,34 @@ def _alike(
     return alike
 
 
-def _early(seconds: np.ndarray, inputs: Sequence[Timed]) -> float:
-    """By how much an output that jumps with inputs shows the jumps too early [s], once filtered.
+def _amid_jumps(signal: Timed, inputs: Sequence[Timed]) -> Timed:
+    """An output that jumps with inputs, with half of each jump in the sample at which it shows.
 
     A filter takes a sample for the output from half a step before it to half a step behind it. One
-    that has a jump in it the moment that the input jumps was taken behind the jump, not amid.
+    that has a jump in it the moment that the input jumps was taken behind the jump, not amid; left
+    as it is, it would show each jump half a step too early, once filtered. How far the output jumps
+    is what its own moves say, by least squares.
 
     Args:
-        seconds: stamps of the output (N,) [s].
+        signal: the output, on its own clock.
         inputs: held ones that it follows at the very sample.
     """
-    lags, weights = [], []
-    for stamps, values in inputs:
-        moves = np.abs(np.diff(values))
-        at = stamps[1:][moves > 0]
-        seen = np.searchsorted(seconds, at - 1e-9)
+    seconds, values = signal
+    step = usual_step(seconds)
+    jumps, early = np.zeros((2, len(inputs), seconds.size))
+    for i, (stamps, held) in enumerate(inputs):
+        sizes, at = np.diff(held), stamps[1:]
+        seen = np.searchsorted(seconds, at - 1e-6 * step)
         inside = (seen > 0) & (seen < seconds.size)
-        lags.append(np.maximum(seconds[seen[inside]] - at[inside], 0.0))
-        # By the square of a jump, as it counts in a fit; of inputs of any units alike.
-        weights.append((moves[moves > 0][inside] / moves.max(initial=1e-300)) ** 2)
-    total = sum(float(w.sum()) for w in weights)
-    if not total > 0:
-        return 0.0
-    lag = sum(float(w @ x) for w, x in zip(weights, lags, strict=True)) / total
-    return 0.5 * float(np.median(np.diff(seconds))) - lag
+        seen, sizes = seen[inside], sizes[inside]
+        late = np.maximum(seconds[seen] - at[inside], 0.0) / step
+        np.add.at(jumps[i], seen, sizes)
+        np.add.at(early[i], seen, sizes * (0.5 - np.minimum(late, 1.0)))
+    moves = np.diff(values)
+    known = np.isfinite(moves)
+    # Of an input that never jumps the least norm makes nothing.
+    gains = np.linalg.lstsq(jumps[:, 1:][:, known].T, moves[known], rcond=None)[0]
+    return Timed(seconds, values - gains @ early)
 
 
 def flight_of(
