@@ -16,6 +16,7 @@ from heli_jax.flights.resample import (
     goes_down,
     held_low_passed,
     held_mean,
+    hold,
     in_gaps,
     longest_gap,
     resampled,
@@ -177,15 +178,16 @@ def at_times(
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
     alike = _alike(request, signals, holds, times)
+    # A linear machine answers a filtered stick with the filtered motion. The mean of each step,
+    # beside an output that is filtered alone, leaves the ringing of the output's jumps to be
+    # explained by the machine.
+    low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
             if holds[key].hold != "zero-order":
                 samples[key, kind] = resampled(*signal, times)
             elif key in alike:
-                # A linear machine answers a filtered stick with the filtered motion. The mean of
-                # each step, beside an output that is filtered alone, leaves the ringing of the
-                # output's jumps to be explained by the machine.
-                samples[key, kind] = held_low_passed(*signal, times)
+                samples[key, kind] = low[key]
                 outputs = ", ".join(alike[key])
                 follow = "follow" if len(alike[key]) > 1 else "follows"
                 notes.append(
@@ -208,8 +210,11 @@ def at_times(
             gaps = in_gaps(own.seconds, times) if own is not signal else False
             jumps = [n for n in alike if request.options.follows.get((n, key))]
             if jumps:
-                own = _amid_jumps(own, [signals[n, "input"] for n in jumps])
-            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
+                inputs = [(signals[n, "input"], low[n]) for n in jumps]
+                made = _resampled_with(own, inputs, times)
+            else:
+                made = resampled(*own, times)
+            samples[key, kind] = np.where(gaps, np.nan, made)
     decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
     return OnGrid(samples, decided, notes)
 
@@ -252,34 +257,30 @@ def _alike(
     return alike
 
 
-def _amid_jumps(signal: Timed, inputs: Sequence[Timed]) -> Timed:
-    """An output that jumps with inputs, with half of each jump in the sample at which it shows.
+def _resampled_with(
+    signal: Timed, inputs: Sequence[tuple[Timed, np.ndarray]], times: np.ndarray
+) -> np.ndarray:
+    """An output that jumps with inputs, low-passed (M,).
 
-    A filter takes a sample for the output from half a step before it to half a step behind it. One
-    that has a jump in it the moment that the input jumps was taken behind the jump, not amid; left
-    as it is, it would show each jump half a step too early, once filtered. How far the output jumps
-    is what its own moves say, by least squares.
+    What jumps in it is known at all times, as the inputs are, and is taken from them. Samples tell
+    of a jump only between which of them it was: low-passed by itself it would be half a step early,
+    and of another size at the end of the band. How far the output jumps is what its own moves say,
+    by least squares.
 
     Args:
         signal: the output, on its own clock.
-        inputs: held ones that it follows at the very sample.
+        inputs: held ones that it follows at the very sample, each with what `held_low_passed`
+            makes of it.
+        times: (M,) [s].
     """
     seconds, values = signal
-    step = usual_step(seconds)
-    jumps, early = np.zeros((2, len(inputs), seconds.size))
-    for i, (stamps, held) in enumerate(inputs):
-        sizes, at = np.diff(held), stamps[1:]
-        seen = np.searchsorted(seconds, at - 1e-6 * step)
-        inside = (seen > 0) & (seen < seconds.size)
-        seen, sizes = seen[inside], sizes[inside]
-        late = np.maximum(seconds[seen] - at[inside], 0.0) / step
-        np.add.at(jumps[i], seen, sizes)
-        np.add.at(early[i], seen, sizes * (0.5 - np.minimum(late, 1.0)))
+    held = np.array([hold(*u, np.maximum(seconds, u.seconds[0])) for u, _ in inputs])
     moves = np.diff(values)
     known = np.isfinite(moves)
     # Of an input that never jumps the least norm makes nothing.
-    gains = np.linalg.lstsq(jumps[:, 1:][:, known].T, moves[known], rcond=None)[0]
-    return Timed(seconds, values - gains @ early)
+    gains = np.linalg.lstsq(np.diff(held)[:, known].T, moves[known], rcond=None)[0]
+    jumping = gains @ np.array([low for _, low in inputs])
+    return resampled(seconds, values - gains @ held, times) + jumping
 
 
 def flight_of(

@@ -13,9 +13,9 @@ _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 _GOES_DOWN = 0.9
 """new rate over old, below which something between the two Nyquist frequencies could fold"""
-_CELLS = 8
+_CELLS = 16
 """parts of a grid step over which a held signal is averaged before it is low-passed: the mean takes
-0.1 % off what is at 0.2 of the rate"""
+0.1 % off what is at 0.4 of the rate"""
 
 
 @dataclass(frozen=True)
