@@ -241,9 +241,29 @@ def test_a_notch_begins_anew_behind_missing_samples():
     np.testing.assert_allclose(got[settled], whole[settled], atol=0.05 * 0.4)
     np.testing.assert_allclose(got[TIMES > 6.0], whole[TIMES > 6.0], atol=1e-3)
     assert "79 of 1961 samples are left out" in clean.source.notes[-1]
-    slow = replace(gap, outputs={"p": np.where(np.arange(2000) % 10, np.nan, x)})
-    with pytest.raises(InputError, match="which leaves 1 of its 200 samples; expected a window"):
-        with_notches(slow, [24.2], "notch")
+    often = replace(gap, outputs={"p": np.where(np.arange(2000) % 30, x, np.nan)})
+    with pytest.raises(InputError, match="which leaves 0 of its 1933 samples; expected a window"):
+        with_notches(often, [24.2], "notch")
+
+
+def test_a_notch_leaves_a_slow_sensor_what_it_cannot_have():
+    x = np.sin(2 * np.pi * 0.4 * TIMES) + 0.3 * np.sin(2 * np.pi * 24.2 * TIMES)
+    slow = np.where(np.arange(2000) % 10, np.nan, x)  # 20 Hz
+    third = np.where(np.arange(2000) % 3 == 1, x, np.nan)  # 67 Hz
+    flight = Flight(DT, {"lat": x}, {"h": slow, "p": x, "v": third}, source=Source("a", "0"))
+    clean = with_notches(flight, [24.2, 48.4], "notch")
+    np.testing.assert_array_equal(clean.outputs["h"], slow)
+    np.testing.assert_array_equal(clean.outputs["p"], clean.inputs["lat"])
+    # By its own samples, and at the line alone that they have.
+    own = clean.outputs["v"][1::3]
+    np.testing.assert_array_equal(own, notched(x[1::3], 3 * DT, [24.2], 10.0))
+    assert np.isnan(np.delete(clean.outputs["v"], np.s_[1::3])).all()
+    assert clean.source.notes[1:] == (
+        "h at about 20 Hz is not notched at 24.2, 48.4 Hz: what it may have of that is folded to "
+        "4.2, 8.4 Hz, where a notch would take the machine's motion too",
+        "v at about 66.67 Hz is not notched at 48.4 Hz: what it may have of that is folded to "
+        "18.3 Hz, where a notch would take the machine's motion too",
+    )
 
 
 def test_a_fit_repeats_the_cautions_once(load):

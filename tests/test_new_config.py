@@ -222,7 +222,17 @@ def test_names_of_outputs_as_people_write_them(name: str, called: str) -> None:
 @pytest.mark.parametrize(
     ("name", "stick"),
     [
-        *((n, "roll") for n in ("Roll_Cmd", "roll_cmd_deg", "aileron_cmd", "cmdRoll", "ail_us")),
+        *(
+            (n, "roll")
+            for n in (
+                "Roll_Cmd",
+                "swashRollCmd",
+                "roll_cmd_deg",
+                "aileron_cmd",
+                "cmdRoll",
+                "ail_us",
+            )
+        ),
         *((n, "roll") for n in ("rcCommand[0]", "ch1_aileron_us", "Ail", "ailrn,_yok1")),
         *((n, "pitch") for n in ("elevatorCmd", "pitch_command", "delta_e", "rcCommand[1]")),
         *((n, "yaw") for n in ("rcCommand[2]", "Rud")),

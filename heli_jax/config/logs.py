@@ -8,6 +8,7 @@ from heli_jax import naming, units
 from heli_jax.config.corrections import read_corrections, with_corrections
 from heli_jax.config.doubts import OFFSET_AND_SCALE, pulse_width_doubts
 from heli_jax.config.experiment import Experiment
+from heli_jax.config.feedthrough import follows
 from heli_jax.config.instruments import instrument_signals, with_instruments
 from heli_jax.config.kinematics import between_samples, prepared
 from heli_jax.config.measurement import filter_cautions
@@ -65,8 +66,7 @@ def _read_flight(
     # As the path in the configuration: flights[0].known, flights[0].signals.inputs.x_roll.unit.
     where = f"{experiment.path}: flights[{i}]"
     _check(model, f, where)
-    time = f.signals.time
-    path = experiment.path.parent / f.log
+    time, path = f.signals.time, experiment.path.parent / f.log
     # Only where the log has to be asked before its signals are known: a wrong unit or a reversed
     # window is otherwise told before minutes of reading.
     asked = f.signals.preset is not None or f.signals.ccpm is not None
@@ -95,6 +95,7 @@ def _read_flight(
             moving_inputs=moving,
             number=f.flight,
             also=tuple(_also(experiment, a, inputs, outputs) for a in f.also),
+            follows=follows(experiment, f.rate, inputs),
         )
     except InputError:
         raise  # it names the log and the line already
@@ -103,9 +104,8 @@ def _read_flight(
     notes = (*_unstated_units(model, everything, flights[0].source), *named.notes)
     flights = tuple(with_instruments(flight, instruments) for flight in flights)
     first, *others = _treated(experiment, flights, f, where)
-    cautions = filter_cautions(first.source, everything.outputs)
     cautions = (
-        *cautions,
+        *filter_cautions(first.source, everything.outputs),
         *pulse_width_doubts(first),
         *vibration_notes(experiment, first, f, where),
     )

@@ -13,7 +13,15 @@ from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
 from heli_jax.flights.flight import Flight
 from heli_jax.flights.onto_grid import FEWEST
-from heli_jax.flights.vibration import line_words, lines, notched, settling
+from heli_jax.flights.vibration import (
+    folded,
+    line_words,
+    lines,
+    notched,
+    notched_slow,
+    settling,
+    slow_step,
+)
 
 _Q = 10.0
 """of the notches: a rotor whose speed wanders by two percent stays within"""
@@ -27,7 +35,9 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
     """The flight without some frequencies, in its inputs and outputs alike.
 
     A linear machine answers notched sticks with notched motion, so nothing is biased; notched on
-    one side alone, the notch's lag would be taken for the machine's.
+    one side alone, the notch's lag would be taken for the machine's. An output that was sampled too
+    slowly to have a frequency stays as it is there: of what it does have the notch takes nothing,
+    and each lag is at most 3 % of its own step.
 
     Args:
         flight: as read.
@@ -47,18 +57,39 @@ def with_notches(flight: Flight, frequencies: Sequence[float], where: str) -> Fl
                 f"{hz:g} Hz"
             )
     inputs, outputs, instruments = (
-        {n: notched(x, flight.dt, frequencies, _Q) for n, x in signals.items()}
-        for signals in (flight.inputs, flight.outputs, flight.instruments)
+        {n: notch(x, flight.dt, frequencies, _Q) for n, x in signals.items()}
+        for notch, signals in (
+            (notched, flight.inputs),
+            (notched_slow, flight.outputs),
+            (notched, flight.instruments),
+        )
     )
+    slow = _too_slow(flight, frequencies)
     lost = _lost(flight, outputs, settling(frequencies, _Q), where)
     source = flight.source
     if source is not None:
         listed = ", ".join(f"{hz:g}" for hz in frequencies)
         note = f"inputs and outputs notched at {listed} Hz (Q {_Q:g})"
-        source = dataclasses.replace(source, notes=(*source.notes, note, *lost))
+        source = dataclasses.replace(source, notes=(*source.notes, note, *slow, *lost))
     return dataclasses.replace(
         flight, inputs=inputs, outputs=outputs, instruments=instruments, source=source
     )
+
+
+def _too_slow(flight: Flight, frequencies: Sequence[float]) -> tuple[str, ...]:
+    """A sentence for each output without samples enough to have some frequencies."""
+    notes = []
+    for name, y in flight.outputs.items():
+        rate = 1.0 / (slow_step(y) * flight.dt)
+        above = [hz for hz in frequencies if not hz < 0.5 * rate]
+        if above:
+            listed = ", ".join(f"{hz:g}" for hz in above)
+            at = ", ".join(f"{folded(hz, rate):.3g}" for hz in above)
+            notes.append(
+                f"{name} at about {rate:.4g} Hz is not notched at {listed} Hz: what it may have of "
+                f"that is folded to {at} Hz, where a notch would take the machine's motion too"
+            )
+    return tuple(notes)
 
 
 def _lost(

@@ -62,7 +62,7 @@ def decimate(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.n
     longest = max(2 * step, 5 * usual)
     seconds, values = seconds[known], values[known]
     even_step, even = even_samples(seconds, values, usual)
-    filtered = _low_pass(even, even_step, times - seconds[0], step)
+    filtered = low_pass(even, even_step, times - seconds[0], step)
     # The stamps on both sides of each time say how wide the gap is in which it lies. Where that is
     # too wide the fit has drawn a straight line, which is no measurement.
     behind = np.clip(np.searchsorted(seconds, times, side="right"), 1, seconds.size - 1)
@@ -195,8 +195,15 @@ def _sinc(x: np.ndarray) -> np.ndarray:
     return np.sinc(x) * window
 
 
-def _low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) -> np.ndarray:
-    """Even samples (K,), `step` [s] apart from 0, filtered, at `times` (M,) [s]."""
+def low_pass(even: np.ndarray, step: float, times: np.ndarray, new_step: float) -> np.ndarray:
+    """Even samples, low-passed, at the times of a slower grid (M,).
+
+    Args:
+        even: samples (K,), `step` [s] apart from 0 on; they go on as their mirror image.
+        step: between them [s].
+        times: (M,) [s].
+        new_step: of the slower grid [s], whose Nyquist frequency nothing passes.
+    """
     taps = 2 * int(np.ceil(_REACH * new_step / step)) + 2
     # As the mirror image through each end goes on: value and slope stay.
     padded = np.pad(even, taps, mode="reflect", reflect_type="odd")

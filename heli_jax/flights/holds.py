@@ -5,6 +5,7 @@ until the next. One that moves at nearly every sample was sampled on its way: a 
 sample to sample is nearer to it.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ class Decision(NamedTuple):
     reason: str
 
 
+_LOW_PASSED = "was low-passed as"
 _QUIET = 0.25 + 1e-6
 """of a jump: a neighbour smaller than that is none"""
 _FEW = 10
@@ -65,6 +67,16 @@ def decide(values: np.ndarray) -> Decision:
     if weight[jumps].sum() >= 0.5 * weight.sum():
         return Decision("zero-order", _steps(jumps))
     return Decision("linear", f"moves at {_percent(share)}")
+
+
+def low_passed(outputs: Iterable[str]) -> Decision:
+    """Of an input that was commanded in steps and went through the filter of these outputs."""
+    return Decision("linear", f"{_LOW_PASSED} {', '.join(outputs)}")
+
+
+def is_low_passed(reason: str) -> bool:
+    """Whether the reason of a hold is that of `low_passed`: no other hold is right then."""
+    return reason.startswith(_LOW_PASSED)
 
 
 def _of_few_values(

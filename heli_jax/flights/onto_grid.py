@@ -3,22 +3,31 @@
 Sentences about a wrong log are not among it: they name rows of a table, and seconds of a topic.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.flights.flight import Flight, Source
-from heli_jax.flights.holds import Decision, decide
+from heli_jax.flights.holds import Decision, decide, low_passed
 from heli_jax.flights.repeats import repeats_removed
 from heli_jax.flights.request import Request
-from heli_jax.flights.resample import held_mean, in_gaps, longest_gap, resampled
-from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock
+from heli_jax.flights.resample import (
+    goes_down,
+    held_low_passed,
+    held_mean,
+    hold,
+    in_gaps,
+    longest_gap,
+    resampled,
+)
+from heli_jax.flights.slower import Timed, at_nearest, is_slower, own_clock, usual_step
 from heli_jax.flights.slower import note as slower_note
 from heli_jax.flights.table import shown
 
 Key = tuple[str, str]
 """a model's name, and `input` or `output`"""
+_NO_HOLD = Decision("", "")
 FEWEST = 8
 """samples in a run"""
 MOST_UPSAMPLING = 100
@@ -140,17 +149,26 @@ def measured_once(
     return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
 
 
+class OnGrid(NamedTuple):
+    """Signals on a grid: samples (M,) by key, what inputs do between them, and notes."""
+
+    samples: dict[Key, np.ndarray]
+    holds: dict[str, Decision]
+    notes: list[str]
+
+
 def at_times(
     request: Request,
     signals: Mapping[Key, Timed],
     holds: Mapping[str, Decision],
     times: np.ndarray,
-) -> tuple[dict[Key, np.ndarray], list[str]]:
-    """The signals' samples (M,) on a grid, and notes.
+) -> OnGrid:
+    """The signals on a grid.
 
     A held input has the mean of what it was until the grid's next instant. Other inputs and the
     outputs are interpolated, or low-pass filtered where the rate goes down; outputs that are slower
-    than the grid stand at the instants nearest to their own.
+    than the grid stand at the instants nearest to their own. A held input that a low-passed output
+    follows within a sample is low-passed too, and is linear between samples then.
 
     Args:
         request: names them.
@@ -159,15 +177,29 @@ def at_times(
         times: of the grid (M,) [s].
     """
     samples, notes, rate = {}, [], 1.0 / float(times[1] - times[0])
+    alike = _alike(request, signals, holds, times)
+    # A linear machine answers a filtered stick with the filtered motion. The mean of each step,
+    # beside an output that is filtered alone, leaves the ringing of the output's jumps to be
+    # explained by the machine.
+    low = {n: held_low_passed(*signals[n, "input"], times) for n in alike}
     for (key, kind), signal in signals.items():
         if kind == "input":
             if holds[key].hold != "zero-order":
                 samples[key, kind] = resampled(*signal, times)
-                continue
-            # A low-pass filter would turn a stick that jumps into one that rings.
-            samples[key, kind] = held_mean(*signal, times)
-            if not np.isin(samples[key, kind], signal.values).all():
-                notes.append(f"{key} is held: each step of the grid has its mean over that step")
+            elif key in alike:
+                samples[key, kind] = low[key]
+                outputs = ", ".join(alike[key])
+                follow = "follow" if len(alike[key]) > 1 else "follows"
+                notes.append(
+                    f"{key} is low-passed as well and linear between samples, since {outputs} "
+                    f"{follow} it within a sample: filtered alike, both keep what is between them"
+                )
+            else:
+                # A low-pass filter would turn a stick that jumps into one that rings.
+                samples[key, kind] = held_mean(*signal, times)
+                if not np.isin(samples[key, kind], signal.values).all():
+                    words = f"{key} is held: each step of the grid has its mean over that step"
+                    notes += [words, *_between(request, signals, key, times)]
         elif is_slower(signal, rate):
             placed = at_nearest(signal, times)
             samples[key, kind] = placed.samples
@@ -176,8 +208,79 @@ def at_times(
             own = own_clock(signal)
             # Missing rows are no longer there to say where too much is missing.
             gaps = in_gaps(own.seconds, times) if own is not signal else False
-            samples[key, kind] = np.where(gaps, np.nan, resampled(*own, times))
-    return samples, notes
+            jumps = [n for n in alike if request.options.follows.get((n, key))]
+            if jumps:
+                inputs = [(signals[n, "input"], low[n]) for n in jumps]
+                made = _resampled_with(own, inputs, times)
+            else:
+                made = resampled(*own, times)
+            samples[key, kind] = np.where(gaps, np.nan, made)
+    decided = {n: low_passed(alike[n]) if n in alike else d for n, d in holds.items()}
+    return OnGrid(samples, decided, notes)
+
+
+def _between(
+    request: Request, signals: Mapping[Key, Timed], name: str, times: np.ndarray
+) -> list[str]:
+    """What to say of a held input that moves between the samples of outputs that jump with it."""
+    signal = signals[name, "input"]
+    jump = [o for (i, o), at_once in request.options.follows.items() if i == name and at_once]
+    # What is low-passed is no longer here, and a slower one has its samples where they were.
+    rate = 1.0 / float(times[1] - times[0])
+    jump = [
+        o for o in jump if (o, "output") in signals and not is_slower(signals[o, "output"], rate)
+    ]
+    if not jump or not goes_down(signal.seconds, times):
+        return []
+    hz = 1.0 / usual_step(signal.seconds)
+    return [
+        f"{', '.join(jump)} and {name} jump together, and {name} was logged at about {hz:.4g} Hz: "
+        "its mean over a step is not what they show at the step's beginning, and estimates suffer; "
+        f"a rate as high as that of {name} keeps both as they are"
+    ]
+
+
+def _alike(
+    request: Request,
+    signals: Mapping[Key, Timed],
+    holds: Mapping[str, Decision],
+    times: np.ndarray,
+) -> dict[str, list[str]]:
+    """The held inputs that have to be filtered, with the filtered outputs that follow them within a
+    sample of the grid (M,) [s]."""
+    alike: dict[str, list[str]] = {}
+    for name, output in request.options.follows:
+        if holds.get(name, _NO_HOLD).hold == "zero-order" and (output, "output") in signals:
+            own = own_clock(signals[output, "output"])
+            if goes_down(own.seconds, times):
+                alike.setdefault(name, []).append(output)
+    return alike
+
+
+def _resampled_with(
+    signal: Timed, inputs: Sequence[tuple[Timed, np.ndarray]], times: np.ndarray
+) -> np.ndarray:
+    """An output that jumps with inputs, low-passed (M,).
+
+    What jumps in it is known at all times, as the inputs are, and is taken from them. Samples tell
+    of a jump only between which of them it was: low-passed by itself it would be half a step early,
+    and of another size at the end of the band. How far the output jumps is what its own moves say,
+    by least squares.
+
+    Args:
+        signal: the output, on its own clock.
+        inputs: held ones that it follows at the very sample, each with what `held_low_passed`
+            makes of it.
+        times: (M,) [s].
+    """
+    seconds, values = signal
+    held = np.array([hold(*u, np.maximum(seconds, u.seconds[0])) for u, _ in inputs])
+    moves = np.diff(values)
+    known = np.isfinite(moves)
+    # Of an input that never jumps the least norm makes nothing.
+    gains = np.linalg.lstsq(np.diff(held)[:, known].T, moves[known], rcond=None)[0]
+    jumping = gains @ np.array([low for _, low in inputs])
+    return resampled(seconds, values - gains @ held, times) + jumping
 
 
 def flight_of(

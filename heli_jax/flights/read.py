@@ -125,7 +125,12 @@ def read_parts(
             left_out.append(f"{start:.6g} s to {end:.6g} s ({words})")
             why = e
             continue
-        reasons = {key: d.reason for key, d in holds.items() if d.reason}
+        reasons = {
+            key: d.reason
+            for key, d in holds.items()
+            # What the resampling made of it has the part's own reason.
+            if d.reason and flight.hold.get(key) == d.hold
+        }
         reasons = {**flight.hold_reason, **reasons}
         parts.append(dataclasses.replace(flight, hold_reason=reasons))
     if not parts:

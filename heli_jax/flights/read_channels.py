@@ -18,6 +18,7 @@ from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
     Key,
+    OnGrid,
     at_times,
     decided_holds,
     even_expected,
@@ -122,7 +123,7 @@ def flight_of_signals(
     values, repeated = measured_once(request, values)
     signals = {key: replace(signal, values=values[key]) for key, signal in signals.items()}
     said = sample_notes(request, {key: signal.timed for key, signal in signals.items()})
-    start, dt, samples, notes = _on_grid(source.path, request, signals, holds)
+    start, dt, (samples, holds, notes) = _on_grid(source.path, request, signals, holds)
     notes = (*source.notes, *other_units(request), *logged.notes, *repeated, *said, *notes)
     rates = {n: 1.0 / s.clock.usual for (n, kind), s in signals.items() if kind == "output"}
     source = replace(source, notes=notes, rates=rates, first_time=first_time)
@@ -205,8 +206,8 @@ def _on_grid(
     request: Request,
     signals: Mapping[Key, ClockedSignal],
     holds: Mapping[str, Decision],
-) -> tuple[float, float, dict[Key, np.ndarray], tuple[str, ...]]:
-    """First time and step [s] of the grid, the samples (N,) on it, and notes on how they came
+) -> tuple[float, float, OnGrid]:
+    """First time and step [s] of the grid, and the signals on it with notes on how they came
     there."""
     rate = request.options.rate
     clocks = clocks_of(signals.values())
@@ -218,14 +219,15 @@ def _on_grid(
             raise wrong(path, f"{problem} they are resampled, such as `rate: {slowest:.3g}`")
         dt, notes = _uniform(path, clocks[0])
         samples = {key: signal.values for key, signal in signals.items()}
-        return float(clocks[0].seconds[0]), dt, samples, notes
+        made = OnGrid(samples, dict(holds), list(notes))
+        return float(clocks[0].seconds[0]), dt, made
     clocks = on_all_the_time(signals, rate)
     notes = [f"{c.topic}: {note}" for c in clocks for note in new_clock(c.seconds, rate).notes]
     _require_no_gaps(path, clocks)
     times = common_times(path, clocks, rate)
     timed = {key: signal.timed for key, signal in signals.items()}
-    samples, more = at_times(request, timed, holds, times)
-    return float(times[0]), 1.0 / rate, samples, (*notes, *more)
+    made = at_times(request, timed, holds, times)
+    return float(times[0]), 1.0 / rate, made._replace(notes=[*notes, *made.notes])
 
 
 def clocks_of(signals: Iterable[ClockedSignal]) -> list[TopicClock]:

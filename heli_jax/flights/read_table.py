@@ -34,6 +34,7 @@ from heli_jax.flights.onto_grid import (
     FEWEST,
     MOST_UPSAMPLING,
     Key,
+    OnGrid,
     at_times,
     decided_holds,
     even_expected,
@@ -128,7 +129,7 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     holds = decided_holds(request, signals)
     signals, repeated = measured_once(request, signals)
     with clock.hinting():
-        dt, samples, more = _on_grid(stamps, request, signals, grid, holds)
+        dt, (samples, holds, more) = _on_grid(stamps, request, signals, grid, holds)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}
     notes = (*table.notes, *clock.notes, *other_units(request), *notes)
     notes = (*notes, *logged.notes, *repeated, *sample_notes(request, timed), *more)
@@ -347,17 +348,17 @@ def _on_grid(
     signals: _Samples,
     grid: Grid | Uneven,
     holds: Mapping[str, Decision],
-) -> tuple[float, _Samples, tuple[str, ...]]:
-    """The time step, the signals on the uniform grid, and notes on how they came there."""
+) -> tuple[float, OnGrid]:
+    """The time step, and the signals on the uniform grid with notes on how they came there."""
     seconds, rate = stamps.seconds, request.options.rate
     notes: tuple[str, ...] = ()
     if isinstance(grid, Grid):
         if rate is None:
-            return grid.dt, signals, grid.notes
+            return grid.dt, OnGrid(signals, dict(holds), list(grid.notes))
         # A rate that leaves the log's own grid by less than half a sample at its end is that grid:
         # the samples stay as they are, unblurred by interpolation.
         if abs(rate * grid.dt - 1.0) * seconds.size < 0.5:
-            return 1.0 / rate, signals, grid.notes
+            return 1.0 / rate, OnGrid(signals, dict(holds), list(grid.notes))
         # The grid is better than its rounded stamps: held inputs would slip by a sample.
         seconds, notes = seconds[0] + grid.dt * np.arange(seconds.size), grid.notes
         stamps = dataclasses.replace(stamps, seconds=seconds)
@@ -365,8 +366,8 @@ def _on_grid(
     _check_rate(stamps, rate)
     clock = new_clock(seconds, rate)
     timed = {key: Timed(seconds, x) for key, x in signals.items()}
-    samples, more = at_times(request, timed, holds, clock.times)
-    return clock.dt, samples, (*notes, *clock.notes, *more)
+    made = at_times(request, timed, holds, clock.times)
+    return clock.dt, made._replace(notes=[*notes, *clock.notes, *made.notes])
 
 
 def _check_rate(stamps: _Stamps, rate: float) -> None:

@@ -66,6 +66,9 @@ class ReadOptions:
     """which flight of a file that holds several, from 1"""
     also: tuple[Also, ...] = ()
     """further logs of the same flight, aligned with this one; they need a rate"""
+    follows: Mapping[tuple[str, str], bool] = field(default_factory=dict)
+    """the inputs that an output follows within a sample of the rate, as (input, output), and
+    whether it does so at the very sample; such held inputs are low-passed as the output is"""
 
 
 class Request:

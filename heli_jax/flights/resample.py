@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heli_jax.flights.band_limited import PASSED, decimate
+from heli_jax.flights.band_limited import PASSED, decimate, low_pass
 from heli_jax.flights.clock_steps import step_notes
 
 # What may be bridged: a few lost samples, or a moment in which a small helicopter's attitude is
@@ -13,6 +13,9 @@ _GAP_STEPS = 5.0
 _GAP_SECONDS = 0.25
 _GOES_DOWN = 0.9
 """new rate over old, below which something between the two Nyquist frequencies could fold"""
+_CELLS = 16
+"""parts of a grid step over which a held signal is averaged before it is low-passed: the mean takes
+0.1 % off what is at 0.4 of the rate"""
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,32 @@ def held_mean(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     return np.clip(mean, lowest, highest)
 
 
+def held_low_passed(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """A stepwise signal through the low-pass filter of `resampled`, at the times of a grid.
+
+    Args:
+        seconds: stamps (N,) [s], increasing; each sample stays until the next.
+        values: samples (N,), finite.
+        times: (M,) [s], evenly spaced, M >= 2, none before the first stamp.
+
+    Returns:
+        (M,), in the samples' unit.
+    """
+    step = float(times[1] - times[0])
+    cell = step / _CELLS
+    count = int(np.ceil((max(seconds[-1], times[-1]) - seconds[0]) / cell)) + 1
+    means = held_mean(seconds, values, seconds[0] + cell * np.arange(count))
+    # A mean stands for the middle of its cell.
+    return low_pass(means, cell, times - seconds[0] - 0.5 * cell, step)
+
+
+def goes_down(seconds: np.ndarray, times: np.ndarray) -> bool:
+    """Whether `resampled` low-passes samples at these stamps (N,) [s] for these times (M,) [s]."""
+    return bool(
+        times.size >= 2 and np.median(np.diff(seconds)) < _GOES_DOWN * (times[1] - times[0])
+    )
+
+
 def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """A signal that is no step: on straight lines, or low-pass filtered where the rate goes down.
 
@@ -121,7 +150,7 @@ def resampled(seconds: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.
     """
     # Where the rate hardly goes down there is nothing to fold, and straight lines keep the samples
     # as they are.
-    if times.size < 2 or np.median(np.diff(seconds)) >= _GOES_DOWN * (times[1] - times[0]):
+    if not goes_down(seconds, times):
         return interpolate(seconds, values, times)
     return decimate(seconds, values, times)
 

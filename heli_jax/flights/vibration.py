@@ -156,6 +156,35 @@ def settling(frequencies: Sequence[float], q: float) -> float:
     return 3.0 * q / (np.pi * min(frequencies))
 
 
+def slow_step(x: np.ndarray) -> int:
+    """Of samples (N,) of a sensor that is slower than the grid, of which most are missing, the
+    usual step between them in steps of the grid; 1 where it is not slower."""
+    steps = np.diff(np.flatnonzero(np.isfinite(x)))
+    return round(float(np.median(steps))) if steps.size else 1
+
+
+def notched_slow(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
+    """As `notched`, of a sensor that is slower than the grid: by its own samples, and without the
+    frequencies that it has no more; they are folded, and stay where they are.
+
+    Args:
+        x: samples (N,), NaN between those that were taken.
+        dt: of the grid [s].
+        frequencies: centres of the notches [Hz].
+        q: centre over width.
+    """
+    step = slow_step(x)
+    own = [hz for hz in frequencies if hz < 0.5 / (step * dt)]
+    there = np.flatnonzero(np.isfinite(x))
+    if step == 1 or (own and np.any(np.diff(there) % step)):
+        return notched(x, dt, frequencies, q)
+    made = np.array(x)
+    if own:
+        every = slice(int(there[0]), None, step)
+        made[every] = notched(x[every], step * dt, own, q)
+    return made
+
+
 def notched(x: np.ndarray, dt: float, frequencies: Sequence[float], q: float) -> np.ndarray:
     """A record (N,) without some frequencies: a causal notch for each, settled at the first sample.
 

@@ -1,5 +1,6 @@
 """Signs, units and clocks of signals that do not go together, and those that do."""
 
+import re
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -71,6 +72,20 @@ def test_a_wrong_sign_or_unit_of_an_angle_or_its_rate_is_said(angle, rate, words
     _, phi, p = moved()
     [sentence] = said(angle * phi, rate * p)
     assert words in sentence
+
+
+def test_a_rate_that_is_too_large_for_its_angle_is_said_with_its_interval():
+    for seed in range(5):
+        _, phi, p = moved(seed)
+        [sentence] = said(phi, 1.25 * p)
+        found = re.search(
+            r"p is ([\d.]+) times the rate of phi \(95 % ([\d.]+) to ([\d.]+)\)", sentence
+        )
+        assert found is not None
+        size, low, high = map(float, found.groups())
+        assert low <= 1.25 <= high
+        assert low <= size <= high < low + 0.2
+        assert "scale or the unit" in said(phi, 0.8 * p)[0]
 
 
 def test_an_output_that_moves_against_the_simulated_one_is_said():

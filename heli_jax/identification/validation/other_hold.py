@@ -10,6 +10,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.dynamics.jacobians import jacobians
 from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import is_low_passed
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Solution
@@ -74,6 +75,7 @@ def _moving_inputs(problem: Problem, flight: Flight, in_doubt: bool) -> set[str]
         for n in naming.names(problem.model.Inputs)
         # What stays constant is the same under either hold.
         if np.ptp(flight.inputs[n]) > 0
+        and not is_low_passed(flight.hold_reason.get(n, ""))
         and (not in_doubt or (flight.hold[n] == "linear" and n in flight.hold_reason))
     }
 

@@ -26,6 +26,10 @@ _ALIKE = 0.8
 """correlation of the two from which on their sizes are compared"""
 _FACTOR = 1.3
 """by which these may differ: coupled rotation and sensors that are off by a fifth"""
+_SCALE = 1.12
+"""by which they may differ for certain, by the interval of their factor: a sensor off by a tenth"""
+_QUANTILE = 2.26
+"""of Student's t with as many degrees of freedom as parts but one, for 95 %"""
 _GAP = 0.3
 """[s] without a sample, over which nothing is put between"""
 _DEGREE = 180.0 / np.pi
@@ -92,7 +96,7 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     size = float(np.sign(smallest) * np.sqrt(smallest * largest))
     backward, off = size < 0, abs(smallest) > _FACTOR or abs(largest) < 1.0 / _FACTOR
     if not (backward or off):
-        return []
+        return _of_scale(label, flight, rate, angle, ratio)
     how = f"{abs(size):.3g} times as far as" if off else "as far as"
     alike = np.sign(smallest) * np.sqrt(smallest / largest)
     against = f", and against it (correlation {alike:+.2f})" if backward else ""
@@ -106,6 +110,38 @@ def _of_pair(label: str, flight: Flight, rate: str, angle: str) -> list[Finding]
     )
     criterion = f"change of the angle over that of the integrated rate, 1 within {_FACTOR:g}"
     return [Finding("signs and units", "doubt", words, size, criterion)]
+
+
+def _of_scale(
+    label: str, flight: Flight, rate: str, angle: str, ratio: tuple[float, float]
+) -> list[Finding]:
+    """A doubt where a rate is too large or too small for its angle by more than chance, the noise
+    of either and a sensor's usual error explain."""
+    smallest, largest = ratio
+    changes = _changes(flight.outputs[angle], flight.outputs[rate], flight.dt)
+    if changes is None:
+        return []
+    sd = _log_sd(*changes)
+    low = float(np.exp(-_QUANTILE * sd)) / largest
+    high = float(np.exp(_QUANTILE * sd)) / smallest
+    if low <= _SCALE and high >= 1.0 / _SCALE:
+        return []
+    size = 1.0 / float(np.sqrt(smallest * largest))
+    words = (
+        f"{label}: {rate} is {size:.3g} times the rate of {angle} (95 % {low:.3g} to {high:.3g}): "
+        "the scale or the unit of one of the two is off, and a fit puts it into the machine."
+    )
+    criterion = f"the integrated rate's change over that of the angle, 1 within {_SCALE:g}"
+    return [Finding("signs and units", "doubt", words, size, criterion)]
+
+
+def _log_sd(first: np.ndarray, second: np.ndarray) -> float:
+    """Standard deviation of the logarithm of the ratio of two records' sizes (N,), by leaving out
+    one part after the other (the jackknife)."""
+    squares = [[float(part @ part) for part in np.array_split(x, PARTS)] for x in (first, second)]
+    left = [sum(of) - np.asarray(of) for of in squares]
+    logs = 0.5 * np.log(left[0] / left[1])
+    return float(np.sqrt((PARTS - 1) * np.var(logs)))
 
 
 def angle_over_rate(
@@ -122,13 +158,9 @@ def angle_over_rate(
         rate: [rad/s], likewise.
         dt: [s].
     """
-    both = angle_and_integral(angle, rate, dt)
-    if both is None:
+    changes = _changes(angle, rate, dt)
+    if changes is None:
         return None
-    steps = max(1, round(WITHIN / dt))
-    # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
-    # is not divided by a sample time.
-    changes = [v[steps:] - v[:-steps] for v in both]
     sds = [float(np.std(v)) for v in changes]
     if not min(sds) > 0:
         return None
@@ -137,6 +169,22 @@ def angle_over_rate(
         return None
     size = float(np.sign(alike)) * sds[0] / sds[1]
     return size * abs(alike), size / abs(alike)
+
+
+def _changes(
+    angle: Float[np.ndarray, " N"], rate: Float[np.ndarray, " N"], dt: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """By how much an angle and the integral of its rate change over `WITHIN`, without their means;
+    None where nothing can be told."""
+    both = angle_and_integral(angle, rate, dt)
+    if both is None:
+        return None
+    steps = max(1, round(WITHIN / dt))
+    # Changes over half a second: a bias of the rate is in their mean alone, and noise of the angle
+    # is not divided by a sample time.
+    changes = [v[steps:] - v[:-steps] for v in both]
+    first, second = (v - v.mean() for v in changes)
+    return first, second
 
 
 def angle_and_integral(
