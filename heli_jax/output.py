@@ -37,12 +37,14 @@ def print_fit(run: FitRun) -> None:
     # Nuisance parameters of a single flight ('flight/bias') are many and of interest to few: they
     # stand in fit.json and the report.
     shown = {**fit.estimates, **{n: e for n, e in fit.nuisance.items() if "/" not in n}}
-    rows = [_row(name, e) for name, e in shown.items()]
+    stopped = fit.status == "not-converged"
+    rows = [_row(name, e, stopped=stopped) for name, e in shown.items()]
     head = ("parameter", "estimate", "sd", "95 % interval", "unit", "prior share")
     print_table((*head[:3], fit.interval, *head[4:]), rows)
     if note := report_tables.prior_note(problem, fit):
         print(f"! {note}")
-    for c in fit.verdict.combinations:
+    # Where no optimum was reached nothing is determined.
+    for c in () if stopped else fit.verdict.combinations:
         print(_determined(c))
     if supplementary.intervals is not None:
         table = report_tables.intervals(supplementary.intervals, fit)
@@ -202,7 +204,10 @@ def _print_baseline(b: Baseline) -> None:
         print(f"  ! {sentence}")
 
 
-def _row(name: str, e: Estimate) -> tuple[str, ...]:
+def _row(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
+    """A row of the table of estimates; `stopped`: the optimiser did not arrive."""
+    if stopped:
+        return (name, report_tables.where_it_stopped(e), "", "", e.unit, f"{e.prior_share:.2f}")
     # A parameter that is not identifiable keeps its value in fit.json; a number here would be read
     # as an estimate.
     if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:

@@ -118,12 +118,18 @@ def test_three_free_end_with_exit_code_3(bench, capsys):
     assert "not determined" in capsys.readouterr().out
 
 
-def test_too_few_steps_end_with_exit_code_4(bench):
+def test_too_few_steps_end_with_exit_code_4(bench, capsys):
     out = bench.parent / "run"
     arguments = ["fit", str(bench), "--set", "fit.max_steps=2", "--out", str(out)]
     assert main(arguments) == 4
     written = json.loads((out / "fit.json").read_text())
     assert written["status"] == "not-converged"
+    # Where it stopped is told, and no interval about that.
+    assert all(
+        e["value"] is not None and e["sd"] is None and e["lower95"] is None
+        for e in written["parameters"].values()
+    )
+    assert "(no result)" in capsys.readouterr().out
     assert written["adequacy"]["summary"] != "yes"
 
 

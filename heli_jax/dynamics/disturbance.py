@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from heli_jax import naming
+from heli_jax import naming, units
 from heli_jax.dynamics.check_model import check_model
 from heli_jax.dynamics.model import Disturbance, Model, axes_of
 from heli_jax.naming import Record, Scalar
@@ -55,7 +55,8 @@ def with_disturbance(model: Model, on: str | Sequence[str], poles: int = 1) -> M
     unit per second) and the correlation time tau_w [s]. With two poles w follows a second lag of
     the same time constant, scaled to the same standard deviation. At the first sample w is what it
     is at any other: all its states have the standard deviation sigma_w, and the two of two poles
-    the correlation 1/sqrt(2).
+    the correlation 1/sqrt(2). An output that is that derivative by its equation, or its negative
+    (an acceleration as an accelerometer has it), has the push in it too.
 
     With one the model gains the parameters `sigma_w` (default 0) and `tau_w` (default 1 s); with
     several each has its own, named after what is disturbed: `sigma_w_p`, `tau_w_p`. A model's own
@@ -99,7 +100,7 @@ def _with_disturbances(model: Model, on: tuple[str, ...], poles: int) -> Model:
         raise ValueError(f"poles must be 1 or 2, got {poles}")
     added = _disturbances(model, on, poles)
     Params, State = _records(model, added)
-    disturbed = _Disturbed(model, added, State)
+    disturbed = _Disturbed(model, added, State, _felt(model, added))
     return Model(
         f"{model.name}-disturbed",
         disturbed.vector_field,
@@ -199,6 +200,50 @@ def _pushed_unit(model: Model, state: str) -> str:
     return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
+def _felt(model: Model, added: tuple[Disturbance, ...]) -> tuple[tuple[str, str, float], ...]:
+    """The outputs that are the derivative of a pushed state, or its negative: their names, the lag
+    that pushes, and the sign.
+
+    Found by two evaluations, as `disturbable_states` finds kinematics. The unit has to be that of
+    the derivative: an output that is a state may have the number of one.
+    """
+    pairs = [
+        (d, name)
+        for d in added
+        for name in naming.names(model.Outputs)
+        if _same_kind(naming.unit(model.Outputs, name), _pushed_unit(model, d.state))
+    ]
+    if not pairs:
+        return ()
+    rng = np.random.default_rng(8)
+    at = [_anywhere(model, rng) for _ in range(2)]
+    # To single precision, in which the model may have been evaluated.
+    return tuple(
+        (name, d.lags[-1], sign)
+        for d, name in pairs
+        for sign in (1.0, -1.0)
+        if all(abs(y[name] - sign * r[d.state]) < 1e-6 * abs(r[d.state]) for r, y in at)
+    )
+
+
+def _same_kind(unit: str | None, other: str) -> bool:
+    if unit is None or not (units.is_unit(unit) and units.is_unit(other)):
+        return False
+    return units.base_of(unit) == units.base_of(other)
+
+
+def _anywhere(model: Model, rng: np.random.Generator) -> tuple[dict[str, float], dict[str, float]]:
+    """A model's rates and outputs at numbers that no formula makes of one another."""
+    p, s, u = (
+        record(**{n: np.float64(rng.uniform(0.5, 1.5)) for n in naming.names(record)})
+        for record in (model.Params, model.State, model.Inputs)
+    )
+    with np.errstate(all="ignore"):
+        both = (model.vector_field(p, s, u), model.output(p, s, u))
+    rates, outputs = ({n: float(v) for n, v in naming.asdict(one).items()} for one in both)
+    return rates, outputs
+
+
 def _records(model: Model, added: tuple[Disturbance, ...]) -> tuple[type, type]:
     """The classes of parameters and states with those of the disturbances."""
     parameters, states = {}, {}
@@ -224,6 +269,8 @@ class _Disturbed(NamedTuple):
     model: Model
     added: tuple[Disturbance, ...]
     State: type
+    felt: tuple[tuple[str, str, float], ...]
+    """outputs that are the derivative of a pushed state: name, lag that pushes, sign"""
 
     def undisturbed(self, state: Record) -> Record:
         """The State of the model itself."""
@@ -247,14 +294,21 @@ class _Disturbed(NamedTuple):
         return self.State(**rates)
 
     def output(self, p: Record, s: Record, u: Record) -> Record:
-        """The model's outputs: a push shows in them by the motion alone.
+        """The model's outputs: a push shows in them by the motion, and in those that are the
+        derivative that it adds to.
 
         Args:
             p: the Params of the whole model, SI.
             s: its State, with the states added here.
             u: its Inputs, as they come from outside.
         """
-        return self.model.output(p, self.undisturbed(s), u)
+        outputs = self.model.output(p, self.undisturbed(s), u)
+        # Left out of an accelerometer's reading, a gust would be taken for noise that has a memory,
+        # and the filter for one of another size and time.
+        pushed = {
+            name: getattr(outputs, name) + sign * getattr(s, lag) for name, lag, sign in self.felt
+        }
+        return naming.replace(outputs, **pushed) if pushed else outputs
 
     def limits(self, p: Record, s: Record, u: Record) -> dict[str, Any]:
         """The model's limits, by name.

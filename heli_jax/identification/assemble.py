@@ -147,8 +147,16 @@ def _numbers(
         nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
     nuisance |= {n: _absent(nuisance[n], gone=n in layout.sigmas) for n in absent}
     sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
-    ill = layout.estimator.ill_conditioned(problem, e, sds)
-    return Numbers(of_interest, nuisance, sds, ill)
+    return Numbers(of_interest, nuisance, sds)
+
+
+def _ill_conditioned(
+    problem: Problem, search: Search, optimum: RelaxedOptimum, e: Evaluation
+) -> bool:
+    """Whether the numbers at the end of a search, with what they tell `e`, are rounding."""
+    scales = unpack(search.layout, search.data, optimum.best.z).scales
+    sds = noise_by_name(problem, optimum.noise, scales)
+    return search.layout.estimator.ill_conditioned(problem, e, sds)
 
 
 def assemble(
@@ -164,6 +172,10 @@ def assemble(
     """
     e = evaluate(search.layout, search.data, optimum.noise, optimum.best.z)
     optimum = unless_stuck(search.layout, optimum, e, problem.free)
+    ill = _ill_conditioned(problem, search, optimum, e)
+    if ill:
+        # Of rounding no likelihood can be asked, by whatever asks further on.
+        optimum = optimum._replace(best=optimum.best._replace(converged=np.asarray(False)))
     layout, data, best, noise = search.layout, search.data, optimum.best, optimum.noise
     signals, absent = signals_of(e, problem.training), absent_names(layout, optimum)
     white, correlated = whiteness_of(signals, e), correlated_residuals(signals)
@@ -190,7 +202,10 @@ def assemble(
     if bool(best.converged):
         verdict = unless_inputs_explain_nothing(solution, e, errors.verdict)
         errors = errors._replace(verdict=verdict)
-    numbers = _numbers(problem, solution, e, errors, absent)
+    numbers = _numbers(problem, solution, e, errors, absent)._replace(ill=ill)
+    status = _status(best, e, errors.verdict)
+    if status == "not-converged":
+        numbers = numbers.without_intervals()
     held = _held_out(problem, search, optimum)
     estimates = {k: numbers.of_interest[k] for k in layout.free}
     params = _params(problem, estimates)
@@ -216,6 +231,7 @@ def assemble(
     if bool(best.converged) and verdict is not errors.verdict:
         errors = errors._replace(verdict=verdict, limits={})
         numbers = _numbers(problem, solution, e, errors, absent)
+        status = _status(best, e, verdict)
         estimates = {k: numbers.of_interest[k] for k in layout.free}
     elif bool(best.converged) and not (ahead or instruments or any(f.present for f in found)):
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
@@ -228,7 +244,6 @@ def assemble(
         moved, stays = {}, False
     notes = fit_notes(problem, search, optimum, e, numbers, correlated if errors.coloured else {})
     notes += [*limit_notes(errors.limits), *excitation.aliasing(fast)]
-    status = _status(best, e, numbers, errors.verdict)
     told = any(not f.by_amplitude for f in lacking)
     notes += [*closed_loop, *feedback_trust_notes(moved, Loop(found, instruments, stays))]
     notes += [*weak_note(weak), *adequacy.sentences]
@@ -344,10 +359,8 @@ def _unknowns(layout: Layout, absent: int) -> int:
     return estimated - absent
 
 
-def _status(best: Optimum, e: Evaluation, numbers: Numbers, verdict: Verdict) -> Status:
-    # A point whose numbers are rounding is no optimum, however small the last step to it was.
-    usable = bool(np.all(np.isfinite(e.J))) and not numbers.ill
-    if not bool(best.converged) or not usable:
+def _status(best: Optimum, e: Evaluation, verdict: Verdict) -> Status:
+    if not bool(best.converged) or not bool(np.all(np.isfinite(e.J))):
         return "not-converged"
     return "converged" if verdict.identifiable else "not-identifiable"
 

@@ -31,8 +31,19 @@ class Numbers(NamedTuple):
     """all but the free parameters"""
     noise: dict[str, float]
     """standard deviations as 'flight/output'"""
-    ill: bool
+    ill: bool = False
     """whether the numbers are rounding"""
+
+    def without_intervals(self) -> "Numbers":
+        """Of a search that did not arrive: slopes where it stopped bound nothing."""
+        of_interest, nuisance = (
+            {
+                n: e._replace(sd=None, lower95=None, upper95=None, sd_white=None, sd_alone=None)
+                for n, e in estimates.items()
+            }
+            for estimates in (self.of_interest, self.nuisance)
+        )
+        return self._replace(of_interest=of_interest, nuisance=nuisance)
 
 
 def no_disturbance(optimum: RelaxedOptimum) -> bool:
@@ -78,7 +89,8 @@ def fit_notes(
     # optimiser that has not arrived, which makes all else doubtful.
     return [
         *bound_notes(numbers.of_interest),
-        *_stopped_notes(layout, best, optimum),
+        # Rounding has a remedy of its own.
+        *([] if numbers.ill else _stopped_notes(layout, best, optimum)),
         *_disturbance_notes(optimum.ratio if none else None),
         *([] if none else extreme_noise_notes(layout, data, best.z, absent)),
         *_absent_notes(layout, optimum.absent),

@@ -256,11 +256,11 @@ class Fit:
     @property
     def interval(self) -> str:
         """What to call the intervals."""
-        if self.status == "not-converged":
-            return "95 % where it stopped"
-        if self.coloured:
+        if self.status != "not-converged" and self.coloured:
             return "95 % (autocorrelated residuals)"
-        return "95 % (too narrow)" if self.overconfident else "95 % interval"
+        # Where no optimum was reached there are none.
+        narrow = self.overconfident and self.status != "not-converged"
+        return "95 % (too narrow)" if narrow else "95 % interval"
 
     @property
     def white(self) -> bool:

@@ -70,9 +70,9 @@ def fit_json(
             "verdict_before": content.verdict(fit.verdict_before),
             "parameters": {
                 **content.fixed(problem),
-                **{n: content.parameter(e) for n, e in fit.estimates.items()},
+                **{n: content.parameter(e, fit.status) for n, e in fit.estimates.items()},
             },
-            "nuisance": {n: content.parameter(e) for n, e in fit.nuisance.items()},
+            "nuisance": {n: content.parameter(e, fit.status) for n, e in fit.nuisance.items()},
             "noise_sd": fit.noise,
             **content.metrics(fit),
             "acceptance": [g._asdict() for g in card(problem, fit)],

@@ -7,7 +7,7 @@ from heli_jax.flights import Flight
 from heli_jax.flights.origins import as_content
 from heli_jax.identification.equation_error.baseline import Baseline
 from heli_jax.identification.equation_error.first_guess import EquationErrorStart
-from heli_jax.identification.fit import Estimate, Fit
+from heli_jax.identification.fit import Estimate, Fit, Status
 from heli_jax.identification.identifiability.verdict import Verdict
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.model_selection import Choice
@@ -32,7 +32,9 @@ def whiteness_note(fit: Fit) -> str:
             "the noise's spectrum is estimated and the intervals allow for it."
         )
     what, better = estimator.errors, fit.disturbable
-    if fit.coloured:
+    if fit.status == "not-converged":
+        consequence = ""
+    elif fit.coloured:
         consequence = (
             "White-noise (Cramer-Rao) intervals would be too narrow; those given allow for the "
             "residuals' autocorrelation"
@@ -45,7 +47,7 @@ def whiteness_note(fit: Fit) -> str:
     return (
         f"The {what} of {', '.join(not_white)} are not white (autocorrelation {worst.lag1:+.2f} "
         f"at one sample, {percent(worst.outside, 0)} of the lags outside the 99 % band): "
-        f"a disturbance or dynamics that the model lacks is in them. {consequence}"
+        f"a disturbance or dynamics that the model lacks is in them. {consequence}".rstrip()
     )
 
 
@@ -172,8 +174,11 @@ def intervals(comparison: Intervals | None) -> dict[str, Any] | None:
     return content
 
 
-def parameter(e: Estimate) -> dict[str, Any]:
-    """One estimate; of what the data do not determine the guess and the bounds alone."""
+def parameter(e: Estimate, status: Status = "converged") -> dict[str, Any]:
+    """One estimate of a fit; of what the data do not determine the guess and the bounds alone."""
+    # The status says that it is no result: whoever goes on from there has to know where it is.
+    if status == "not-converged":
+        return {**e._asdict(), "fixed": False}
     # Where the optimiser stopped in a direction that nothing determines is an accident, and a
     # program that reads the file would take it for an estimate.
     missing = dict.fromkeys(("value", "sd_white", "sd_alone")) if e.sd is None else {}
@@ -182,7 +187,8 @@ def parameter(e: Estimate) -> dict[str, Any]:
 
 def starts(fit: Fit) -> list[dict[str, Any]]:
     """Where each start led; null for what is not determined."""
-    open_ones = {n for n, e in fit.estimates.items() if e.sd is None}
+    arrived = fit.status != "not-converged"
+    open_ones = {n for n, e in fit.estimates.items() if arrived and e.sd is None}
     return [
         {**row._asdict(), "end": {n: None if n in open_ones else v for n, v in row.end.items()}}
         for row in fit.starts

@@ -180,3 +180,44 @@ def test_a_stand_keeps_the_disturbance(bench30):
         process_noise(one, params, DT), process_noise(other, params, DT), rtol=1e-12
     )
     assert one.random_states == other.random_states == ("w1_roll",)
+
+
+HEAVE = """
+name: heave
+states: {w: m/s, nu: m/s}
+inputs: {col: "1"}
+outputs: {az: m/s^2, up: m/s^2, w: m/s, lift: m/s^2}
+parameters: {Zw: {value: -0.5, unit: 1/s}, Zc: {value: -28, unit: m/s^2}}
+A: {w: {w: Zw, nu: 6}, nu: {nu: -9}}
+B: {w: {col: Zc}, nu: {col: 10}}
+C: {az: {w: Zw, nu: 6}, up: {w: -Zw, nu: -6}, lift: {w: Zw, nu: 6}}
+D: {az: {col: Zc}, up: {col: -Zc}}
+"""
+
+
+@pytest.mark.parametrize("poles", [1, 2])
+def test_an_output_that_is_the_pushed_derivative_has_the_push(tmp_path, poles):
+    """az is w' and up is -w'; lift lacks the control and w is a state: they have the motion alone.
+
+    az of a run against the differences of its own w.
+    """
+    path = tmp_path / "heave.yaml"
+    path.write_text(HEAVE)
+    file = linear_model(path)
+    model = with_disturbance(file.model, "w", poles)
+    known = naming.asdict(file.vehicle().params)
+    n, dt = 2000, 1e-3
+    col = np.repeat(np.random.default_rng(0).choice([-0.05, 0.05], n // 100), 100)
+    p = model.Params(**known, sigma_w=0.4, tau_w=0.5)
+    run = simulate(model, p, model.Inputs(col), dt=dt, key=jax.random.key(1))
+    az, up, lift = (np.asarray(getattr(run.outputs, k)) for k in ("az", "up", "lift"))
+    slope = np.diff(np.asarray(run.states.w)) / dt
+    steady = np.diff(col) == 0
+    # What the push does within a sample has no more than its rms: sigma sqrt(2 dt/(3 tau)).
+    within = 0.4 * np.sqrt(2.0 * dt / (3.0 * 0.5))
+    assert np.std((0.5 * (az[1:] + az[:-1]) - slope)[steady]) < within
+    push = np.asarray(getattr(run.states, f"w{poles}_w"))
+    assert np.std(push) > 5.0 * within
+    np.testing.assert_allclose(up, -az, rtol=1e-5, atol=1e-5)
+    known_motion = az + 28.0 * col - push
+    np.testing.assert_allclose(lift, known_motion, rtol=1e-5, atol=1e-4)

@@ -251,6 +251,9 @@ def test_noise_that_cannot_be_is_told(disturbed):
     assert any("times as large as the fixed noise" in note for note in too_small.notes)
     no_digits = run(1e-13)
     assert no_digits.status == "not-converged"
+    # Of rounding nothing is known: no interval, and no word of where the optimiser stopped.
+    assert all(e.sd is None and e.lower95 is None for e in no_digits.estimates.values())
+    assert not any("stopped after" in note for note in no_digits.notes)
     assert any("ill-conditioned" in note for note in no_digits.notes)
     assert all(np.isfinite(e.value) for e in no_digits.estimates.values())
 

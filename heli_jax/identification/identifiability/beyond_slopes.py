@@ -112,7 +112,10 @@ def beyond_slopes(
     R = np.linalg.qr(np.asarray(e.J, np.float64), mode="r")
     # What is open already goes along with anything, and tells nothing of where the others go.
     R[:, [i for i, n in enumerate(verdict.names) if n in lacking]] = 0.0
-    inverse = np.linalg.pinv(R, rcond=1e-10)
+    # Columns of one size: beside one that is larger by far another would count as none at all.
+    norms = np.linalg.norm(R, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    inverse = np.linalg.pinv(R / norms, rcond=1e-10) / norms[:, None]
     # Several that go together along one valley have as many ways to fit the noise: their intervals
     # are those that hold for all of them at once.
     together = math.sqrt(scipy.special.chdtri(len(wide), 0.05)) / Z95
@@ -204,8 +207,11 @@ def _lost(at: Solution, first: float, squares: float) -> float:
     """Twice the log-likelihood between two sums of squares, none where the second is smaller."""
     if not math.isfinite(squares):
         return math.inf
+    # What a further step promises may be all there is.
+    if squares <= 0.0:
+        return 0.0
     n = measured_count(at.data)
-    lost = at.layout.estimator.deviance(at.layout, max(squares, 0.0) / n, first / n, n)
+    lost = at.layout.estimator.deviance(at.layout, squares / n, first / n, n)
     return max(0.0, float(lost))
 
 

@@ -12,6 +12,7 @@ from heli_jax.report.tables.estimates import (
     sampling,
     starts,
     verdict,
+    where_it_stopped,
 )
 from heli_jax.report.tables.first_guess import first_guess, selection_steps, start_method
 from heli_jax.report.tables.handling import handling, handling_sentences
@@ -64,4 +65,5 @@ __all__ = [
     "starts",
     "verdict",
     "warnings",
+    "where_it_stopped",
 ]

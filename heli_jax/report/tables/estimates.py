@@ -8,7 +8,7 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.result import Estimate, Fit
 from heli_jax.identification.uncertainty.comparison import Intervals
 from heli_jax.identification.uncertainty.nuts import EFFECTIVE, RHAT, Posterior
-from heli_jax.numbers import NOTHING, measured, number, percent, relative
+from heli_jax.numbers import NOTHING, measured, number, percent, relative, terse
 from heli_jax.report.tables.table import NOT_DETERMINED, Table
 from heli_jax.report.unit_symbols import pretty
 
@@ -19,7 +19,8 @@ _SHARE = 0.005
 def parameters(fit: Fit) -> Table:
     """The free parameters; where the data do not determine one, that is said in place of it."""
     head = ("parameter", "estimate", "sd", "sd / value", fit.interval, "unit", "start")
-    rows = [_estimate(n, e) for n, e in fit.estimates.items()]
+    stopped = fit.status == "not-converged"
+    rows = [_estimate(n, e, stopped=stopped) for n, e in fit.estimates.items()]
     if fit.coloured:
         # What the sd would be if residuals were white, so that the price of their autocorrelation
         # can be seen.
@@ -47,9 +48,17 @@ def prior_note(problem: Problem, fit: Fit) -> str:
     )
 
 
-def _estimate(name: str, e: Estimate) -> tuple[str, ...]:
+def where_it_stopped(e: Estimate) -> str:
+    """The cell of an estimate of a fit that did not converge: a number that is no result."""
+    return f"{terse(e.value, 3)} (no result)" if math.isfinite(e.value) else NOT_DETERMINED
+
+
+def _estimate(name: str, e: Estimate, *, stopped: bool) -> tuple[str, ...]:
     start, share = number(e.start, 5), percent(e.prior_share, 0)
     bound = "yes" if e.at_bound else "no"
+    if stopped:
+        at = where_it_stopped(e)
+        return (name, at, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
     # Where the optimiser stopped in a direction that nothing determines is an accident: no number.
     if e.sd is None or not math.isfinite(e.sd) or e.lower95 is None or e.upper95 is None:
         return (name, NOT_DETERMINED, *[NOTHING] * 3, pretty(e.unit), start, share, bound)
@@ -89,7 +98,8 @@ def _nuisance(name: str, e: Estimate) -> tuple[str, ...]:
 def combinations(fit: Fit) -> Table:
     """What the data do determine where they do not determine every parameter."""
     rows = []
-    for c in fit.verdict.combinations:
+    # Where no optimum was reached nothing is determined.
+    for c in () if fit.status == "not-converged" else fit.verdict.combinations:
         value, low, high, sd = measured(c.sd, c.value, c.lower95, c.upper95)
         rows.append((c.name, value, sd, relative(c.sd, c.value), f"{low} to {high}"))
     return Table(("combination", "estimate", "sd", "sd / value", "95 % interval"), rows)
