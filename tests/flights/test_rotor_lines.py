@@ -52,7 +52,7 @@ def test_lines_are_named_while_the_rotor_is_steady(tmp_path, capsys):
     assert "  RATE.R: 25 Hz has " in text
     assert "(1/rev of the rotor)" in text
     assert "(no harmonic of the rotor)" in text
-    assert "no line above 1% of the variance: RATE.P" in text
+    assert "no line above 1 % of the variance: RATE.P" in text
     assert main(["info", str(path), "--json"]) == 0
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
     line = flight["vibration"]["signals"][0]["lines"][0]
