@@ -238,7 +238,7 @@ def assemble(
         sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
         lacking = unmodelled(solution, e, sds, coloured=in_colour)
         adequacy = with_unmodelled(adequacy, lacking)
-    adequacy = adequacy.doubted([*adequacy.doubts, *delay_doubts(problem, estimates)])
+    adequacy = adequacy.doubted(delay_doubts(problem, estimates))
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
         moved, stays = {}, False

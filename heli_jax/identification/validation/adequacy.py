@@ -77,8 +77,9 @@ class Adequacy(NamedTuple):
     """[s] that is predicted at most where that, and no simulation, was judged"""
 
     def doubted(self, doubts: Sequence[str]) -> "Adequacy":
-        """The same, not adequate where there is such a doubt, each in a few words."""
-        return self._replace(adequate=False, doubts=tuple(doubts)) if doubts else self
+        """The same with such doubts, each in a few words: not adequate where there is one."""
+        doubts = (*self.doubts, *doubts)
+        return self._replace(adequate=False, doubts=doubts) if doubts else self
 
     @property
     def unjudged(self) -> bool:
