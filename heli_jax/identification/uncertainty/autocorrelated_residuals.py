@@ -20,7 +20,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Complex, Float
 
-from heli_jax.identification.estimation.evaluation import Evaluation
+from heli_jax.identification.estimation.evaluation import Evaluation, deviations
 from heli_jax.identification.estimation.levenberg_marquardt import residual_and_jacobian
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
 
@@ -36,6 +36,8 @@ _NO_EFFECT = 1e-100
 """of the largest column of J: a smaller one is rounding of no effect"""
 _ENDLESS = 1e140
 """standard deviation of an unknown of no effect, whose square is still a number"""
+_LARGEST_STEP = 0.1
+"""of a coordinate, most of them logarithms, for differences of the slopes"""
 _FLATTEST = 0.05
 """curvature over that of J'J that is believed at least"""
 
@@ -203,7 +205,9 @@ def residual_curvature(
 ) -> Float[np.ndarray, "q q"]:
     """What the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
-    By central differences of J'r along the unknowns of interest. Zero where it is not finite.
+    By central differences of J'r along the unknowns of interest. Zero where it is not finite. Those
+    of a model that is not linear reach two standard deviations to either side: over less, what a
+    limit, a stop or a dead band makes of the slopes are kinks, whose differences are no curvature.
 
     Args:
         layout: of the unknowns.
@@ -212,21 +216,30 @@ def residual_curvature(
         z: the optimum (q,), in the optimiser's coordinates.
     """
     # The fit has compiled `slopes`; second derivatives would be another program, and a longer one.
-    step = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
+    least = float(np.finfo(np.asarray(z).dtype).eps) ** 0.25
     at = residual_and_jacobian(layout, data, noise, z)
     J = np.asarray(at.J, np.float64)
     q, k = J.shape[1], len(layout.of_interest)
     curvature = np.zeros((q, q))
+    steps = np.full(k, least)
+    if not layout.model.linear:
+        sds = deviations(J)[:k]
+        steps = np.where(np.isfinite(sds), 2.0 * sds, _LARGEST_STEP)
+        steps = np.clip(steps, least, _LARGEST_STEP)
     with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
         # Initial states and biases enter linearly, or so nearly that they are left at J'J.
         for i in range(k):
-            ends = []
-            for sign in (1.0, -1.0):
-                near = residual_and_jacobian(
-                    layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype))
-                )
-                ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
-            curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
+            # So far away a simulation may diverge that does not close by.
+            for step in (float(steps[i]), least):
+                ends = []
+                for sign in (1.0, -1.0):
+                    near = residual_and_jacobian(
+                        layout, data, noise, z.at[i].add(jnp.asarray(sign * step, z.dtype))
+                    )
+                    ends.append(np.asarray(near.J, np.float64).T @ np.asarray(near.r, np.float64))
+                curvature[:, i] = (ends[0] - ends[1]) / (2.0 * step) - J.T @ J[:, i]
+                if np.isfinite(curvature[:, i]).all():
+                    break
     # A Hessian is symmetric, its differences only nearly so.
     curvature[:k, :k] = 0.5 * (curvature[:k, :k] + curvature[:k, :k].T)
     curvature[:k, k:] = curvature[k:, :k].T
