@@ -205,9 +205,9 @@ def residual_curvature(
 ) -> Float[np.ndarray, "q q"]:
     """What the residuals add to J'J in the Hessian of r'r/2, (q, q): the sum of r_k r_k''.
 
-    By central differences of J'r along the unknowns of interest, two standard deviations of each to
-    either side: over less, what a limit, a stop or a dead band makes of the slopes are kinks, whose
-    differences are no curvature. Zero where it is not finite.
+    By central differences of J'r along the unknowns of interest. Zero where it is not finite. Those
+    of a model that is not linear reach two standard deviations to either side: over less, what a
+    limit, a stop or a dead band makes of the slopes are kinks, whose differences are no curvature.
 
     Args:
         layout: of the unknowns.
@@ -221,8 +221,11 @@ def residual_curvature(
     J = np.asarray(at.J, np.float64)
     q, k = J.shape[1], len(layout.of_interest)
     curvature = np.zeros((q, q))
-    sds = deviations(J)[:k]
-    steps = np.clip(np.where(np.isfinite(sds), 2.0 * sds, _LARGEST_STEP), least, _LARGEST_STEP)
+    steps = np.full(k, least)
+    if not layout.model.linear:
+        sds = deviations(J)[:k]
+        steps = np.where(np.isfinite(sds), 2.0 * sds, _LARGEST_STEP)
+        steps = np.clip(steps, least, _LARGEST_STEP)
     with np.errstate(all="ignore"):  # an unstable simulation a step away: zero, as said above
         # Initial states and biases enter linearly, or so nearly that they are left at J'J.
         for i in range(k):
