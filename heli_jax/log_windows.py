@@ -10,7 +10,6 @@ from heli_jax import config as configuration
 from heli_jax.config import Experiment
 from heli_jax.config.schema import FlightConfig
 from heli_jax.errors import InputError
-from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.fit import windows
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
@@ -18,6 +17,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.chosen_windows import DETERMINES, ENOUGH, Window
 from heli_jax.identification.validation.expected_accuracy import GUESSED, too_good
 from heli_jax.identification.validation.record_windows import Ranking, window_samples
+from heli_jax.numerics.white_noise import noise_guess
 
 _MOST = 40
 """windows in the table; those that were taken are always in it"""

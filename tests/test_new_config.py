@@ -9,7 +9,7 @@ from heli_jax import cli, load_config, yaml_file
 from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
-from heli_jax.flights.channel_names import unit_in_name
+from heli_jax.flights.channel_names import no_stick, unit_in_name, words_in
 from heli_jax.new_config import _names
 from heli_jax.new_config.guess import (
     Series,
@@ -412,3 +412,11 @@ def test_a_rate_is_never_taken_for_the_stick(
     )
     assert cli.main(["fit", str(tmp_path / "none.yaml"), "--out", str(tmp_path / "fit")]) == 2
     assert "EDIT" in capsys.readouterr().err
+
+
+def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
+    assert no_stick("RATE.R", "", "1", sure=True) == "an angular rate"
+    # ArduPilot's name of the controller's output, which its preset takes for the stick.
+    assert no_stick("RATE.ROut", "", "1", sure=True) == ""
+    assert words_in("RATE.RDes") == ("rate", "r", "des")
+    assert words_in("rollRate") == words_in("Roll Rate") == ("roll", "rate")

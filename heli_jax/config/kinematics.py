@@ -225,7 +225,7 @@ def noise_of(model: Model, flights: Sequence[Flight]) -> dict[str, float]:
         if parameter in known:
             # White noise of sd s in every sample adds s dt to an angle: s sqrt(dt) in a second.
             # Imported here: a second, of which models without sensors' errors have no need.
-            from heli_jax.identification.estimation.noise_covariance import noise_guess
+            from heli_jax.numerics.white_noise import noise_guess
 
             walks = [noise_guess(f.inputs[n]) * f.dt**0.5 for f in flights for n in names]
             # One intensity for three axes, as the model has it: their rms.

@@ -131,8 +131,8 @@ def names_a_stick(name: str) -> bool:
 
 
 def words_in(name: str) -> tuple[str, ...]:
-    """The words of a name in lower case: of rollRate, roll_rate and `Roll Rate`."""
-    apart = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
+    """The words of a name in lower case: of rollRate, roll_rate and `Roll Rate`; ROut is R Out."""
+    apart = re.sub(r"([a-z0-9])([A-Z])|([A-Z])(?=[A-Z][a-z])", r"\1\3 \2", name)
     # ch1, rc2in: a number is no part of a word.
     return tuple(w for w in re.split(r"[^a-z]+", apart.lower()) if w)
 

@@ -20,6 +20,7 @@ from heli_jax.identification.uncertainty.estimates import (
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
 from heli_jax.identification.validation.other_hold import other_hold
+from heli_jax.identification.validation.wandering_angles import wandering_notes
 
 
 class Numbers(NamedTuple):
@@ -98,6 +99,7 @@ def fit_notes(
         *optimum.notes,
         *layout.estimator.notes(layout, data, optimum.noise, e, numbers.ill),
         *stated_noise_notes(problem, numbers.noise),
+        *wandering_notes(problem),
         *_correlation_notes(correlated),
         *delay_notes(problem, numbers.of_interest),
         *prior_notes(problem, {k: numbers.of_interest[k] for k in layout.free}),

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heli_jax import models, naming
+from heli_jax.dynamics.model import axes_of
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.channel_names import names_a_stick
 from heli_jax.flights.preset import fitting_presets, model_inputs, model_outputs
@@ -17,6 +18,7 @@ from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.rate import channels_of_preset, common_rate
+from heli_jax.numerics.white_noise import wanders, without_noise
 from heli_jax.run_directory import require_place
 from heli_jax.vehicle import read_vehicle
 from heli_jax.yaml_file import EDIT, parse_mapping
@@ -90,6 +92,7 @@ def write_config(
         free=_free(chosen, constants, paths),
         rate=None if read.time is not None else common_rate(read.series, used),
         others=[f"{name}: {meaning}" for name, meaning in others],
+        preset_outputs=tuple(_only_turn(chosen.model).values()),
     )
     for path, words in {out: content, **paths}.items():
         path.write_text(words, encoding="utf-8")
@@ -234,7 +237,7 @@ def _signals(model: Any, log: Log) -> text.Signals:
         for channel in _moving(log, guess.excitations(known, tuple(log.series)))[:1]:
             excitations[name] = channel
     taken += excitations.values()
-    outputs: dict[str, Guess | None] = {}
+    outputs: dict[str, Guess] = {}
     for name in naming.names(model.Outputs):
         signal = model_outputs().get(name, name)
         known, unit = called["outputs"].get(signal, []), naming.unit(model.Outputs, name) or "1"
@@ -248,7 +251,28 @@ def _signals(model: Any, log: Log) -> text.Signals:
         known = {"Omega": (speed[0], guess.rotor_speed(speed[0], log.series[speed[0]]))}
         taken.append(speed[0])
     rest = tuple(n for n in log.series if n not in taken)
-    return text.Signals(inputs, outputs, known, rest, excitations)
+    measured = [log.series[g.channel].values for g in outputs.values()]
+    smooth = bool(measured) and all(map(without_noise, measured))
+    wandering = {} if smooth else _wandering(model, log, outputs)
+    outputs = {n: g for n, g in outputs.items() if n not in wandering}
+    return text.Signals(inputs, outputs, known, rest, excitations, wandering, smooth)
+
+
+def _only_turn(model: Any) -> dict[str, str]:
+    """By angle the rate, of a model whose outputs are one axis's rate and angle alone: there the
+    angle says nothing that the rate does not."""
+    pairs = {a.angle: a.rate for a in axes_of(model) if a.angle is not None}
+    outputs = set(naming.names(model.Outputs))
+    return {angle: rate for angle, rate in pairs.items() if {angle, rate} == outputs}
+
+
+def _wandering(model: Any, log: Log, outputs: Mapping[str, Guess]) -> dict[str, Guess]:
+    """Angles beside their rate whose error is that of an integrated rate, as an autopilot's."""
+    return {
+        angle: outputs[angle]
+        for angle, rate in _only_turn(model).items()
+        if {angle, rate} <= set(outputs) and wanders(log.series[outputs[angle].channel].values)
+    }
 
 
 def _own(name: str) -> str:

@@ -17,6 +17,14 @@ from heli_jax.yaml_file import EDIT
 _MOST_LISTED = 12
 _UNSET = {"kappa": "a stand that does not spring", "zeta": "a stand that does not damp"}
 """what a constant's default says where it is not zero for every machine"""
+_GUSTS = (
+    "  # With a disturbance, since gusts move real machines too; where none do, output-error",
+    "  # and no section disturbance.",
+)
+_SMOOTH = (
+    "  # GUESS: output-error, since the outputs have no sensor's noise: the log was smoothed or",
+    "  # simulated, and filter-error needs the noise as the sensors gave it.",
+)
 # Short words of YAML (on, y, null) and numbers are none of these.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
@@ -39,6 +47,10 @@ class Signals(NamedTuple):
     rest: Sequence[str]
     excitations: Mapping[str, str] = {}
     """by input the channel of what an autopilot added to it"""
+    wandering: Mapping[str, Guess] = {}
+    """angles that are left out, since their error is that of an integrated rate"""
+    smooth: bool = False
+    """whether no output has a sensor's noise"""
 
 
 def configuration(
@@ -53,6 +65,7 @@ def configuration(
     free: Mapping[str, float | str | None],
     rate: float | None = None,
     others: Sequence[str] = (),
+    preset_outputs: Sequence[str] = (),
 ) -> str:
     """The configuration as text.
 
@@ -67,6 +80,7 @@ def configuration(
         free: starts by parameter; None at the vehicle's value.
         rate: [Hz] onto which topics with clocks of their own are brought.
         others: models that fit the signals too, each with what it is for.
+        preset_outputs: those to take from the preset; all unless given.
 
     Raises:
         InputError: the log holds no output of the model.
@@ -87,16 +101,18 @@ def configuration(
     if preset is not None:
         lines += [
             "    # window: auto               # or [first, last] s: the parts that say most",
-            f"    signals: {{preset: {preset}}}   # heli-jax info shows the channels",
+            *_preset(preset, preset_outputs),
         ]
     else:
         assert signals is not None
         lines += _flight(chosen, signals, time, log)
     axes = _axes(chosen.model)
+    smooth = signals is not None and signals.smooth
+    if smooth:
+        axes = ()
     lines += [
         "fit:",
-        "  # With a disturbance, since gusts move real machines too; where none do, output-error",
-        "  # and no section disturbance.",
+        *(_SMOOTH if smooth else _GUSTS),
         f"  method: {'filter-error' if axes else 'output-error'}",
         "  free:                          # what is found, and where the search begins",
     ]
@@ -195,6 +211,7 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
     lines.append("      outputs:")
     for name, found in signals.outputs.items():
         lines += _signal(name, found, naming.meaning(chosen.model.Outputs, name))
+    lines += _left_out(signals.wandering)
     lines += _missing(chosen, signals)
     lines += _instruments(signals.excitations)
     if signals.rest:
@@ -204,12 +221,38 @@ def _flight(chosen: Chosen, signals: Signals, time: TimeInfo | None, log: str) -
     return lines
 
 
+def _preset(preset: str, outputs: Sequence[str]) -> list[str]:
+    known = "# heli-jax info shows the channels"
+    if not outputs:
+        return [f"    signals: {{preset: {preset}}}   {known}"]
+    return [
+        f"    signals:                     {known}",
+        f"      preset: {preset}",
+        "      # Without the angle, which the autopilot integrates from its gyros: its error",
+        "      # wanders, and filter-error takes it for white noise.",
+        f"      preset_outputs: [{', '.join(outputs)}]",
+    ]
+
+
+def _left_out(wandering: Mapping[str, Guess]) -> list[str]:
+    """Angles that would mislead, each as a comment to put back."""
+    return [
+        line
+        for name, found in wandering.items()
+        for line in (
+            f"        # GUESS: without {name}, whose error looks integrated from a gyro: it",
+            "        # wanders, and filter-error takes it for white noise.",
+            *(f"        # {words.strip()}" for words in _signal(name, found, "")),
+        )
+    ]
+
+
 def _missing(chosen: Chosen, signals: Signals) -> list[str]:
     """Outputs that no channel's name tells of."""
     units = {
         n: naming.unit(chosen.model.Outputs, n) or "1"
         for n in naming.names(chosen.model.Outputs)
-        if n not in signals.outputs
+        if n not in signals.outputs and n not in signals.wandering
     }
     if not units:
         return []

@@ -9,9 +9,9 @@ import pytest
 import scipy.signal
 
 from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
-from heli_jax.identification.estimation.noise_covariance import noise_guess, white_part
 from heli_jax.identification.validation.excitation_test import outputs_against_excitation
 from heli_jax.naming import Scalar
+from heli_jax.numerics.white_noise import noise_guess, white_part
 from heli_jax.report import fit_content
 from tests.identification.test_enough import steps
 

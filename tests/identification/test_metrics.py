@@ -7,8 +7,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heli_jax.identification.estimation.noise_covariance import noise_guess
 from heli_jax.identification.validation.metrics import metrics, whiteness
+from heli_jax.numerics.white_noise import noise_guess
 
 SIGNAL = np.sin(0.1 * np.arange(500))
 

@@ -11,7 +11,7 @@ from heli_jax.dynamics.model import Model
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.equation_error import smoothing
 from heli_jax.identification.equation_error.structure import Structure
-from heli_jax.identification.estimation.noise_covariance import noise_guess
+from heli_jax.numerics.white_noise import noise_guess
 
 _SEGMENTS = 20
 """of a flight at most, the longest: each has an initial state of its own for what is hidden"""

@@ -15,6 +15,7 @@ from heli_jax.identification.estimation.noisy_scales import slopes_changed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
+from heli_jax.numerics.white_noise import noise_guess
 
 _ROUNDS = 8
 """of the optimiser at most"""
@@ -27,8 +28,6 @@ _SETTLED = 3e-3
 relaxation of a noise that is a spectrum has ended: the next would move it by a fifth of that"""
 _EXPLAINED = 2.0
 """times the noise that a record shows by itself up to which its residual is that noise"""
-_FEW_DIFFERENCES = 0.2
-"""third differences of neighbours for each sample, below which they are taken across gaps"""
 _WORTH_TELLING = 0.1
 """log-likelihood by which two optima differ"""
 
@@ -52,52 +51,6 @@ class RelaxedOptimum(NamedTuple):
         return self._replace(
             trace=(*earlier.trace, *self.trace), ratio=earlier.ratio, notes=(*earlier.notes, *notes)
         )
-
-
-def noise_guess(signal: np.ndarray) -> float:
-    """White measurement noise sd of a smooth signal, from its third differences; NaN is skipped.
-
-    Third differences of white noise have variance 20 sd^2; what is smooth all but vanishes in
-    them. Robust against the corners of a response (median of absolute values).
-    """
-    # A gap makes NaN of the differences across it alone: no sample has to be filled in.
-    d, at = np.diff(signal, 3) / np.sqrt(20.0), np.flatnonzero(np.isfinite(signal))
-    d, signal = d[np.isfinite(d)], signal[at]
-    # Where gaps leave few samples in a row, as of a slow sensor on a fast grid, from one sample to
-    # the next wherever they stand.
-    if d.size < _FEW_DIFFERENCES * signal.size:
-        d = _divided_differences(at.astype(float), signal)
-    # Of three samples and fewer, the signal itself bounds its noise.
-    if not d.size:
-        d = signal - np.median(signal)
-    # The median of |x| of a normal x is 0.674 sd; 1 + 9 + 9 + 1 = 20.
-    guess = float(np.median(np.abs(d)) / 0.6744897501960817)
-    # A record without noise: rows divided by zero would be infinite.
-    floor = 1e-9 * float(np.sqrt(np.mean(signal**2)))
-    return max(guess, floor, 1e-300)
-
-
-def white_part(signal: np.ndarray) -> float:
-    """The sd of the white noise in a signal: what is there at its fastest and at its slowest.
-
-    Args:
-        signal: (N,), NaN where nothing is measured.
-    """
-    # Third differences look at the fast end of the spectrum alone, where a swing near the Nyquist
-    # frequency passes for noise. With every other sign turned the ends change places.
-    turned = signal * np.where(np.arange(signal.size) % 2, -1.0, 1.0)
-    return min(noise_guess(signal), noise_guess(turned))
-
-
-def _divided_differences(at: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Third divided differences (N - 3,) of samples (N,) at any instants, scaled so that those of
-    white noise have its variance; a parabola has none."""
-    if y.size < 4:
-        return np.zeros(0)
-    t, y = (np.lib.stride_tricks.sliding_window_view(x, 4) for x in (at, y))
-    apart = t[:, :, None] - t[:, None, :] + np.eye(4)
-    weights = 1.0 / np.prod(apart, axis=2)
-    return np.sum(weights * y, axis=1) / np.linalg.norm(weights, axis=1)
 
 
 def first_noise(problem: Problem, flights: Sequence[Flight]) -> Noise:

@@ -21,7 +21,6 @@ import numpy as np
 import scipy.special
 
 from heli_jax.analysis.response_agreement import ResponseAgreement
-from heli_jax.identification.estimation.noise_covariance import white_part
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.validation.advice import (
     FAR_FROM_WHITE,
@@ -34,6 +33,7 @@ from heli_jax.identification.validation.metrics import Metrics, Whiteness
 from heli_jax.identification.validation.moves_against import moves_against
 from heli_jax.identification.validation.predicts_nothing import predicts_nothing
 from heli_jax.numbers import explained_text, vaf_text
+from heli_jax.numerics.white_noise import white_part
 
 # params is Any: a record of a model's Params, whose class may be a user's own.
 

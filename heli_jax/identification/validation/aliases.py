@@ -14,9 +14,9 @@ from heli_jax import naming
 from heli_jax.analysis.linear import linearize
 from heli_jax.analysis.operating_point import OperatingPoint, operating_point
 from heli_jax.flights.flight import Flight
-from heli_jax.identification.estimation.noise_covariance import white_part
 from heli_jax.identification.identifiability.valley import SAME, Valley
 from heli_jax.identification.problem import Problem
+from heli_jax.numerics.white_noise import white_part
 
 _NEAR, _AT_NYQUIST = 0.8, 0.9
 """parts of the Nyquist frequency from which on the samples hardly show a mode: from the first its

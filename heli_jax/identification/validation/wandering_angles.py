@@ -1,0 +1,32 @@
+"""Angles whose error is no white noise, as those that an autopilot integrates from its gyros."""
+
+from heli_jax.dynamics.model import axes_of
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
+from heli_jax.numerics.white_noise import wanders
+
+
+def wandering_notes(problem: Problem) -> list[str]:
+    """Of filter error, which takes every output's error for white noise: the angles whose is not.
+
+    Args:
+        problem: with its flights.
+    """
+    if not estimator_of(problem.method).process_noise:
+        return []
+    pairs = [(a.angle, a.rate) for a in axes_of(problem.model) if a.angle is not None]
+    flights = [f.outputs for f in problem.flights]
+    found = [
+        (angle, rate)
+        for angle, rate in pairs
+        # Where the rate's is not white either, the whole log was smoothed or resampled.
+        if any(
+            {angle, rate} <= set(y) and wanders(y[angle]) and not wanders(y[rate]) for y in flights
+        )
+    ]
+    return [
+        f"The error of {angle} is no white noise, which the filter takes it for: it looks "
+        f"integrated from a gyro, as an autopilot's attitude is, and wanders. That can bias every "
+        f"estimate: fit without {angle}, which says nothing that {rate} does not, and compare."
+        for angle, rate in found
+    ]

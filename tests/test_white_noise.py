@@ -1,0 +1,103 @@
+"""Whether a signal's noise is white: by records whose noise is known."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heli_jax import Flight, Free, Problem, cli, linear_model, yaml_file
+from heli_jax.dynamics.disturbance import with_disturbance
+from heli_jax.identification.validation.wandering_angles import wandering_notes
+from heli_jax.numerics.white_noise import noise_guess, wanders, without_noise
+
+T = np.arange(3000) * 0.01
+STICK = 0.1 * np.sign(np.sin(2.0 * T)) * (np.sin(0.31 * T) > -0.5)
+RATE = np.convolve(STICK, 0.05 * np.exp(-T / 0.2))[: T.size]
+ANGLE = np.cumsum(RATE) * 0.01
+
+
+def angles(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A rate from a gyro, an angle from a sensor of its own, and the integral of that gyro."""
+    rng = np.random.default_rng(seed)
+    # The gyro is read ten times as often as it is logged.
+    fast = 0.03 * rng.standard_normal((T.size, 10))
+    gyro = RATE + fast[:, -1]
+    return gyro, ANGLE + 0.003 * rng.standard_normal(T.size), ANGLE + np.cumsum(fast.mean(1)) * 0.01
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_integrated_rate_wanders_and_white_noise_does_not(seed: int) -> None:
+    gyro, sensor, integrated = angles(seed)
+    assert wanders(integrated)
+    assert not wanders(gyro)
+    assert not wanders(sensor)
+    # Lost samples and a rounding of a thousandth of a degree change nothing.
+    lost = np.random.default_rng(seed).random(T.size) < 0.02
+    assert wanders(np.where(lost, np.nan, np.radians(np.round(np.degrees(integrated), 3))))
+    # A sensor half as fast repeats its values.
+    assert not wanders(np.repeat(sensor[::2], 2))
+    # Few samples tell nothing.
+    assert not wanders(integrated[:300])
+
+
+def test_a_smoothed_signal_has_no_noise_of_a_sensor() -> None:
+    gyro, _, _ = angles(0)
+    smooth = np.sin(T) + 0.3 * np.sin(3.1 * T)
+    assert without_noise(smooth)
+    assert wanders(smooth)
+    assert not without_noise(gyro)
+    assert noise_guess(gyro) == pytest.approx(0.03, rel=0.1)
+    assert not without_noise(np.zeros(10))
+
+
+def test_filter_error_says_of_an_integrated_angle_that_its_error_wanders() -> None:
+    roll = linear_model("roll-flybarless")
+    gyro, sensor, integrated = angles(1)
+
+    def notes(phi: np.ndarray, method: str) -> list[str]:
+        flight = Flight(dt=0.01, inputs={"lat": STICK}, outputs={"phi": phi, "p": gyro})
+        filtered = method == "filter-error"
+        model = with_disturbance(roll.model, "roll") if filtered else roll.model
+        gust = {"sigma_w": jnp.asarray(1.0), "tau_w": jnp.asarray(0.3)} if filtered else {}
+        vehicle = model.Params(**roll.vehicle().params._asdict(), **gust)
+        problem = Problem(model, vehicle, [flight], {"Lb": Free(100.0)}, method=method)
+        return wandering_notes(problem)
+
+    (note,) = notes(integrated, "filter-error")
+    assert "The error of phi is no white noise" in note
+    assert "fit without phi" in note
+    assert not notes(sensor, "filter-error")
+    # Output error's intervals allow for errors that wander.
+    assert not notes(integrated, "output-error")
+
+
+def _new(folder: Path, phi: np.ndarray, p: np.ndarray) -> tuple[dict, str]:
+    rows = "\n".join(
+        f"{t:.2f},{u:.3f},{a:.6f},{b:.5f}" for t, u, a, b in zip(T, STICK, phi, p, strict=True)
+    )
+    (folder / "run.csv").write_text(f"t,lat,roll_rad,gyro_x_rad_s\n{rows}\n")
+    out = folder / "run.yaml"
+    out.unlink(missing_ok=True)
+    assert cli.main(["new", str(folder / "run.csv"), "--out", str(out)]) == 0
+    return yaml_file.read_mapping(out), out.read_text()
+
+
+def test_new_leaves_out_an_integrated_angle_and_takes_a_sensors(tmp_path: Path) -> None:
+    gyro, sensor, integrated = angles(2)
+    made, text = _new(tmp_path, integrated, gyro)
+    assert set(made["flights"][0]["signals"]["outputs"]) == {"p"}
+    assert "without phi" in text
+    assert "# phi: {signal: " in text
+    assert "Not found by name" not in text
+    made, text = _new(tmp_path, sensor, gyro)
+    assert set(made["flights"][0]["signals"]["outputs"]) == {"phi", "p"}
+    assert made["fit"]["method"] == "filter-error"
+
+
+def test_new_takes_output_error_for_a_log_without_noise(tmp_path: Path) -> None:
+    smooth = np.sin(T) + 0.3 * np.sin(3.1 * T)
+    made, text = _new(tmp_path, smooth, np.cos(T) + 0.93 * np.cos(3.1 * T))
+    assert made["fit"]["method"] == "output-error"
+    assert "disturbance" not in made
+    assert "smoothed or" in text
