@@ -49,6 +49,7 @@ from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.enough import is_it_enough
 from heli_jax.identification.validation.excited_band import bands
+from heli_jax.identification.validation.expected_accuracy import guessed_gusts
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.logging_rate import logging_rate
@@ -145,6 +146,7 @@ def check(problem: Problem) -> Check:
     not_identifiable = (*verdict.undetermined, *verdict.without_effect)
     notes += tuple(of_disturbances(guess.layout, guess.e))
     notes += other_hold(problem, at, guess.e, skip=not_identifiable)
+    notes += [gusts] if (gusts := guessed_gusts(problem)) else []
     guessed = tuple(
         f"{label}/{name}"
         for label, flight in zip(labels(problem.training), problem.training, strict=True)
@@ -200,7 +202,9 @@ def windows(problem: Problem, length: float | None = None) -> Ranking:
     ranking = rank_windows(problem, Solution(*guess[:4]), guess.e, length)
     flights = list(zip(labels(problem.training), problem.training, strict=True))
     found = [*logging_rate(problem, flights, guess.noise.sd), *bands(problem.training)]
-    return dataclasses.replace(ranking, record=tuple(f for f in found if f.bad))
+    gusts = guessed_gusts(problem)
+    notes = (*ranking.notes, gusts) if gusts else ranking.notes
+    return dataclasses.replace(ranking, record=tuple(f for f in found if f.bad), notes=notes)
 
 
 def _starts(

@@ -1,8 +1,13 @@
 """What expected standard deviations rest on, in words: on the noise, which may be guessed."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+
+from heli_jax.dynamics.disturbance import disturbances_of
+from heli_jax.identification.methods import estimator_of
+from heli_jax.identification.problem import Problem
 
 GUESSED = "guessed: too small where the log was smoothed; state the output's sd"
 """of a noise that nobody stated"""
@@ -35,3 +40,27 @@ def too_good(
         "from differences between samples, and is far too small where the log was smoothed or "
         "simulated; state the outputs' sd. Compare such numbers with one another alone."
     )
+
+
+def guessed_gusts(problem: Problem) -> str:
+    """A sentence where the disturbances' size is the guess that a search begins with; else empty.
+
+    Args:
+        problem: with its vehicle, where a size may be stated.
+    """
+    if not estimator_of(problem.method).process_noise:
+        return ""
+    sizes = [d.sigma for d in disturbances_of(problem.model)]
+    stated = [n for n in sizes if _is_stated(float(getattr(problem.vehicle, n)))]
+    guessed = [n for n in sizes if n not in stated]
+    if not guessed:
+        return ""
+    return (
+        f"Nobody stated {' and '.join(guessed)}: gusts as large as the whole motion are taken, so "
+        "the expected sds are the widest there are. In calm air a fit, which estimates the gusts, "
+        "was 75 times surer; method: output-error shows the other end."
+    )
+
+
+def _is_stated(value: float) -> bool:
+    return math.isfinite(value) and value > 0.0
