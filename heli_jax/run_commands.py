@@ -9,6 +9,7 @@ from typing import Any
 
 from heli_jax import run_directory
 from heli_jax.errors import InputError
+from heli_jax.summaries import adequacy_of
 from heli_jax.terminal_table import print_table
 
 _DEEPEST = 3
@@ -41,13 +42,11 @@ def _found(folder: Path) -> Iterator[dict[str, Any]]:
     for path in _files(folder, _DEEPEST):
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            adequate = {True: "yes", False: "no", None: "not judged"}[content["adequate"]]
-            summary = str(content.get("adequacy", {}).get("summary", ""))
-            limited = (w for w in ("in size only", "one step ahead only") if summary.startswith(w))
-            adequate = next(limited, adequate)
+            # Without its reasons, for which a table has no room.
+            adequate = adequacy_of(content).partition(" (")[0]
             row = {k: content[k] for k in ("model", "method", "status")}
         # Any file may be called so: what no fit wrote is no run.
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue
         date = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
         name = str(path.parent.relative_to(folder))

@@ -88,7 +88,7 @@ def _pictures(compared: ComparedRuns, numbers: Numbers) -> Iterator[tuple[Pictur
         if made is not None:
             drawn = {label for label, _ in found}
             missing = [label for label in compared.labels if label not in drawn]
-            without = f"no {output} in a flight named {name}"
+            without = f"no {output} of that log in a flight named {name}, or no result"
             yield made, f"Not drawn: {', '.join(missing)} ({without})." if missing else ""
         for input in dict.fromkeys(n for _, s in found for n in s.inputs):
             draw = functools.partial(bode_overlay, found, name, output, input)
@@ -101,12 +101,18 @@ def _overlaps(
     compared: ComparedRuns,
 ) -> Iterator[tuple[str, str, list[tuple[str, Signals]]]]:
     """Flights and outputs that more than one run has, with the runs' signals."""
-    by_place: dict[tuple[str, str], list[tuple[str, Signals]]] = {}
+    by_place: dict[tuple[str, str, str], list[tuple[str, Signals]]] = {}
     for label, run in zip(compared.labels, compared.runs, strict=True):
+        # What stopped on its way is no result, and simulates nothing that was found.
+        if run.status == "not-converged":
+            continue
+        # Flights without a name are all called flight 1, whatever log they are of.
+        logs = {f.get("flight"): str(f.get("sha256")) for f in run.content["data"]}
         for signals in run.signals:
+            log = logs.get(signals.flight, "")
             for output in signals.measured:
-                by_place.setdefault((signals.flight, output), []).append((label, signals))
-    for (name, output), found in by_place.items():
+                by_place.setdefault((log, signals.flight, output), []).append((label, signals))
+    for (_, name, output), found in by_place.items():
         if len(found) > 1:
             yield name, output, found
 

@@ -118,7 +118,7 @@ class ComparedRuns(NamedTuple):
                 run.status,
                 # What the data determine is a property of an optimum.
                 "No optimum was reached." if run.status == "not-converged" else run.verdict,
-                {True: "yes", False: "no", None: "not judged"}[run.adequate],
+                run.adequacy,
             )
             for label, run in zip(self.labels, self.runs, strict=True)
         ]
@@ -139,6 +139,8 @@ class ComparedRuns(NamedTuple):
                     notes.append("Differences are from the first run: name one first that did.")
             elif run.adequate is False:
                 notes.append(f"{label} is not adequate: its intervals may be too narrow.")
+            elif run.overconfident:
+                notes.append(f"{label}: its sd are too small, since its residuals are not white.")
         return tuple(notes)
 
     def to_dataframe(self) -> "pd.DataFrame":

@@ -55,7 +55,12 @@ def residuals(fit: Fit) -> dict[str, Any]:
     """Whether they are white, and whether inputs follow what they stand for."""
     whiteness = {name: w._asdict() for name, w in fit.whiteness.items()}
     return {
-        "residuals": {"white": fit.white, "note": whiteness_note(fit), "by_output": whiteness},
+        "residuals": {
+            "white": fit.white,
+            "overconfident": fit.overconfident,
+            "note": whiteness_note(fit),
+            "by_output": whiteness,
+        },
         "feedback": [{**f._asdict(), "present": f.present, "level": LEVEL} for f in fit.feedback],
         "moved_by_feedback": {n: m._asdict() for n, m in fit.moved_by_feedback.items()},
         "held_upright": fit.held_upright,

@@ -13,7 +13,7 @@ from heli_jax.errors import InputError
 from heli_jax.identification.result import Estimate, Signals
 from heli_jax.identification.validation.metrics import Metrics
 from heli_jax.regular_file import read_regular
-from heli_jax.summaries import Summary, as_html, as_text, of_estimates
+from heli_jax.summaries import Summary, adequacy_of, as_html, as_text, of_estimates
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +46,16 @@ class SavedFit(NamedTuple):
     notes: tuple[str, ...]
     content: dict[str, Any]
     """all of fit.json"""
+
+    @property
+    def adequacy(self) -> str:
+        """`yes`, `in size only (...)`, `no (...)` and so on, as the fit said it."""
+        return adequacy_of(self.content)
+
+    @property
+    def overconfident(self) -> bool:
+        """Whether the intervals are too narrow, since residuals are not white."""
+        return bool((self.content.get("residuals") or {}).get("overconfident", False))
 
     def to_dataframe(self, *, nuisance: bool = False) -> "pd.DataFrame":
         """The estimates as a pandas data frame, as `Fit.to_dataframe`.

@@ -91,12 +91,30 @@ def test_what_did_not_converge_is_not_compared_and_one_log_is_said(tmp_path: Pat
     assert "share a log" in words
 
 
+def test_verdicts_are_those_of_the_fits(tmp_path: Path) -> None:
+    summary = "in size only (the residual of p still follows lat)"
+    limited = {"adequacy": {"summary": summary}, "residuals": {"overconfident": True}}
+    a = write_run(tmp_path / "a", {"Ixx": (0.02, 0.001)}, **limited)
+    b = write_run(tmp_path / "b", {"Ixx": (0.03, 0.001)})
+    compared = compare_runs([a, b])
+    assert [row[-1] for row in compared.verdicts.rows] == [summary, "yes"]
+    assert any("a: its sd are too small" in note for note in compared.notes)
+
+
+def test_runs_of_different_logs_are_not_drawn_over_one_record(tmp_path: Path) -> None:
+    fits = [write_run(tmp_path / name, {"Ixx": (0.02, 0.001)}) for name in ("a1", "b1", "b2")]
+    fits.append(write_run(tmp_path / "b3", {"Ixx": (0.02, 0.001)}, status="not-converged"))
+    ((name, output, found),) = compared_page._overlaps(compare_runs(fits))
+    assert (name, output, [label for label, _ in found]) == ("flight 1", "p", ["b1", "b2"])
+
+
 def test_the_commands_list_and_compare(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hostile = "<script>alert(1)</script>"
     a = write_run(tmp_path / "runs" / "a", {"Ixx": (0.02, 0.001)}, model=hostile)
-    b = write_run(tmp_path / "runs" / "deeper" / "b", {"Ixx": (0.03, 0.001)})
+    one_log = [{"flight": "flight 1", "hold_out": False, "sha256": "a"}]
+    b = write_run(tmp_path / "runs" / "deeper" / "b", {"Ixx": (0.03, 0.001)}, data=one_log)
     (tmp_path / "runs" / "c").mkdir()
     (tmp_path / "runs" / "c" / "fit.json").write_text("[1]")
     monkeypatch.chdir(tmp_path)
@@ -152,7 +170,7 @@ def test_what_a_number_is_and_by_which_estimator_is_said(tmp_path: Path) -> None
 
 
 def test_one_run_that_diverges_leaves_the_others_their_axes(tmp_path: Path) -> None:
-    runs = [write_run(tmp_path / n, {"K": (2.0, 0.1)}) for n in "ab"]
+    runs = [write_run(tmp_path / n, {"K": (2.0, 0.1)}) for n in ("a1", "a2")]
     signals = (runs[1] / "signals.csv").read_text().splitlines()
     signals = [signals[0], *(f"{line.rsplit(',', 1)[0]},1e14" for line in signals[1:])]
     (runs[1] / "signals.csv").write_text("\n".join(signals))
