@@ -7,6 +7,7 @@ from pathlib import Path
 
 from heli_jax.config.keys import Key, json_schema, keys, matching
 from heli_jax.errors import InputError
+from heli_jax.run_directory import whole_file
 
 _WIDEST = 100
 """columns of text: longer lines are hard to read"""
@@ -44,8 +45,12 @@ def write_schema(path: Path) -> None:
 
     Args:
         path: where; what stands there is replaced.
+
+    Raises:
+        InputError: it cannot be written there.
     """
-    path.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
+    with whole_file(path, f"--schema {path}") as temporary:
+        temporary.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
 
 
 def _lines(key: Key, width: int) -> list[str]:

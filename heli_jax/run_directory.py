@@ -4,6 +4,7 @@ import contextlib
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -37,15 +38,23 @@ def require_free(path: Path, otherwise: str = "") -> None:
     parent = path.absolute().parent
     while not parent.exists():
         parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
+    try:
+        # By trying: permissions do not tell of file systems that hold nothing new.
+        os.rmdir(tempfile.mkdtemp(prefix=f".{path.name}-", dir=parent))
+    except OSError as e:
         raise InputError(
             f"--out {path}: expected a place in a folder that can be written to, got {parent}"
-        )
+        ) from e
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A temporary directory beside `path`, renamed to it at the end, removed where that fails."""
+def whole(path: Path, *, replaces: bool = False) -> Iterator[Path]:
+    """A temporary directory beside `path`, renamed to it at the end, removed where that fails.
+
+    Args:
+        path: the directory.
+        replaces: whether it stands for an earlier one of this process, which goes then.
+    """
     # Beside it and not in /tmp: a rename is atomic within one file system only.
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     temporary = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
@@ -54,6 +63,8 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.mkdir(mode=0o700)
         yield temporary
         temporary.chmod(0o755)  # until now for its owner alone
+        if replaces:
+            _give_way(path)
         os.rename(temporary, path)
         _finished.append(path)
     except BaseException:  # an interrupt too
@@ -61,6 +72,15 @@ def whole(path: Path) -> Iterator[Path]:
         raise
     finally:
         _unfinished.discard(temporary)
+
+
+def _give_way(path: Path) -> None:
+    """Take away a directory of this process."""
+    aside = path.absolute().parent / f".{path.name}-{secrets.token_hex(4)}"
+    _unfinished.add(aside)
+    os.rename(path, aside)
+    shutil.rmtree(aside, ignore_errors=True)
+    _unfinished.discard(aside)
 
 
 def require_place(path: Path, where: str) -> None:

@@ -4,6 +4,7 @@
 `heli-jax check` does. `load_fit` reads what an earlier fit wrote.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -126,19 +127,20 @@ def run_fit(
         run_directory.require_free(Path(out))  # before the work, not after it
     with recorded() as seconds:
         seconds["loading"] = time.perf_counter() - began
-        run = _fit_run(config, progress, began, with_findings=out is not None)
+        run = _fit_run(config, progress, began, out)
         run.fit.timing.update(seconds)
     if out is None:
         return run
     progress("writing the report")
     with stage("writing the report"):
-        return write_report(run, out)
+        return write_report(run, out, replaces=_long_intervals(run.config))
 
 
 def _fit_run(
-    config: Experiment | str | Path, progress: Say, began: float, *, with_findings: bool
+    config: Experiment | str | Path, progress: Say, began: float, out: str | Path | None
 ) -> FitRun:
-    """`run_fit` without its report."""
+    """`run_fit` without its report; before intervals that take long, that of the fit alone."""
+    with_findings = out is not None
     # A reader shows how far it is by itself.
     with stage("reading the log", name="reading", shown=False):
         config = config if isinstance(config, Experiment) else load_config(config)
@@ -173,11 +175,35 @@ def _fit_run(
         raise InputError(f"{config.path}: fit: {e}") from e
     with stage("recursive least squares", name="rls"):
         rls = _baseline(config, problem, fitted, progress)
-    with stage("what else was asked for", name="further analyses"):
-        further = _supplementary(config, problem, fitted, progress)
+    if out is not None and _long_intervals(config):
+        _keep(FitRun(config, problem, fitted, rls, began=began), out, progress)
+    try:
+        with stage("what else was asked for", name="further analyses"):
+            further = _supplementary(config, problem, fitted, progress)
+    except InputError:
+        if out is not None and _long_intervals(config):
+            shutil.rmtree(out, ignore_errors=True)
+        raise
     with stage("whether the log was enough", name="findings"):
         further = further._replace(findings=_at_estimates(problem, fitted, enough))
     return FitRun(config, problem, fitted, rls, further, began=began)
+
+
+def _long_intervals(config: Experiment) -> bool:
+    """Whether intervals are asked for that take longer than the fit."""
+    options = config.config.fit
+    assert options is not None
+    methods = options.intervals
+    return bool(methods.profile or methods.bootstrap or methods.nuts)
+
+
+def _keep(run: FitRun, out: str | Path, progress: Say) -> None:
+    """Write a fit before further intervals are sought, so that an interrupt does not lose it."""
+    words = "The further intervals that were asked for are not in it: the run was interrupted."
+    fitted = replace(run.fit, notes=(*run.fit.notes, words))
+    with stage("writing the fit", name="report"):
+        write_report(replace(run, fit=fitted), out)
+    progress(f"the fit is in {out}; what else was asked for comes into it")
 
 
 def _require_rates(problem: Problem) -> None:
@@ -334,11 +360,16 @@ def compare_models(
         raise InputError(f"{config.path}: fit: {e}") from e
 
 
-def write_report(run: FitRun, out: str | Path) -> FitRun:
+def write_report(run: FitRun, out: str | Path, *, replaces: bool = False) -> FitRun:
     """Write a fit's run directory: config.yaml, fit.json, signals.csv, report.html, figures/; and
     posterior.nc and bootstrap.nc where there are draws of NUTS and samples of the bootstrap.
 
     The directory appears whole or not at all. Returns the run with `directory` set.
+
+    Args:
+        run: of `run_fit`.
+        out: the directory.
+        replaces: whether it stands there from an earlier moment of this run.
 
     Raises:
         InputError: `out` exists or cannot be written to, or the extra `bayes` is missing.
@@ -349,12 +380,13 @@ def write_report(run: FitRun, out: str | Path) -> FitRun:
     from heli_jax.report.sample_files import sample_files, write_samples
 
     out = Path(out)
-    run_directory.require_free(out)
+    if not replaces:
+        run_directory.require_free(out)
     started = time.perf_counter()
     # Before the figures: a configuration that cannot be written out fails at once.
     text = as_yaml(configuration.resolved(run.config))
     vehicle, extra = run.config.vehicle, _with_responses(run)
-    with run_directory.whole(out) as folder:
+    with run_directory.whole(out, replaces=replaces) as folder:
         (folder / "config.yaml").write_text(text, encoding="utf-8")
         files.write_signals(folder / "signals.csv", run.fit.signals)
         title = run.config.path.stem

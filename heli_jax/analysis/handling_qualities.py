@@ -69,6 +69,12 @@ class Number(NamedTuple):
     lower95: float
     upper95: float
 
+    @property
+    def known(self) -> bool:
+        """Whether it has an interval: that of a model whose parameters the data do not determine,
+        or whose fit stopped on its way, has none and is no result."""
+        return self.sd >= 0.0
+
 
 class HandlingQualities(NamedTuple):
     """What a response says."""

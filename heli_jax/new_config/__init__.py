@@ -19,7 +19,7 @@ from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
 from heli_jax.new_config.rate import channels_of_preset, common_rate
 from heli_jax.numerics.white_noise import wanders, without_noise
-from heli_jax.run_directory import require_place
+from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
 from heli_jax.yaml_file import EDIT, parse_mapping
 
@@ -95,7 +95,8 @@ def write_config(
         preset_outputs=tuple(_only_turn(chosen.model).values()),
     )
     for path, words in {out: content, **paths}.items():
-        path.write_text(words, encoding="utf-8")
+        with whole_file(path, str(path)) as temporary:
+            temporary.write_text(words, encoding="utf-8")
     todo = sum(words.count(EDIT) for words in (content, *paths.values()))
     notes = [f"wrote {', '.join(map(str, (out, *paths)))}", *read.notes]
     if todo:

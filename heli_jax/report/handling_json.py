@@ -24,7 +24,7 @@ def _plain(of: HandlingQualities | str | None) -> dict[str, Any] | None:
         # What is not determined is null, and not left out: programs ask by name.
         "numbers": {
             name: {**of.numbers[name]._asdict(), "unit": UNITS[name]}
-            if name in of.numbers
+            if name in of.numbers and of.numbers[name].known
             else None
             for name in NUMBERS[of.kind]
         },

@@ -20,6 +20,7 @@ _WORDS = {
     "phase_margin": "phase margin",
     "gain_margin": "gain margin",
 }
+_NO_RESULT = "the parameters that it hangs on are not determined, or no optimum was reached."
 _HEADLINES = ("bandwidth", "phase_delay", "crossover", "phase_margin", "gain_margin")
 """what the terminal shows"""
 
@@ -45,7 +46,7 @@ def _sources(entries: Sequence[Handling]) -> tuple[str, ...]:
 
 def _cell(of: HandlingQualities | str | None, name: str) -> str:
     found = of.numbers.get(name) if isinstance(of, HandlingQualities) else None
-    if found is None:
+    if found is None or not found.known:
         return NOT_DETERMINED
     # Pilots' criteria count in rad/s, rotors and filters in Hz.
     hz = f", {number(found.value / (2.0 * np.pi), 3)} Hz" if UNITS[name] == "rad/s" else ""
@@ -53,8 +54,6 @@ def _cell(of: HandlingQualities | str | None, name: str) -> str:
 
 
 def _shown(n: Number) -> str:
-    if not n.sd >= 0.0:  # of a model whose parameters are not known well enough for an interval
-        return number(n.value, 3)
     return f"{number(n.value, 3)} ({number(n.lower95, 3)} to {number(n.upper95, 3)})"
 
 
@@ -65,6 +64,8 @@ def handling_sentences(entries: Sequence[Handling]) -> list[str]:
         for source in _sources(entries):
             of = getattr(entry, source)
             sentences = (of,) if isinstance(of, str) else () if of is None else of.sentences
+            if isinstance(of, HandlingQualities) and not all(n.known for n in of.numbers.values()):
+                sentences = (*sentences, _NO_RESULT)
             said += [f"{entry.pair.words}, {source}: {s}" for s in sentences]
     return said
 
