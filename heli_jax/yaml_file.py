@@ -70,12 +70,17 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     return parse_mapping(text, str(path))
 
 
+_KINDS: dict[type, str] = {str: "text", list: "a list", int: "a number", float: "a number"}
+
+
 def parse_mapping(text: str, where: str) -> dict[str, Any]:
     """As `read_mapping`, for text that is at hand; `where` stands for the file's name."""
     value = _load(text, where)
     if not isinstance(value, dict):
-        kind = "nothing" if value is None else f"a {type(value).__name__}"
-        raise InputError(f"{where}: expected keys with values, got {kind}")
+        kind = "nothing" if value is None else _KINDS.get(type(value), "something else")
+        # A log begins with a row of words, which is YAML for one text.
+        log = "; of a log `heli-jax new LOG` makes a configuration" if "," in text[:200] else ""
+        raise InputError(f"{where}: expected keys with values, got {kind}{log}")
     return value
 
 

@@ -13,6 +13,7 @@ from heli_jax.flights.flight import Flight
 from heli_jax.identification.free import Free
 from heli_jax.identification.methods import METHODS, estimator_of
 from heli_jax.identification.problem import Problem
+from heli_jax.linear_models.read import is_shipped
 
 if TYPE_CHECKING:
     from heli_jax.identification.equation_error.first_guess import EquationErrorStart
@@ -49,8 +50,8 @@ def first_guesses(
         if missing:
             raise InputError(
                 f"{path}: fit.free.{missing[0]}.start: missing, expected a number to begin with, "
-                "a value in the vehicle file, or fit.start: equation-error, which finds one for "
-                "linear models"
+                "a value in the vehicle file or the model's own, or fit.start: equation-error, "
+                "which finds one for linear models"
             )
         return dict(free), None
     # Not before it is needed: it takes a second to import.
@@ -74,8 +75,9 @@ def first_guesses(
 
 def _from_vehicle(experiment: Experiment, free: Mapping[str, Free]) -> Mapping[str, Free]:
     """Starts that are left out, from the vehicle file."""
-    # The numbers of a linear model's own file are those of some other machine.
-    if isinstance(experiment.config.model, LinearConfig):
+    # The numbers of a linear model that ships are those of some other machine.
+    model = experiment.config.model
+    if isinstance(model, LinearConfig) and is_shipped(model.linear):
         return free
     stated = experiment.vehicle.constants
     return {
