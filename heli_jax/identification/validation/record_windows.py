@@ -51,6 +51,8 @@ _FEWEST = 8
 _MOST = 200
 """windows: each has unknowns of its own, so that time and memory grow with their square"""
 _ROUNDING = 1e-12
+_ANOTHER = 0.02
+"""of a window: how far the one at the end has to lie from that before it"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,7 +266,8 @@ def _cuts(flights: Sequence[Flight], samples: int, cell: int) -> list[tuple[int,
             count = (n - first) // cell
             if count * cell >= samples:
                 cuts.append((i, first, first + count * cell))
-        if n >= samples and n % cell:
+        # An end of a few samples more makes no other window.
+        if n >= samples and n % cell > _ANOTHER * samples:
             cuts.append((i, n - samples, n))
     return cuts
 
