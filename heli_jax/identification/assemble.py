@@ -39,7 +39,7 @@ from heli_jax.identification.uncertainty.estimates import (
     with_limits,
 )
 from heli_jax.identification.uncertainty.standard_errors import StandardErrors, standard_errors
-from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, unpack
+from heli_jax.identification.unknowns.layout import Layout, Noise, Solution, scales_of
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
 from heli_jax.identification.validation.adequacy import Adequacy, Evidence, assess, by_responses
@@ -146,7 +146,7 @@ def _numbers(
     if layout.estimator.nuisances_in_rows:
         nuisance |= flight_nuisances(problem, at, e, quantiles, wider)
     nuisance |= {n: _absent(nuisance[n], gone=n in layout.sigmas) for n in absent}
-    sds = noise_by_name(problem, at.noise, unpack(layout, at.data, at.z).scales)
+    sds = noise_by_name(problem, at.noise, scales_of(layout, at.z))
     return Numbers(of_interest, nuisance, sds)
 
 
@@ -154,7 +154,7 @@ def _ill_conditioned(
     problem: Problem, search: Search, optimum: RelaxedOptimum, e: Evaluation
 ) -> bool:
     """Whether the numbers at the end of a search, with what they tell `e`, are rounding."""
-    scales = unpack(search.layout, search.data, optimum.best.z).scales
+    scales = scales_of(search.layout, optimum.best.z)
     sds = noise_by_name(problem, optimum.noise, scales)
     return search.layout.estimator.ill_conditioned(problem, e, sds)
 

@@ -11,6 +11,7 @@ from heli_jax.config.logs import read_flights
 from heli_jax.flights.stick_dropouts import stick_dropouts
 from heli_jax.identification.validation.late_angles import lateness
 from heli_jax.identification.validation.misread import clipped, dropouts, misread, record_doubts
+from heli_jax.identification.validation.signal_quality import facts_of
 from heli_jax.identification.validation.signal_signs import angle_over_rate
 
 TREX = Path(__file__).parents[3] / "shared" / "data" / "trex550"
@@ -18,6 +19,10 @@ DT, N = 0.02, 1000
 T = DT * np.arange(N)
 U = 0.1 * np.sign(np.sin(2.3 * T) + 0.5 * np.sin(5.1 * T)) + 0.02 * np.sin(11.0 * T)
 P = 0.4 * np.sin(1.7 * T) + 0.2 * np.cos(4.3 * T)
+
+
+def facts(problem):
+    return [facts_of(flight) for flight in problem.training]
 
 
 @pytest.fixture
@@ -95,11 +100,12 @@ def test_dropouts_are_no_measurements_and_can_be_stated(load):
     p[np.random.default_rng(1).choice(N, 20, replace=False)] = 0.0
     found = of(flights(load(p)))
     assert record_doubts(found).words == ["dropouts of p are taken for measurements"]
-    [one] = dropouts(found)
+    [one] = dropouts(found, facts(found))
     assert "state missing: 0 beside its signal" in one.finding.sentence
     [flight] = flights(load(p, missing=0))
     assert np.isnan(flight.outputs["p"]).sum() == 20
-    assert dropouts(of([flight])) == []
+    problem = of([flight])
+    assert dropouts(problem, facts(problem)) == []
 
 
 def test_a_stick_that_drops_out():
@@ -118,7 +124,7 @@ def test_flat_tops_are_no_measurements(load):
     noisy = P + 0.01 * rng.standard_normal(N)
     for limit, reasons in ((0.4, ["p is cut off in "]), (np.inf, [])):
         problem = of(flights(load(np.clip(noisy, -limit, limit), unit_of_p="rad/s")))
-        assert len(clipped(problem)) == len(reasons)
+        assert len(clipped(problem, facts(problem))) == len(reasons)
         assert [
             said[: len(reasons[0])] for said in record_doubts(problem).words if reasons
         ] == reasons

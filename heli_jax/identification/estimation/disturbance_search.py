@@ -16,7 +16,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     relaxed_from,
 )
 from heli_jax.identification.estimation.noise_search import noise_guess_at, noise_guesses_by_tau
-from heli_jax.identification.unknowns.layout import Layout, disturbance_limits, unpack
+from heli_jax.identification.unknowns.layout import Layout, disturbance_limits, scales_of
 
 NO_DISTURBANCE = 2.71
 """twice a log-likelihood ratio below which a disturbance is not significant at 5 %: sigma_w = 0 is
@@ -239,7 +239,7 @@ def _corrects(search: Search, without: RelaxedOptimum, e: Evaluation) -> bool:
         e: at that optimum.
     """
     # The noise of each output but the first has a factor of its own among the unknowns.
-    scales = unpack(search.layout, search.data, without.best.z).scales
+    scales = scales_of(search.layout, without.best.z)
     # Without a state to correct the innovation's variance is that of the measurement.
     return any(
         float(np.nanmax(s / (sd[n] * float(scales.get(n, 1.0))) ** 2)) > 1.01

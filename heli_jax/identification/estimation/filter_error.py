@@ -41,7 +41,7 @@ from heli_jax.identification.unknowns.layout import (
     Noise,
     Solution,
     Unknowns,
-    unpack,
+    scales_of,
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.simulation.options import SimulationOptions
@@ -200,7 +200,7 @@ class FilterError(Estimator):
             for sd in noise.sd
         )
         blind = evaluate(layout, data, noise._replace(sd=blinding), z)
-        scales = unpack(layout, data, z).scales
+        scales = scales_of(layout, z)
         missed: dict[str, float] = {}
         expected: dict[str, float] = {}
         each = zip(e.raw, blind.innovations, blinding, noise.sd, strict=True)

@@ -67,9 +67,9 @@ class Resolved(NamedTuple):
     T: Complex[Array, "n n"]
     """Ad = V T V^H, triangular"""
     V: Complex[Array, "n n"]
-    W: Float[Array, "K 2p 2p"]
+    W: Complex[Array, "K p p"]
     """the whitening"""
-    H: Float[Array, "K 2p 2n"]
+    H: Complex[Array, "K p n"]
     """W C (zI - Ad)^-1"""
     Q: Float[Array, "s n"]
     """an orthonormal basis of what the ends may add to whitened rows; zero where a state leaves no
@@ -87,6 +87,8 @@ class Errors(NamedTuple):
     """the states"""
     signals: Signals
     """at the lines"""
+    beyond: Complex[Array, "K p"]
+    """measured less what the inputs add to the outputs past the states"""
 
 
 def alike(layout: Layout, data: Data) -> list[list[int]]:
@@ -196,7 +198,7 @@ def resolved(m: Matrices, record: Record, whitening: Complex[Array, "K p p"]) ->
     H = whitening @ (_solved(z, T, m.C.astype(z.dtype) @ V, left=False) @ jnp.conj(V.T))
     # What the ends of the record explain is found by linear least squares.
     Q, solution = _span(stacked(jnp.asarray(z)[:, None, None] * H).reshape(-1, H.shape[2]))
-    return Resolved(z, T, V, _real(whitening), _real(H), Q, solution)
+    return Resolved(z, T, V, whitening, H, Q, solution)
 
 
 def _triangle(Ad: Float[Array, "n n"]) -> tuple[Complex[Array, "n n"], Complex[Array, "n n"]]:
@@ -230,7 +232,7 @@ def stacked(v: Array) -> Array:
     return jnp.stack([jnp.real(v), jnp.imag(v)], axis=1)
 
 
-def _real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
+def real(M: Complex[Array, "K a b"]) -> Float[Array, "K 2a 2b"]:
     """The real matrix that does to stacked vectors what M does to complex ones."""
     re, im = jnp.real(M), jnp.imag(M)
     return jnp.concatenate(
@@ -253,9 +255,15 @@ def at_lines(record: Record, v: Float[Array, "N c"]) -> Complex[Array, "K c"]:
 
 
 def errors_of_some(
-    at: Resolved, m: Matrices, record: Record, signals: Signals, y: Float[Array, "f N p"]
-) -> Errors:
-    """Of one record of each of a few flights of one machine, with a leading axis.
+    at: Resolved,
+    m: Matrices,
+    record: Record,
+    signals: Signals,
+    y: Float[Array, "f N p"],
+    by: Signals | None = None,
+) -> tuple[Errors, Complex[Array, "f K n"] | None]:
+    """Of one record of each of a few flights of one machine, with a leading axis; and the states
+    that inputs by instrument make, None without any.
 
     Args:
         at: the machine at the record's lines.
@@ -263,20 +271,29 @@ def errors_of_some(
         record: which samples it is.
         signals: over the whole flights.
         y: what was measured.
+        by: the inputs by instrument.
     """
+    B, D = (M.T.astype(at.z.dtype) for M in (m.B, m.D))
 
-    def of_one(signals: Signals, y: Float[Array, "N p"]) -> Errors:
+    def of_one(signals: Signals, y: Float[Array, "N p"]) -> tuple[Array, Array, Signals, Array]:
         lines = Signals(*(at_lines(record, v) for v in signals))
-        passing = lines.acting @ m.D.T.astype(at.z.dtype)
-        driving = lines.U @ m.B.T.astype(at.z.dtype)
-        rest = _times(at.W, at_lines(record, y) - passing)
-        white = rest - _times(at.H, driving)
-        d = at.solution @ (at.Q.T @ white.reshape(-1))
-        driving = driving + at.z[:, None] * d.astype(at.z.dtype)[None, :]
-        return Errors(rest - _times(at.H, driving), states(at, driving), lines)
+        beyond = at_lines(record, y) - lines.acting @ D
+        driving = lines.U @ B
+        white = stacked(_times(at.W, beyond) - _times(at.H, driving)).reshape(record.lines, -1)
+        # The ends of the record: what they add lies along Q.
+        along = at.Q.T @ white.reshape(-1)
+        d = (at.solution @ along).astype(at.z.dtype)
+        rows = white - (at.Q @ along).reshape(white.shape)
+        return rows, driving + at.z[:, None] * d[None, :], lines, beyond
 
     # Under vmap flights are columns of the same products and substitutions.
-    return jax.vmap(of_one)(signals, y)
+    rows, driving, lines, beyond = jax.vmap(of_one)(signals, y)
+    if by is not None:
+        others = jax.vmap(lambda U: at_lines(record, U) @ B)(by.U)
+        driving = jnp.concatenate([driving, others])
+    X = jax.vmap(lambda driving: states(at, driving))(driving)
+    count = rows.shape[0]
+    return Errors(rows, X[:count], lines, beyond), None if by is None else X[count:]
 
 
 def states(at: Resolved, driving: Complex[Array, "K n"]) -> Complex[Array, "K n"]:
@@ -307,8 +324,8 @@ def _solved(z: Complex[np.ndarray, " K"], T: Array, b: Array, *, left: bool) -> 
     return jax.lax.platform_dependent(M, b, cpu=triangle, default=whole)
 
 
-def _times(M: Float[Array, "K a 2b"], v: Complex[Array, "K b"]) -> Float[Array, "K a"]:
-    return jnp.einsum("kab,kb->ka", M, stacked(v).reshape(v.shape[0], -1))
+def _times(M: Complex[Array, "K a b"], v: Complex[Array, "K b"]) -> Complex[Array, "K a"]:
+    return jnp.einsum("kab,kb->ka", M, v)
 
 
 @eqx.filter_jit
@@ -334,11 +351,9 @@ def errors_of_lines(
         def of_some(common: Any, some: Any, parts: Any = parts) -> list[Array]:
             m, ats = common
             made = []
-            for at, (record, W) in zip(ats, parts, strict=True):
-                rows = errors_of_some(at, m, record, *some).rows
-                rows = rows.reshape(rows.shape[0], record.lines, 2, -1)
-                white = jax.lax.complex(rows[:, :, 0], rows[:, :, 1])
-                made.append(jnp.einsum("kij,fkj->fki", jnp.linalg.inv(W), white))
+            for at, (record, _) in zip(ats, parts, strict=True):
+                e, _ = errors_of_some(at, m, record, *some)
+                made.append(e.beyond - e.X @ m.C.T.astype(at.z.dtype))
             return made
 
         each = (machines.signals, y)

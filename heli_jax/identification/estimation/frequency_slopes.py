@@ -26,9 +26,9 @@ from heli_jax.identification.estimation.frequency_lines import (
     machines_of,
     measured,
     parts_of_group,
+    real,
     resolved,
     stacked,
-    states,
 )
 from heli_jax.identification.estimation.frequency_records import Record
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise, Unknowns
@@ -59,8 +59,10 @@ class _Driven(NamedTuple):
 class _Shared(NamedTuple):
     """Of a record's lines what flights of one machine have in common."""
 
-    H: Float[Array, "K 2p 2n"]
-    W: Float[Array, "K 2p 2p"]
+    H: Array
+    """(K, p, n), or for each line the real matrix of it"""
+    W: Array | None
+    """the same of (K, p, p); None where nothing that it multiplies moves"""
     Q: Float[Array, "K 2p n"]
 
 
@@ -157,29 +159,26 @@ def _of_record(
         instruments: the inputs by instrument and their derivatives.
     """
     (at, m, dm), (signals, ds, y) = common, given
-    e = errors_of_some(at, m, record, signals, y)
+    by = None if instruments is None else instruments[0]
+    e, X_by = errors_of_some(at, m, record, signals, y, by)
     driven = jax.vmap(lambda e, ds: _Driven(e.X, e.signals, _lines(record, ds)))(e, ds)
-    lines = _Shared(at.H, at.W, at.Q.reshape(*e.rows.shape[1:], -1))
-
-    def directly() -> _Sums:
-        return _summed(m, dm, lines, _Own(e.rows, driven))
-
-    if instruments is None:
-        return directly()
-
-    def driven_by(by: Signals, dby: Signals) -> _Driven:
-        of_lines = Signals(*(at_lines(record, v) for v in by))
-        X = states(at, of_lines.U @ m.B.T.astype(at.z.dtype))
-        return _Driven(X, of_lines, _lines(record, dby))
-
-    def with_instruments() -> _Sums:
-        return _summed(m, dm, lines, _Own(e.rows, driven, jax.vmap(driven_by)(*instruments)))
-
-    # One program for both: the direct estimate is where the search by instrument begins.
-    return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
+    own = _Own(e.rows, driven)
+    if instruments is not None:
+        own = own._replace(by=jax.vmap(lambda *v: _driven_by(record, *v))(X_by, *instruments))
+    # What passes a machine by, without its states, hangs on no unknown of most.
+    passes = any(v is not None for v in (dm.C, dm.D, ds.acting))
+    W = at.W if passes else None
+    lines = _Shared(at.H, W, at.Q.reshape(*e.rows.shape[1:], -1))
+    return _summed((m, dm), lines, own, by_instrument)
 
 
-def _summed(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
+def _driven_by(record: Record, X: Complex[Array, "K n"], by: Signals, dby: Signals) -> _Driven:
+    return _Driven(X, Signals(*(at_lines(record, v) for v in by)), _lines(record, dby))
+
+
+def _summed(
+    matrices: tuple[Matrices, Matrices], lines: _Shared, own: _Own, by_instrument: Array
+) -> _Sums:
     """Over all lines, some hundred at a time: the derivatives of all would leave every cache."""
     K = lines.H.shape[0]
     count = -(-K // _BLOCK)
@@ -193,7 +192,9 @@ def _summed(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
         return jnp.moveaxis(v, axis, 0)
 
     def made(block: tuple[_Shared, _Own]) -> _Sums:
-        return jax.lax.map(lambda one: _sums(m, dm, block[0], one), block[1])
+        H, W, Q = block[0]
+        shared = _Shared(real(H), None if W is None else real(W), Q)
+        return jax.lax.map(lambda one: _sums(matrices, shared, one, by_instrument), block[1])
 
     def more(total: _Sums, block: tuple[_Shared, _Own]) -> tuple[_Sums, None]:
         return jax.tree.map(jnp.add, total, made(block)), None
@@ -205,15 +206,38 @@ def _summed(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
     return jax.lax.scan(more, zeros, stacked_blocks)[0]
 
 
-def _sums(m: Matrices, dm: Matrices, lines: _Shared, own: _Own) -> _Sums:
-    J = Z = _slopes(lines, m, dm, own.driven)
-    if own.by is not None:
-        Z = _slopes(lines, m, dm, own.by)
+def _sums(
+    matrices: tuple[Matrices, Matrices], lines: _Shared, own: _Own, by_instrument: Array
+) -> _Sums:
+    e = own.e.reshape(-1, 1)
+    Q = lines.Q.reshape(e.shape[0], -1)
+
+    def slopes(of: _Driven) -> Float[Array, "s q"]:
+        made = _slopes(lines, *matrices, of)
+        return made.reshape(e.shape[0], -1)
+
     # J and Z are minus the derivatives: a sign that `products` gives back to Z e.
-    q = J.shape[2]
-    e, J, Z = own.e.reshape(-1), J.reshape(-1, q), Z.reshape(-1, q)
-    Q = lines.Q.reshape(e.size, -1)
-    return _Sums(e @ e, e @ Z, Z.T @ Z, Z.T @ J, Q.T @ e, Q.T @ Z, Q.T @ J)
+    def directly() -> _Sums:
+        J = slopes(own.driven)
+        # One product of tall matrices in place of several: each is read once.
+        q, P = J.shape[1], jnp.concatenate([J, e, Q], axis=1).T @ jnp.concatenate([J, e], axis=1)
+        ZZ, QJ = P[:q, :q], P[q + 1 :, :q]
+        return _Sums(P[q, q], P[:q, q], ZZ, ZZ, P[q + 1 :, q], QJ, QJ)
+
+    if own.by is None:
+        return directly()
+    by = own.by
+
+    def with_instruments() -> _Sums:
+        J, Z = slopes(own.driven), slopes(by)
+        q = J.shape[1]
+        P = jnp.concatenate([Z, e, Q], axis=1).T @ jnp.concatenate([Z, e, J], axis=1)
+        of_Z, of_Q = ((rows[:, q], rows[:, :q], rows[:, q + 1 :]) for rows in (P[:q], P[q + 1 :]))
+        return _Sums(P[q, q], *of_Z, *of_Q)
+
+    # One program for both: the direct estimate is where the search by instrument begins. Block by
+    # block, since what is made for all lines would be copied into the branch that is taken.
+    return jax.lax.cond(by_instrument > 0.5, with_instruments, directly)
 
 
 def _lines(record: Record, ds: Signals) -> Signals:
@@ -230,7 +254,8 @@ def _slopes(lines: _Shared, m: Matrices, dm: Matrices, of: _Driven) -> Float[Arr
     """The derivatives of the whitened response, real parts and imaginary ones."""
     driving = _moved(of.X, of.lines.U, (dm.Ad, dm.B), (m.B, of.slopes.U))
     passing = _moved(of.X, of.lines.acting, (dm.C, dm.D), (m.D, of.slopes.acting))
-    made = [M @ v for M, v in ((lines.H, driving), (lines.W, passing)) if v is not None]
+    pairs = ((lines.H, driving), (lines.W, passing))
+    made = [M @ v for M, v in pairs if M is not None and v is not None]
     return made[0] if len(made) == 1 else made[0] + made[1]
 
 

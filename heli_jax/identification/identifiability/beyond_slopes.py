@@ -11,12 +11,17 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
+from jaxtyping import Float
 
 from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
-from heli_jax.identification.estimation.levenberg_marquardt import measured_count
+from heli_jax.identification.estimation.levenberg_marquardt import (
+    measured_count,
+    residual_and_jacobian,
+)
 from heli_jax.identification.identifiability.sensitivity import unknowns_of, verdict_of
 from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown, Verdict
 from heli_jax.identification.problem import Problem
@@ -155,7 +160,6 @@ class _Point(NamedTuple):
     """The best that is found with some coordinates held."""
 
     z: np.ndarray
-    e: Evaluation
     squares: float
     """sum of them, less what a further step promises; infinite where nothing is found"""
 
@@ -164,15 +168,15 @@ def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
     """From z (q,) to the smallest sum of squares with the coordinates held (q,) where they are."""
     moving = ~held
     ridge = _RIDGE
-    now = _evaluated(at, z)
-    squares, promised = _squares(now), math.inf
+    now = _rows_at(at, z)
+    squares, promised = _squares(now.r), math.inf
     for _ in range(_STEPS):
-        r, J = np.asarray(now.r, np.float64), np.asarray(now.J, np.float64)[:, moving]
+        J = now.J[:, moving]
         # Past that the squares of a simulation that has diverged are no numbers.
         if not (squares < _HUGE and np.abs(J).max(initial=0.0) < _HUGE):
-            return _Point(now.z, now, math.inf)
+            return _Point(now.z, math.inf)
         Q, R = np.linalg.qr(J)
-        left = -(Q.T @ r)
+        left = -(Q.T @ now.r)
         damped = np.vstack([R, ridge * np.eye(len(R))])
         wanted = np.concatenate([left, np.zeros(len(R))])
         part = np.linalg.lstsq(damped, wanted, rcond=None)[0]
@@ -181,8 +185,8 @@ def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
             break
         step = np.zeros(z.size)
         step[moving] = part
-        then = _evaluated(at, now.z + step)
-        gained = squares - _squares(then)
+        then = _rows_at(at, now.z + step)
+        gained = squares - _squares(then.r)
         # Negated: also what is not finite is no step.
         if gained > 0:
             now, squares, ridge = then, squares - gained, max(_RIDGE, ridge / 10.0)
@@ -190,15 +194,26 @@ def _follow(at: Solution, z: np.ndarray, held: np.ndarray) -> _Point:
             break
         else:
             ridge *= 10.0
-    return _Point(np.asarray(now.z, np.float64), now, squares - promised)
+    return _Point(now.z, squares - promised)
 
 
-def _evaluated(at: Solution, z: np.ndarray) -> Evaluation:
-    return evaluate(at.layout, at.data, at.noise, jnp.asarray(z, at.z.dtype))
+class _Rows(NamedTuple):
+    """All that a step needs of a point: the simulation in time would cost some methods more."""
+
+    z: Float[np.ndarray, " q"]
+    r: Float[np.ndarray, " n"]
+    J: Float[np.ndarray, "n q"]
 
 
-def _squares(e: Evaluation) -> float:
-    r = np.asarray(e.r, np.float64)
+def _rows_at(at: Solution, z: np.ndarray) -> _Rows:
+    there = jnp.asarray(z, at.z.dtype)
+    made = residual_and_jacobian(at.layout, at.data, at.noise, there)
+    each = jax.device_get((there, made.r, made.J))
+    return _Rows(*(np.asarray(v, np.float64) for v in each))
+
+
+def _squares(r: np.ndarray) -> float:
+    r = np.asarray(r, np.float64)
     with np.errstate(all="ignore"):
         return float(r @ r)
 
@@ -249,7 +264,7 @@ class _Profile(NamedTuple):
         """The end of the interval towards smaller (-1) or larger (1) coordinates; None where
         the likelihood does not bound the parameter within the factor of ten."""
         sd = math.sqrt(float(self.along[self.i]))
-        z0, first = np.asarray(self.at.z, np.float64), _squares(self.e)
+        z0, first = np.asarray(self.at.z, np.float64), _squares(self.e.r)
         t = self.reach * sd
         furthest = self._furthest(side)
         seen, guess = [(0.0, 0.0)], z0
@@ -349,14 +364,15 @@ def _open_at_rest(
     if not (np.abs(z[held]) > _REST).any():
         return []
     point = _follow(at, np.where(held, 0.0, z), held)
-    lost = _lost(at, _squares(e), point.squares)
+    lost = _lost(at, _squares(e.r), point.squares)
     # Autocorrelated residuals let chance gain more.
     wider = max(1.0, float(np.median(reaches[held])) / Z95)
     if lost > wider**2 * scipy.special.chdtri(int(held.sum()), _BY_CHANCE):
         return []
-    if not np.isfinite(point.e.J).all():
+    e = evaluate(layout, at.data, at.noise, jnp.asarray(point.z, at.z.dtype))
+    if not np.isfinite(e.J).all():
         return []
-    there = verdict_of(problem, layout, point.e)
+    there = verdict_of(problem, layout, e)
     return [
         np.array([v[n] for n in there.names])
         for v in there.null_directions

@@ -27,11 +27,11 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
         problem: the start values, in the units of the parameters.
     """
     dtype = data.low.dtype
+    # Fetched once: an entry by itself would be a program of its own, for each of the unknowns.
+    limits = zip(*jax.device_get((data.sign, data.low, data.high)), strict=True)
     z = [
-        transforms.to_coordinate(
-            kind, jnp.asarray(f.start, dtype), data.sign[i], data.low[i], data.high[i]
-        )
-        for i, (f, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
+        transforms.to_coordinate(kind, np.asarray(f.start, dtype), *of_one)
+        for f, kind, of_one in zip(problem.free.values(), layout.kinds, limits, strict=True)
     ]
     one, zero = np.ones((), dtype), np.zeros((), dtype)
     z += [one] * len(layout.gains) + [zero] * layout.shift

@@ -146,9 +146,9 @@ class Layout(eqx.Module):
     @property
     def size(self) -> int:
         """The number of unknowns."""
+        states, flights = len(self.states), zip(self.windows, self.outputs, strict=True)
         return self.first_nuisance + sum(
-            count * len(self.states) + self.constants(outputs)
-            for (count, _), outputs in zip(self.windows, self.outputs, strict=True)
+            count * states + self.constants(outputs) for (count, _), outputs in flights
         )
 
     def constants(self, outputs: tuple[str, ...]) -> int:
@@ -367,18 +367,28 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         name: jnp.exp(jnp.clip(z[at + i], *limits[name]))
         for i, name in enumerate(layout.disturbance)
     }
-    at += len(layout.disturbance)
-    scales = {
-        name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
-        for i, name in enumerate(layout.scaled)
-    }
     at = layout.first_nuisance
     flights = []
     for i, flight in enumerate(data.flights):
         flights.append(_of_flight(layout, i, flight, z, at))
         at += layout.windows[i][0] * len(layout.states) + layout.constants(layout.outputs[i])
     states, biases, offsets = zip(*flights, strict=True)
+    scales = scales_of(layout, z)
     return Unknowns(params, noise, scales, gains, shift, states, biases, offsets)
+
+
+def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
+    """Factors on the guess of the measurement noise, by output that has one of its own.
+
+    Args:
+        layout: what stands where.
+        z: all unknowns (q,), without units.
+    """
+    first = layout.first_nuisance - len(layout.scaled)
+    return {
+        name: jnp.exp(jnp.clip(z[first + i], -_SCALES, _SCALES))
+        for i, name in enumerate(layout.scaled)
+    }
 
 
 def _of_flight(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.special
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from heli_jax.identification.estimation.frequency_instrument import instruments_of
 from heli_jax.identification.estimation.frequency_lines import errors_of_lines
@@ -131,8 +131,7 @@ def outputs_against_excitation(problem: Problem) -> dict[str, float]:
             continue
         count = flight.n_samples // 2
         X, y = _lines(drives, count), _lines([flight.outputs[n] for n in names], count)
-        for j, name in enumerate(names):
-            found = _in_bands(y[:, j], y[:, j], np.ones(count), X)
+        for name, found in zip(names, _in_bands(y, y, np.ones(y.shape), X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {
         name: float(scipy.special.chdtrc(freedom, statistic))
@@ -176,8 +175,7 @@ def residual_against_excitation(problem: Problem, at: Solution) -> dict[str, Fol
         # Of one size over each band, as chance is taken to be: by the noise's own spectrum.
         S = np.linalg.inv(np.conj(np.swapaxes(W, 1, 2)) @ W)
         size = np.sqrt(np.real(np.einsum("kii->ki", S)))
-        for j, name in enumerate(names):
-            found = _in_bands(e[:, j], y[:, j], size[:, j], X)
+        for name, found in zip(names, _in_bands(e, y, size, X), strict=True):
             sums[name] = sums.get(name, np.zeros(4)) + found
     return {
         name: Followed(
@@ -195,36 +193,34 @@ def _lines(signals: list[np.ndarray], count: int) -> Complex[np.ndarray, "K c"]:
 
 
 def _in_bands(
-    e: Complex[np.ndarray, " K"],
-    y: Complex[np.ndarray, " K"],
-    size: np.ndarray,
+    e: Complex[np.ndarray, "K p"],
+    y: Complex[np.ndarray, "K p"],
+    size: Float[np.ndarray, "K p"],
     X: Complex[np.ndarray, "K m"],
-) -> np.ndarray:
-    """The test's statistic and degrees of freedom, and the powers that follow the excitation of the
-    residual and of what was measured, less what chance makes."""
-    first, lines, total = 0, float(max(_FIRST, 4 * X.shape[1])), np.zeros(4)
+) -> Float[np.ndarray, "p 4"]:
+    """By output the test's statistic and degrees of freedom, and the powers that follow the
+    excitation of the residual and of what was measured, less what chance makes."""
+    first, lines = 0, float(max(_FIRST, 4 * X.shape[1]))
+    total = np.zeros((e.shape[1], 4))
     while first + int(lines) <= len(e):
         band = slice(first, first + int(lines))
         n, first, lines = int(lines), band.stop, lines * _GROWTH
-        white = e[band] / size[band]
-        Q, R = np.linalg.qr(X[band] / size[band][:, None])
-        along = np.abs(np.diag(R))
-        Q = Q[:, along > 1e-9 * np.max(along, initial=0.0)]
-        m = Q.shape[1]
-        if m == 0:
-            continue
-        power = float(np.sum(np.abs(white) ** 2))
-        followed = float(np.sum(np.abs(Q.conj().T @ white) ** 2))
-        if not power > followed:
-            continue
-        statistic = -(2.0 * n - m - 1.0) * np.log1p(-followed / power)
+        over = 1.0 / size[band].T
+        # All outputs side by side: each has excitations of its own size.
+        Q, R = np.linalg.qr(X[None, band] * over[:, :, None])
+        along = np.abs(np.einsum("pii->pi", R))
+        kept = along > 1e-9 * np.max(along, axis=1, initial=0.0, keepdims=True)
+        Q, m = np.where(kept[:, None, :], Q, 0.0), np.sum(kept, axis=1)
+        both = np.stack([e[band].T * over, y[band].T * over], axis=2)
+        whole = np.sum(np.abs(both) ** 2, axis=1)
+        parts = np.sum(np.abs(np.conj(np.swapaxes(Q, 1, 2)) @ both) ** 2, axis=1)
+        power, followed = whole[:, 0], parts[:, 0]
+        asked = (m > 0) & (power > followed)
+        share = followed / np.where(asked, power, np.inf)
+        statistic = -(2.0 * n - m - 1.0) * np.log1p(-share)
         # Not the model's response: a wrong model's may be larger than anything that was measured.
-        answer = y[band] / size[band]
-        answered = float(np.sum(np.abs(Q.conj().T @ answer) ** 2))
-        scale = float(np.mean(size[band] ** 2))
-        chance, of_answer = (
-            m * max(whole - part, 0.0) / (n - m)
-            for whole, part in ((power, followed), (float(np.sum(np.abs(answer) ** 2)), answered))
-        )
-        total += [statistic, 2.0 * m, scale * (followed - chance), scale * (answered - of_answer)]
+        scale = np.mean(size[band] ** 2, axis=0)[:, None]
+        chance = m[:, None] * np.maximum(whole - parts, 0.0) / (n - m)[:, None]
+        found = np.column_stack([statistic, 2.0 * m, scale * (parts - chance)])
+        total += np.where(asked[:, None], found, 0.0)
     return total

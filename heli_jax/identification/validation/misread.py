@@ -5,7 +5,7 @@ What a record says by itself of units is little: degrees fit as well as radians 
 are in them, with every estimate off by 57. Their size is the only evidence.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,12 @@ from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation.finding import Finding
 from heli_jax.identification.validation.odd_flights import odd_flights
-from heli_jax.identification.validation.signal_quality import cut_off, dropout_words, facts_of
+from heli_jax.identification.validation.signal_quality import (
+    Facts,
+    cut_off,
+    dropout_words,
+    facts_of,
+)
 from heli_jax.identification.validation.signal_signs import contradictions, rate_against_angle
 
 _LARGEST_ANGLE, _LARGEST_RATE = np.pi, 20.0
@@ -74,7 +79,9 @@ def record_doubts(problem: Problem) -> RecordDoubts:
     Args:
         problem: the flights, and the model, whose axes name headings.
     """
-    found = [*misread(problem), *dropouts(problem), *clipped(problem)]
+    # Of both questions once: sorting long records is what takes the time.
+    facts = [facts_of(flight) for flight in problem.training]
+    found = [*misread(problem), *dropouts(problem, facts), *clipped(problem, facts)]
     odd = odd_flights(problem.training)
     words = dict.fromkeys(one.words for one in found if one.words)
     return RecordDoubts(
@@ -87,24 +94,33 @@ def record_doubts(problem: Problem) -> RecordDoubts:
     )
 
 
-def dropouts(problem: Problem) -> list[Misread]:
-    """The signals whose dropouts are taken for values."""
+def dropouts(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
+    """The signals whose dropouts are taken for values.
+
+    Args:
+        problem: the flights.
+        facts: of each fitted flight.
+    """
     flights = problem.training
     return [
         Misread(
-            Finding("stuck outputs", "doubt", dropout_words(label, flight, (name, kind), facts)),
+            Finding("stuck outputs", "doubt", dropout_words(label, flight, (name, kind), one)),
             f"dropouts of {name} are taken for {'commands' if kind == 'input' else 'measurements'}",
         )
-        for label, flight in zip(labels(flights), flights, strict=True)
-        for (name, kind), facts in facts_of(flight).items()
-        if facts.dropouts is not None and (kind == "input" or facts.dropped >= DROP_SHARE)
+        for label, flight, of_signals in zip(labels(flights), flights, facts, strict=True)
+        for (name, kind), one in of_signals.items()
+        if one.dropouts is not None and (kind == "input" or one.dropped >= DROP_SHARE)
     ]
 
 
-def clipped(problem: Problem) -> list[Misread]:
-    """The outputs whose flat tops are taken for measurements."""
-    flights = problem.training
-    found = cut_off(list(zip(labels(flights), flights, strict=True)))
+def clipped(problem: Problem, facts: Sequence[Facts]) -> list[Misread]:
+    """The outputs whose flat tops are taken for measurements.
+
+    Args:
+        problem: the flights.
+        facts: of each fitted flight.
+    """
+    found = cut_off(list(zip(labels(problem.training), facts, strict=True)))
     return [Misread(finding, words) for finding, words in found]
 
 

@@ -156,10 +156,10 @@ def explained_by(
     y = e[first:] - e[first:].mean()
     X = X - X.mean(axis=0)
     # An input held for several samples has columns that are the same: only their rank counts.
-    # Of its triangle, whose singular values are those of X, in a third of the time.
-    _, values, Vt = np.linalg.svd(np.linalg.qr(X, mode="r"))
-    kept = values > 1e-6 * values[0]
-    followed = (Vt[kept] @ (X.T @ y)) / values[kept]
+    # Of the columns' products, which halves the time of all: a share is told to six digits then.
+    squares, V = np.linalg.eigh(X.T @ X)
+    kept = squares > 1e-12 * squares[-1]
+    followed = (V.T[kept] @ (X.T @ y)) / np.sqrt(squares[kept])
     rank, n = int(kept.sum()), y.size
     share = float(np.sum(followed**2) / np.sum(y**2))
     freedom = n - rank - 1

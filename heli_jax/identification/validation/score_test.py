@@ -130,7 +130,7 @@ def strongest(
     filters = _filters(records, bank, plain)
     back = np.exp(-1j * angles)
     asked = _Asked(
-        np.stack([_filter(*one, angles) for one in filters]),
+        np.stack([_filter(*one, back) for one in filters]),
         _complex(known),
         np.concatenate([*_ends(records, back), *(_pair(X[:, i], back) for i in beside)], axis=1),
         [_pair(X[:, i], back) for i in drives],
@@ -141,9 +141,12 @@ def strongest(
     drive, one = drives[k % len(drives)], filters[k // len(drives)]
     if not gain > _AT_LEAST:
         return Strongest(gain, 1.0, drive, *one, *np.zeros((2, J.shape[1])))
-    # The same phases for the same residual, whoever asks.
+    # The same phases for the same residual, whoever asks. In single precision, half the work: what
+    # chance makes is known to a tenth of itself.
     turns = np.random.default_rng(0).random((e.size, _SURROGATES))
-    anew = _without(known, _real(_complex(white) * np.exp(2j * np.pi * turns)))
+    turns = (2.0 * np.pi * turns).astype(np.float32)
+    phases = np.cos(turns) + 1j * np.sin(turns)
+    anew = _without(known.astype(np.float32), _real(_complex(white).astype(phases.dtype) * phases))
     anew *= np.sqrt(freedom / np.sum(anew**2, axis=0))
     chance = _by_chance(gain, _gains(asked, _complex(anew)).max(axis=(0, 1)))
     G = asked.filters[k // len(drives), :, None]
@@ -169,14 +172,14 @@ def _gains(asked: _Asked, tried: Complex[np.ndarray, "K r"]) -> Float[np.ndarray
     """
     # In real numbers, of whose products only these are asked.
     G = np.concatenate([np.real(asked.filters), np.imag(asked.filters)], axis=1)
+    of_tried = G.astype(np.real(tried).dtype)
     power = np.real(asked.filters) ** 2 + np.imag(asked.filters) ** 2
 
     def products(a: np.ndarray, b: np.ndarray, *, both: bool = False) -> np.ndarray:
         """(F, a, b), of filtered columns a with columns b, these filtered too or not."""
+        a, filters = (a.astype(tried.dtype), of_tried) if b is tried else (a, G)
         each = (np.conj(a)[:, :, None] * b[:, None, :]).reshape(len(a), -1)
-        found = (
-            power @ np.real(each) if both else G @ np.concatenate([np.real(each), np.imag(each)])
-        )
+        found = power @ np.real(each) if both else filters @ _real(each)
         return found.reshape(len(G), a.shape[1], b.shape[1])
 
     n = asked.beside
@@ -238,11 +241,11 @@ def _filters(
     return tried
 
 
-def _filter(damping: float, frequency: float, angles: np.ndarray) -> Complex[np.ndarray, " K"]:
+def _filter(damping: float, frequency: float, back: np.ndarray) -> Complex[np.ndarray, " K"]:
     if not np.isfinite(damping):
-        return np.ones(angles.size, complex)
+        return np.ones(back.size, complex)
     turn = frequency * np.sqrt(max(1.0 - damping**2, 0.0))
-    pole, back = np.exp(-damping * frequency + 1j * turn), np.exp(-1j * angles)
+    pole = np.exp(-damping * frequency + 1j * turn)
     return 1.0 / ((1.0 - pole * back) * (1.0 - np.conj(pole) * back))
 
 

@@ -69,6 +69,10 @@ def rails(x: Float[np.ndarray, " N"]) -> Rails:
     return Rails(float(at_low.sum() / seen), float(at_high.sum() / seen))
 
 
+type Facts = Mapping[tuple[str, str], SignalFacts]
+"""of a flight's signals, by name and kind"""
+
+
 def facts_of(flight: Flight) -> dict[tuple[str, str], SignalFacts]:
     """Of all signals, by name and kind: as they were logged, where the flight knows it."""
     known = flight.source.facts if flight.source else {}
@@ -99,12 +103,12 @@ def saturation(flights: Sequence[tuple[str, Flight]]) -> list[Finding]:
     return [_saturated(*f) for f in found[:_MOST_NAMED]]
 
 
-def cut_off(flights: Sequence[tuple[str, Flight]]) -> list[tuple[Finding, str]]:
+def cut_off(flights: Sequence[tuple[str, Facts]]) -> list[tuple[Finding, str]]:
     """Outputs that rest at an end of their range, each with a few words where it is enough of them
     to move the estimates.
 
     Args:
-        flights: by what each is called.
+        flights: what each is called, and the facts of its signals.
     """
     return [
         (
@@ -113,8 +117,8 @@ def cut_off(flights: Sequence[tuple[str, Flight]]) -> list[tuple[Finding, str]]:
             if sum(facts.shares) >= _CUT_OFF
             else "",
         )
-        for label, flight in flights
-        for (name, kind), facts in facts_of(flight).items()
+        for label, of_signals in flights
+        for (name, kind), facts in of_signals.items()
         if kind == "output" and sum(facts.shares) > 0
     ]
 
