@@ -1,4 +1,8 @@
-"""The acceptance card: the usual gates of rotorcraft identification, each passed or failed."""
+"""The acceptance card: the usual gates of rotorcraft identification, each passed or failed.
+
+Its first gates are the first line's own statements: whatever makes a `no` there, no gate of a usual
+card may see it, and a card that is passed must not stand beside a `no`.
+"""
 
 import math
 from typing import NamedTuple
@@ -45,16 +49,18 @@ class Gate(NamedTuple):
     passed: bool | None
     """None where the line informs and nothing is asked"""
     remark: str = ""
+    words: str = ""
+    """what is shown in place of a number"""
 
 
 def card(problem: Problem, fit: Fit) -> tuple[Gate, ...]:
-    """Every line: parameters, their relations, agreement, whiteness, excitation.
+    """Every line: the verdicts, parameters, their relations, agreement, whiteness, excitation.
 
     None of a fit that stopped before an optimum: its numbers are no result.
     """
     if fit.status == "not-converged":
         return ()
-    lines: list[Gate] = []
+    lines = _of_verdicts(fit)
     for name, estimate in fit.estimates.items():
         lines += _of_parameter(name, estimate, own_prior=problem.free[name].prior is not None)
     lines += _of_relations(fit)
@@ -106,6 +112,8 @@ def summary(lines: tuple[Gate, ...], most: int | None = None) -> str:
 
 def shown(gate: Gate) -> str:
     """The value as text."""
+    if gate.words:
+        return gate.words
     if math.isnan(gate.value):
         return "none"
     if gate.what == _VAF:
@@ -129,6 +137,26 @@ def _most(what: str, of: str, value: float, unit: str, most: float, remark: str 
 def _least(what: str, of: str, value: float, unit: str, least: float, remark: str = "") -> Gate:
     gate = f"at least {least:g}{f' {unit}' if unit else ''}"
     return Gate(what, of, value, unit, gate, bool(value >= least), remark)
+
+
+def _of_verdicts(fit: Fit) -> list[Gate]:
+    """What the first line says: the reason for its `no` need not show in any number of the card."""
+    determined = "determined" if fit.verdict.identifiable else "not determined"
+    # `no: p looks like ...` instead of `no (p looks like ...)`, since a summary has it in brackets.
+    verdict, _, why = fit.adequacy.summary.partition(" (")
+    adequate = f"{verdict}: {why[:-1]}" if why.endswith(")") else fit.adequacy.summary
+    return [
+        Gate(
+            "identifiability",
+            "all parameters",
+            math.nan,
+            "",
+            "determined",
+            fit.verdict.identifiable,
+            words=determined,
+        ),
+        Gate("adequacy", "the model", math.nan, "", "not no", fit.adequate, words=adequate),
+    ]
 
 
 def _of_parameter(name: str, estimate: Estimate, *, own_prior: bool) -> list[Gate]:

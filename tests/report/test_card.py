@@ -4,7 +4,9 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
 
+from heli_jax.identification.validation.adequacy import CHANCE, Adequacy
 from heli_jax.report.card import card, failed, shown, summary
 from heli_jax.report.tables import prior_note
 
@@ -15,6 +17,7 @@ def test_a_sound_fit_passes(sound):
     assert failed(lines) == ()
     asked = {g.what for g in lines}
     assert {
+        "identifiability", "adequacy",
         "Cramér-Rao", "insensitivity", "condition number", "largest correlation", "VAF",
         "NRMSE fit", "Theil coefficient", "Theil bias part", "Theil variance part",
         "Theil covariance part", "whiteness of residuals, p-value", "coherence",
@@ -55,6 +58,40 @@ def test_what_is_not_determined_fails(not_identifiable):
     assert {("Cramér-Rao", n) for n in fit.estimates} <= {(g.what, g.of) for g in gone}
     assert any(g.what == "condition number" for g in gone)
     assert "failed: " in summary(card(problem, fit))
+
+
+NO = Adequacy(False, False, ())
+
+
+@pytest.mark.parametrize(
+    ("adequacy", "words"),
+    [
+        (NO, "no"),
+        (NO.doubted(["p looks like deg/s read as rad/s"]), "no: p looks like deg/s read as rad/s"),
+        (NO._replace(doubts=(CHANCE,), by_chance=True), f"no: {CHANCE}"),
+        (NO.doubted(["a (in b)", "c"]), "no: a (in b); c"),
+    ],
+)
+def test_a_card_is_never_passed_beside_a_no(sound, adequacy, words):
+    fit, problem, _ = sound
+    lines = card(problem, dataclasses.replace(fit, adequacy=adequacy))
+    assert [(g.what, shown(g)) for g in failed(lines)] == [("adequacy", words)]
+    asked = len([g for g in lines if g.passed is not None])
+    assert summary(lines) == (
+        f"{asked - 1} of {asked} gates passed; failed: adequacy of the model ({words})"
+    )
+
+
+def test_what_is_adequate_with_a_remark_has_it_on_the_card(sound):
+    fit, problem, _ = sound
+    limited = fit.adequacy._replace(limited="the response of p depends on amplitude")
+    [line] = [
+        g for g in card(problem, dataclasses.replace(fit, adequacy=limited)) if g.of == "the model"
+    ]
+    assert (line.passed, shown(line)) == (
+        True,
+        "in size only: the response of p depends on amplitude",
+    )
 
 
 def test_a_simulation_of_a_disturbed_machine_is_not_judged(sound):

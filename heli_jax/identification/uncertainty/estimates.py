@@ -175,8 +175,8 @@ def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
         if estimate.upper95 < 0:
             notes.append(
                 f"{name} is negative: its signal acts before the log has it. The clocks of inputs "
-                "and outputs differ, or the input does something else between samples than was "
-                "stated (hold)."
+                "and outputs differ (two logs on one clock: also.align), or the input does "
+                "something else between samples than was stated (hold)."
             )
         elif estimate.lower95 <= 0:
             notes.append(
@@ -189,7 +189,8 @@ def delay_notes(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
 def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     """Delays by which the model answers before its input, by more than a sample of every flight.
 
-    Within a sample that may be how the input was held; beyond it no machine does so.
+    Within a sample that may be how the input was held; beyond it no machine does so, but two logs
+    whose clocks differ look like it.
 
     Args:
         problem: its model says which parameters are delays.
@@ -198,7 +199,8 @@ def delay_doubts(problem: Problem, estimates: dict[str, Estimate]) -> list[str]:
     sample = max(f.dt for f in problem.training)
     found = [(n, estimates[n]) for n in problem.model.delay_parameters if n in estimates]
     return [
-        f"by {n} = {1e3 * e.value:.3g} ms it answers before its input"
+        f"by {n} = {1e3 * e.value:.3g} ms it answers before its input, unless the clocks of stick "
+        "and response differ"
         for n, e in found
         if e.upper95 is not None and e.upper95 < -sample
     ]
