@@ -43,7 +43,7 @@ from heli_jax.identification.unknowns.layout import (
     Noise,
     Solution,
     layout_of,
-    unpack,
+    scales_of,
 )
 from heli_jax.identification.unknowns.nuisances import labels
 from heli_jax.identification.validation import excitation
@@ -151,7 +151,7 @@ def check(problem: Problem) -> Check:
         for name in flight.outputs
         if name not in flight.sd
     )
-    sds = noise_by_name(problem, guess.noise, unpack(guess.layout, guess.data, guess.z).scales)
+    sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
     return Check(verdict, sds, tuple(notes), guessed, findings)
 

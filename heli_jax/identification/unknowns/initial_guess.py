@@ -27,10 +27,10 @@ def start_vector(layout: Layout, data: Data, problem: Problem) -> Float[Array, "
         problem: the start values, in the units of the parameters.
     """
     dtype = data.low.dtype
+    # Fetched: taking one entry of an array on the device is a program to load.
+    sign, low, high = jax.device_get((data.sign, data.low, data.high))
     z = [
-        transforms.to_coordinate(
-            kind, jnp.asarray(f.start, dtype), data.sign[i], data.low[i], data.high[i]
-        )
+        transforms.to_coordinate(kind, jnp.asarray(f.start, dtype), sign[i], low[i], high[i])
         for i, (f, kind) in enumerate(zip(problem.free.values(), layout.kinds, strict=True))
     ]
     one, zero = np.ones((), dtype), np.zeros((), dtype)

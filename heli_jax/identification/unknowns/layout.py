@@ -367,11 +367,7 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         name: jnp.exp(jnp.clip(z[at + i], *limits[name]))
         for i, name in enumerate(layout.disturbance)
     }
-    at += len(layout.disturbance)
-    scales = {
-        name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
-        for i, name in enumerate(layout.scaled)
-    }
+    scales = scales_of(layout, z)
     at = layout.first_nuisance
     flights = []
     for i, flight in enumerate(data.flights):
@@ -379,6 +375,20 @@ def unpack(layout: Layout, data: Data, z: Float[Array, " q"]) -> Unknowns:
         at += layout.windows[i][0] * len(layout.states) + layout.constants(layout.outputs[i])
     states, biases, offsets = zip(*flights, strict=True)
     return Unknowns(params, noise, scales, gains, shift, states, biases, offsets)
+
+
+def scales_of(layout: Layout, z: Float[Array, " q"]) -> dict[str, Any]:
+    """By output the factor of its measurement noise; none where the noise is known.
+
+    Args:
+        layout: what stands where.
+        z: all unknowns (q,), without units.
+    """
+    at = layout.first_nuisance - len(layout.scaled)
+    return {
+        name: jnp.exp(jnp.clip(z[at + i], -_SCALES, _SCALES))
+        for i, name in enumerate(layout.scaled)
+    }
 
 
 def _of_flight(
