@@ -236,6 +236,23 @@ def si_of(unit: str) -> str:
     raise ValueError(f"unit {unit!r} is of the kind {kind}, for which no SI unit is listed")
 
 
+# Of the rates, angles and speeds of nearly every model: `check` and `fit` ask them of each output,
+# and load pint for nothing else.
+_COMMON_KINDS = {
+    "1": {},
+    "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1},
+    "m/s^2": {"m": 1, "s": -2},
+    "s": {"s": 1},
+    "rad": {"rad": 1},
+    "rad/s": {"s": -1, "rad": 1},
+    "rad/s^2": {"s": -2, "rad": 1},
+    "deg": {"rad": 1},
+    "deg/s": {"s": -1, "rad": 1},
+    "1/s": {"s": -1},
+    "1/s^2": {"s": -2},
+}
+"""exponents of base units, as of `base_of`"""
 _BASE = {"[mass]": "kg", "[length]": "m", "[time]": "s", "[angle]": "rad", "[current]": "A"}
 
 
@@ -245,12 +262,16 @@ def base_of(unit: str) -> dict[str, int]:
     Raises:
         ValueError: the unit is unknown.
     """
+    if unit in _COMMON_KINDS:
+        return dict(_COMMON_KINDS[unit])
     kind = dict(_parse(unit).dimensionality)
     return {si: round(kind[name]) for name, si in _BASE.items() if kind.get(name)}
 
 
 def is_unit(unit: str) -> bool:
     """Whether a text is a unit of any kind."""
+    if unit in _COMMON_KINDS:
+        return True
     try:
         _parse(unit)
     except ValueError:

@@ -1,6 +1,7 @@
 """The command line as a user meets it: exit codes, sentences, files."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -488,6 +489,29 @@ def test_interrupts_after_the_end_are_nothing(tmp_path):
     process = as_program(f"{script}cli._info = lambda options: 0", ["info", "log.csv"], tmp_path)
     assert process.communicate(timeout=30) == ("", "")
     assert process.returncode == 0
+
+
+def test_who_stops_reading_is_no_failure_and_a_full_disk_is(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("t,p\n" + "".join(f"{0.01 * k},{k % 7}\n" for k in range(100)))
+    command = [sys.executable, "-m", "heli_jax", "info", str(log)]
+    # Written at the end and at once: Python's own buffer is larger than what info prints.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as nobody:
+        ended = subprocess.run(
+            command, stdout=nobody, stderr=subprocess.PIPE, text=True, env=environment
+        )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    full = Path("/dev/full")
+    if full.exists():
+        with full.open("w") as nowhere:
+            ended = subprocess.run(
+                command, stdout=nowhere, stderr=subprocess.PIPE, text=True, env=environment
+            )
+        assert ended.returncode != 0
+        assert "No space left" in ended.stderr
 
 
 # The moments above are those at which it could go wrong; this one waits for the imports of a fit.

@@ -244,3 +244,13 @@ def test_the_units_that_are_known_without_pint_are_those_of_pint(monkeypatch):
     monkeypatch.setattr(units, "_COMMON_IN_SI", {})
     assert {u: units.factor(u, u) for u in common} == dict.fromkeys(common, 1.0)
     assert {pair: units.factor(*pair) for pair in in_si} == in_si
+
+
+def test_the_kinds_that_need_no_pint_are_those_it_has(monkeypatch):
+    common = dict(units._COMMON_KINDS)
+    assert all(units.is_unit(u) and units.base_of(u) == kind for u, kind in common.items())
+    monkeypatch.setattr(units, "_COMMON_KINDS", {})
+    for unit, kind in common.items():
+        assert units.is_unit(unit)
+        # In the same order, in which `as_text` writes them.
+        assert list(units.base_of(unit).items()) == list(kind.items())

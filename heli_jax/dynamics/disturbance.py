@@ -9,7 +9,7 @@ import numpy as np
 
 from heli_jax import naming, units
 from heli_jax.dynamics.check_model import check_model
-from heli_jax.dynamics.model import Disturbance, Model, axes_of
+from heli_jax.dynamics.model import Disturbance, Model, axes_of, plain
 from heli_jax.naming import Record, Scalar
 
 
@@ -30,7 +30,7 @@ def disturbable_states(model: Model) -> tuple[str, ...]:
     # Numbers that no formula makes of one another by chance.
     values = np.random.default_rng(7).uniform(0.5, 1.5, len(names))
     state = dict(zip(names, (np.float64(v) for v in values), strict=True))
-    params = model.Params(**dict.fromkeys(naming.names(model.Params), nan))
+    params = plain(model.Params(**dict.fromkeys(naming.names(model.Params), nan)))
     inputs = model.Inputs(**dict.fromkeys(naming.names(model.Inputs), nan))
     # NaN goes through every operation that uses it: what is still a number uses neither. That alone
     # does not make it kinematics: v' = -0.4 v + 9.81 phi is a force whose coefficients are written
@@ -238,6 +238,7 @@ def _anywhere(model: Model, rng: np.random.Generator) -> tuple[dict[str, float],
         record(**{n: np.float64(rng.uniform(0.5, 1.5)) for n in naming.names(record)})
         for record in (model.Params, model.State, model.Inputs)
     )
+    p = plain(p)
     with np.errstate(all="ignore"):
         both = (model.vector_field(p, s, u), model.output(p, s, u))
     rates, outputs = ({n: float(v) for n, v in naming.asdict(one).items()} for one in both)

@@ -6,6 +6,7 @@ divided by the rotor's speed, so that a rotor at rest is an ordinary point.
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 from heli_jax.naming import Scalar
 from heli_jax.vehicle import Helicopter
@@ -53,6 +54,9 @@ def paddle_chord(p: Helicopter) -> Scalar:
 
 def _given_or(value: Scalar, default: Scalar) -> Scalar:
     """A constant that may be left out (NaN), or what stands in its place then."""
+    # A quick look at the equations has NumPy's scalars, which jnp would compile programs for.
+    if isinstance(value, np.floating):
+        return default if np.isnan(value) else value
     return jnp.where(jnp.isnan(value), default, value)
 
 

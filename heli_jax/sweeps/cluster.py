@@ -9,6 +9,7 @@ import logging
 import signal
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -32,6 +33,13 @@ _RETRIES = 5  # of a chunk whose task fails; how often workers may die with it d
 # result travels; all at once, the results of a large sweep would wait in this process's memory.
 _AHEAD = 3
 _CONNECT_S = 20  # [s] without an answer, before an address is taken to be wrong
+_ALONE_S = 120.0
+"""[s] without any worker, before those that died are taken not to come back: a nanny starts another
+in seconds, a queue of jobs may take its time"""
+_LOOK_S = 2.0
+"""[s] between two looks at whether there are workers"""
+_WAIT_S = 0.02
+"""[s] between two looks at whether a task has ended"""
 _IMPORTS = (
     "expected modules of your own to be there too: begin scheduler and workers with PYTHONPATH set "
     "to their folder"
@@ -242,7 +250,7 @@ def computed(
 
     first = [submitted(k) for _, k in zip(range(_AHEAD * threads), waiting, strict=False)]
     running = as_completed(first)
-    for future in running:
+    for future in _as_they_end(client, running):
         with _answering():
             chunk, results = future.result()
         # Before the chunk is written, or the worker would keep its results for as long.
@@ -251,6 +259,35 @@ def computed(
         if following is not None:
             running.add(submitted(following))
         yield chunk, results
+
+
+# Any: dask's as_completed, whose futures have no type.
+def _as_they_end(client: Client, running: Any) -> Iterator[Any]:
+    """The futures as they end, in any order; more may be added meanwhile.
+
+    Raises:
+        InputError: the scheduler is gone, or has had no worker for long: tasks would wait for one
+            without end, and nobody would be told.
+    """
+    seen = looked = time.monotonic()
+    while not running.is_empty():
+        if running.has_ready():
+            yield next(running)
+            seen = looked = time.monotonic()
+            continue
+        time.sleep(_WAIT_S)
+        now = time.monotonic()
+        if now - looked < _LOOK_S:
+            continue
+        looked = now
+        there: Any = client.nthreads
+        with _answering():
+            seen = now if there() else seen
+        if now - seen > _ALONE_S:
+            raise InputError(
+                f"dask: the scheduler has had no worker for {now - seen:.0f} s, expected one at "
+                "least to run to the end; what is finished is kept: --resume goes on"
+            )
 
 
 def mapped[T, R](
@@ -279,7 +316,7 @@ def mapped[T, R](
 
     at_once = _AHEAD * _threads(client)
     running = as_completed([submitted(k) for _, k in zip(range(at_once), waiting, strict=False)])
-    for future in running:
+    for future in _as_they_end(client, running):
         with _answering():
             try:
                 result = future.result()

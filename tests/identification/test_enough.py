@@ -290,6 +290,7 @@ def test_filters_behind_an_output_are_no_motion_that_a_log_has_to_show():
     assert finding.severity == "ok", finding.sentence
 
 
+@pytest.mark.slow
 def test_candidates_one_by_one_are_those_side_by_side(monkeypatch):
     asked = problem(flight(0, 1500))
     both = []

@@ -125,7 +125,12 @@ def test_a_model_without_disturbance_is_refused(bench30):
 
 
 @pytest.mark.parametrize(
-    "fixed", [("sigma_y", "tau_w"), ("sigma_w", "tau_w", "sigma_y")], ids=" ".join
+    "fixed",
+    [
+        ("sigma_y", "tau_w"),
+        pytest.param(("sigma_w", "tau_w", "sigma_y"), marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
 )
 def test_noise_may_be_fixed(disturbed, fixed):
     params, problem, free = disturbed

@@ -122,6 +122,7 @@ def test_estimates_are_those_of_output_error_in_white_noise(by):
     assert by["frequency-error"].noise["flight 1/roll"] == pytest.approx(2e-3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_unstable_machine_needs_no_windows(tmp_path):
     """Roll with a divergence of 1 1/s, flown for 30 s in which it grows by 1e13."""
     path = tmp_path / "falling.yaml"

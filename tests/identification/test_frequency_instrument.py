@@ -223,7 +223,8 @@ def held(seed: int, n: int = 3000, late: int = 0) -> Flight:
     return Flight(dt=DT, inputs={"lat": u}, outputs={"phi": y}, instruments={"lat": sweep})
 
 
-@pytest.mark.parametrize("late", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0, 1])
 def test_a_search_does_not_go_astray_where_a_loop_holds_the_attitude(tmp_path, late):
     # Below the sweep the input cancels the gusts and the attitude stays: no machine answers so, and
     # least squares of the signals as they were measured lead far away, from the truth as well.

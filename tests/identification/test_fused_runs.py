@@ -50,12 +50,14 @@ def problem(flights, free=FREE, **how):
     return Problem(models.roll_on_stand, vehicle(BENCH), flights, free, **how)
 
 
+NONE = Nuisance(False, False)
 CASES = {
     "two flights": lambda: problem(two()),
+    "two flights without nuisances": lambda: problem(two(), nuisance=NONE),
     "rk4": lambda: problem(one(), solver="rk4", substeps=1),
-    "no nuisances": lambda: problem(one(), nuisance=Nuisance(False, False)),
     "offsets and gains, straight lines between samples": lambda: problem(
-        one(hold={"x_roll": "linear"}), nuisance=Nuisance(input_gain=True, input_offset=True)
+        one(hold={"x_roll": "linear"}),
+        nuisance=Nuisance(False, False, input_gain=True, input_offset=True),
     ),
 }
 
@@ -113,7 +115,13 @@ def agree(problem, own):
     )
 
 
-@pytest.mark.parametrize("case", CASES)
+# It compiles longest, and its parts are in other cases: a flight with nuisances in the test below.
+SLOW = ("two flights",)
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=[pytest.mark.slow] if c in SLOW else []) for c in CASES]
+)
 def test_as_jax_makes_them(case):
     agree(CASES[case](), Own(False, True))
 
@@ -152,6 +160,7 @@ def fitted():
     return fit(problem([record(BENCH, seed=3, n=150)]))
 
 
+@pytest.mark.slow
 def test_a_bootstrap_is_what_it_was_run_by_run(fitted, monkeypatch):
     found = bootstrap(fitted, 24)
     monkeypatch.setattr(many_runs, "_MANY", 100)
@@ -205,7 +214,7 @@ def emulated(monkeypatch):
 
 
 def test_on_a_gpu_that_is_none(emulated):
-    layout, data, noise, z = pieces(problem(one()))
+    layout, data, noise, z = pieces(problem(one(), nuisance=NONE))
     own = Own(False, True)
     numbers = tiled(data, own)
     found = FusedRuns(layout, data, noise, own, emulated)(numbers, jnp.asarray(z))

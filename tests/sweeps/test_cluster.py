@@ -80,6 +80,41 @@ def test_what_dask_says_ends_in_one_sentence(error, words):
         raise RuntimeError("another")
 
 
+def test_a_scheduler_without_workers_is_not_waited_for_without_end(monkeypatch):
+    class Running:
+        """Tasks that wait for a worker."""
+
+        def __init__(self, done):
+            self.done = done
+
+        def is_empty(self):
+            return False
+
+        def has_ready(self):
+            return bool(self.done)
+
+        def __next__(self):
+            return self.done.pop()
+
+    class Scheduler:
+        """Its workers by time; the last look finds none."""
+
+        def __init__(self, *looks):
+            self.looks = list(looks)
+
+        def nthreads(self):
+            return self.looks.pop(0) if self.looks else {}
+
+    monkeypatch.setattr(cluster, "_ALONE_S", 0.2)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.05)
+    scheduler = Scheduler({}, {}, {"tcp://a": 1})
+    ended = cluster._as_they_end(scheduler, Running(["a", "b"]))
+    assert [next(ended), next(ended)] == ["b", "a"]
+    with pytest.raises(InputError, match=r"no worker for \d+ s.*--resume goes on"):
+        next(ended)
+    assert scheduler.looks == []
+
+
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path, monkeypatch):
     """The experiment that shows it at full size, in small."""

@@ -138,8 +138,15 @@ def by_thread(model, vehicle, flight, design, reduce, monkeypatch, **options):
     return [jax.tree.map(lambda v: np.asarray(v)[:n], r) for r in both]
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("solver", ["exact", "rk4"])
+@pytest.mark.parametrize(
+    ("solver", "precision"),
+    [
+        ("exact", "float64"),
+        ("rk4", "float32"),
+        pytest.param("exact", "float32", marks=pytest.mark.slow),
+        pytest.param("rk4", "float64", marks=pytest.mark.slow),
+    ],
+)
 def test_a_program_for_a_gpu(bench30, record, solver, precision, monkeypatch):
     design = paired(
         {"Ixx": [0.02, 0.024, 0.03, 0.036, 0.04, 0.05], "kappa": [0.0, -1e5, 0, 0, 0, 0]}

@@ -272,7 +272,7 @@ def _each_by_itself(
         return None
     # Behind the end of a candidate nothing is measured, and rows of that are zero.
     measured = jnp.asarray(np.where(np.arange(n) < m, 0.0, np.nan), dtype)
-    z = jnp.concatenate([at.z[: at.layout.first_nuisance], _begins_as(at, 0, linear=True)])
+    z = _joined(at, [_begins_as(at, 0, linear=True)])
     found = []
     for candidate in candidates:
         inputs = {**rest, candidate.input: np.pad(candidate.values, (0, n - m))}
@@ -316,17 +316,23 @@ def _sensitivity(
     data = at.data._replace(flights=tuple(parts))
     noise = Noise((at.noise.sd[i],) * len(parts), at.noise.log_variance_ratio)
     own = _begins_as(at, i, linear)
-    z = jnp.concatenate([at.z[: at.layout.first_nuisance], *([own] * len(parts))])
+    z = _joined(at, [own] * len(parts))
     return sensitivity_at(problem, layout, evaluate(layout, data, noise, z)), layout, data
 
 
-def _begins_as(at: Solution, i: int, linear: bool) -> jax.Array:
+def _joined(at: Solution, flights: list[np.ndarray]) -> jax.Array:
+    """The unknowns of the problem, and behind them those of the flights one by one."""
+    # In NumPy, as they are made: each operation by itself would be a program to load.
+    return jnp.asarray(np.concatenate([np.asarray(at.z)[: at.layout.first_nuisance], *flights]))
+
+
+def _begins_as(at: Solution, i: int, linear: bool) -> np.ndarray:
     """The initial state of the i-th flight's first window, and no bias."""
     layout, position = at.layout, at.layout.first_nuisance
     for j in range(i):
         position += layout.windows[j][0] * len(layout.states)
         position += layout.constants(layout.outputs[j])
-    states = at.z[position : position + len(layout.states)]
+    states = np.asarray(at.z)[position : position + len(layout.states)]
     # A linear machine begins at rest, wherever the record begins.
-    states = jnp.zeros_like(states) if linear else states
-    return jnp.concatenate([states, jnp.zeros(layout.constants(layout.outputs[i]), at.z.dtype)])
+    states = np.zeros_like(states) if linear else states
+    return np.concatenate([states, np.zeros(layout.constants(layout.outputs[i]), states.dtype)])

@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heli_jax import naming
@@ -114,9 +113,11 @@ def _averaged(layout: Layout, data: Data, moving: list[set[str]]) -> Data:
     for i, (flight, names) in enumerate(zip(data.flights, moving, strict=True)):
         inputs = {}
         for n, u in naming.asdict(flight.inputs).items():
-            beside = jnp.concatenate([u[1:], u[-1:]])
+            # In NumPy: each operation by itself would be a program to load.
+            u = np.asarray(u)
+            beside = np.concatenate([u[1:], u[-1:]])
             if layout.hold(i)[n] == "linear":
-                beside = jnp.concatenate([u[:1], u[:-1]])
+                beside = np.concatenate([u[:1], u[:-1]])
             inputs[n] = 0.5 * (u + beside) if n in names else u
         flights.append(flight._replace(inputs=layout.model.Inputs(**inputs)))
     return data._replace(flights=jax.device_put(tuple(flights)))
