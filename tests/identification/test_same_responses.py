@@ -147,5 +147,6 @@ def test_a_filter_begun_on_the_wrong_side_finds_the_right_one(flight):
     assert found.status == "converged"
     for name, true in START._asdict().items():
         e = found.estimates[name]
+        assert e.sd is not None, name
         assert abs(e.value - true) < 4.0 * e.sd, name
     assert any("answer the inputs alike" in note for note in found.notes)

@@ -51,6 +51,8 @@ _MOVED = 0.1
 _DETERMINED = 1e-6
 """smallest singular value over the largest, of the responses by the parameters: below, whole
 valleys answer alike, of which the verdict tells"""
+_STEP = 1e-6
+"""of a coordinate, for differences"""
 _STEPS = (10, 15)
 """evaluations at most for each parameter: with one of them held, and with none"""
 _EVALUATIONS = 1000
@@ -117,7 +119,8 @@ def same_responses(
         here: coordinates (q,) of the free parameters.
     """
     differ = _Difference(problem, layout, data, here)
-    slopes = scipy.optimize.approx_fprime(here, differ, 1e-6)
+    # Of the difference from here, which is zero.
+    slopes = np.stack([differ(here + step) / _STEP for step in _STEP * np.eye(here.size)], axis=1)
     sizes = np.linalg.svd(slopes, compute_uv=False)
     if not (np.isfinite(slopes).all() and sizes[-1] > _DETERMINED * sizes[0]):
         return []
