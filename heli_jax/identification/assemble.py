@@ -26,6 +26,7 @@ from heli_jax.identification.estimation.multistart import Search, table
 from heli_jax.identification.estimation.noise_covariance import RelaxedOptimum
 from heli_jax.identification.estimation.predictions_ahead import SECONDS, predictions_ahead
 from heli_jax.identification.fit_notes import Numbers, absent_names, fit_notes
+from heli_jax.identification.identifiability.as_likely import unless_as_likely
 from heli_jax.identification.identifiability.twins import twins_of
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Verdict
@@ -200,7 +201,8 @@ def assemble(
         optimum=bool(best.converged),
     )
     if bool(best.converged):
-        verdict = unless_inputs_explain_nothing(solution, e, errors.verdict)
+        verdict = unless_as_likely(errors.verdict, optimum.as_likely)
+        verdict = unless_inputs_explain_nothing(solution, e, verdict)
         errors = errors._replace(verdict=verdict)
     numbers = _numbers(problem, solution, e, errors, absent)._replace(ill=ill)
     status = _status(best, e, errors.verdict)

@@ -27,6 +27,7 @@ from heli_jax.identification.estimation.noise_covariance import (
     first_noise,
     relax_noise_covariance,
 )
+from heli_jax.identification.estimation.same_responses import better_of_same_responses
 from heli_jax.identification.estimation.shooting_start import SAID, by_windows
 from heli_jax.identification.estimation.which_disturbances import those_that_show
 from heli_jax.identification.identifiability.disturbances import of_disturbances
@@ -313,7 +314,7 @@ def _search(
     if disturbed:
         several = len(disturbances_of(problem.model)) > 1
         which = those_that_show if several else disturbance_or_none
-        optimum = which(search, optimum)
+        optimum = better_of_same_responses(search, which(search, optimum))
     return search, optima, optimum
 
 

@@ -65,7 +65,7 @@ def _restarted_from_a_limit(search: Search, optimum: RelaxedOptimum) -> RelaxedO
     if not at_limit(search, optimum, d):
         return optimum
     z = with_noise_guess(search, optimum)
-    again = _begun_at(search, optimum, z)
+    again = begun_at(search, optimum, z)
     gained = log_likelihood_of(search, again) > log_likelihood_of(search, optimum)
     if bool(again.best.converged) and gained:
         optimum = again.after(optimum)
@@ -106,7 +106,7 @@ def from_other_taus(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> 
     start = start.at[scales].set(0.0)
     likelihood = log_likelihood_of(search, optimum)
     for z in noise_guesses_by_tau(search.layout, search.data, optimum.noise, start, d):
-        again = _begun_at(search, optimum, z)
+        again = begun_at(search, optimum, z)
         inside = bool(again.best.converged) and not at_limit(search, again, d)
         # Each takes as long as a fit: the first that ends between the limits will do.
         if inside and log_likelihood_of(search, again) > likelihood:
@@ -130,8 +130,14 @@ def at_its_start(search: Search, optimum: RelaxedOptimum, d: Disturbance) -> Flo
     return z
 
 
-def _begun_at(search: Search, optimum: RelaxedOptimum, z: Float[Array, " q"]) -> RelaxedOptimum:
-    """A search begun anew from z, its noise at the level that shows there."""
+def begun_at(search: Search, optimum: RelaxedOptimum, z: Float[Array, " q"]) -> RelaxedOptimum:
+    """A search begun anew from z, its noise at the level that shows there.
+
+    Args:
+        search: the optimiser over the problem.
+        optimum: whose noise is taken to z.
+        z: where to begin (q,).
+    """
     at_guess = evaluate(search.layout, search.data, optimum.noise, z)
     noise = search.layout.estimator.with_level(search.data, at_guess, optimum.noise)
     return relaxed_from(search, noise, z)
@@ -219,7 +225,12 @@ def _from_nested(
 
 
 def with_noise_guess(search: Search, optimum: RelaxedOptimum) -> Float[Array, " q"]:
-    """z at the parameters of an optimum, the disturbance from a coarse search."""
+    """z (q,) at the parameters of an optimum, the disturbance from a coarse search.
+
+    Args:
+        search: the optimiser over the problem.
+        optimum: where it ended.
+    """
     layout, at = search.layout, len(search.layout.of_interest)
     starts = [np.log(search.problem.noise[n].start) for n in layout.disturbance]
     # From the problem's own start values: those of the optimum have run off to a limit.

@@ -32,6 +32,12 @@ from heli_jax.identification.estimation.noisy_scales import (
     slopes_at,
     slopes_changed,
 )
+from heli_jax.identification.estimation.restricted_likelihood import (
+    own_at,
+    own_changed,
+    taken_up,
+    with_own_noise,
+)
 from heli_jax.identification.estimation.shared_covariance import innovations_together
 from heli_jax.identification.estimation.simulated_flights import driven
 from heli_jax.identification.problem import Problem
@@ -96,7 +102,9 @@ class FilterError(Estimator):
         return outputs[concentrated:], concentrated
 
     def prepared_for(self, problem: Problem, noise: Noise, flights: Sequence[Flight]) -> Noise:
-        """With a derivative by each scale error that is free, which no relaxation has found yet."""
+        """With a derivative by each scale error that is free and by the noise of what is
+        integrated, which no relaxation has found yet."""
+        noise = with_own_noise(problem, noise)
         scales = free_scales(problem.model.input_scales, problem.free)
         if not scales:
             return noise
@@ -119,8 +127,10 @@ class FilterError(Estimator):
         squares, logs = innovation_sums(e, noise)
         level = np.asarray(logs / n, noise.log_variance_ratio.dtype)
         if not layout.concentrated:
-            slopes = slopes_at(layout, noise, e, self.row_signals(layout, data).size)
-            return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes)
+            measured = self.row_signals(layout, data).size
+            slopes = slopes_at(layout, noise, e, measured)
+            own = own_at(layout, data, noise, e, z, measured)
+            return z, noise._replace(log_variance_ratio=level, scale_slopes=slopes, own=own)
         # The scale of the greatest likelihood, and what the unknowns took from the squares.
         factor = np.sqrt(squares / n * freedom)
         for name in layout.sigmas:
@@ -136,11 +146,13 @@ class FilterError(Estimator):
 
     def noise_matters(self, problem: Problem, layout: Layout, before: Noise, after: Noise) -> bool:
         """Only where priors are weighed against a scale that is concentrated out, where the noise
-        fell past what the likelihood's row can show, or where it attenuates scale errors."""
+        fell past what the likelihood's row can show, or where it attenuates scale errors or is
+        itself too small by what the parameters take up."""
         if layout.concentrated:
             return any(f.prior for f in problem.free.values())
         fell = before.log_variance_ratio - after.log_variance_ratio
-        return bool(fell > _FELL) or slopes_changed(before, after) > _ATTENUATES
+        attenuates = slopes_changed(before, after) > _ATTENUATES
+        return bool(fell > _FELL) or attenuates or own_changed(before, after)
 
     def log_likelihood(self, layout: Layout, data: Data, noise: Noise, e: Evaluation) -> float:
         """Of the innovations (Schweppe, 1965), at the scale of the greatest likelihood where that
@@ -343,7 +355,7 @@ def _likelihood_rows(
         rows, last = rows * jnp.exp(0.5 * above), []
     else:
         # N mean(log s) as a square: the 1 keeps it above zero, where the root has a derivative.
-        above -= not_attenuating(layout, noise, u) / count
+        above += (taken_up(noise, u) - not_attenuating(layout, noise, u)) / count
         last = [jnp.sqrt(count * jnp.maximum(1.0 + above, _FLOOR))[None]]
     log_s = jnp.where(seen, log_s - mean, 0.0)
     # The last rows are zero themselves, with the derivative of what is subtracted left out.

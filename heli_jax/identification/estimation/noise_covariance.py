@@ -1,6 +1,6 @@
 """How large the measurement noise is: guessed first, then relaxed with the optimum."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from heli_jax.identification.estimation.evaluation import evaluate
 from heli_jax.identification.estimation.levenberg_marquardt import Optimum
 from heli_jax.identification.estimation.multistart import Search
 from heli_jax.identification.estimation.noisy_scales import slopes_changed
+from heli_jax.identification.estimation.restricted_likelihood import own_changed
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Problem
 from heli_jax.identification.unknowns.layout import Data, Layout, Noise
@@ -32,6 +33,17 @@ _WORTH_TELLING = 0.1
 """log-likelihood by which two optima differ"""
 
 
+class OtherValues(NamedTuple):
+    """Values of free parameters that explain a record as well as an optimum's."""
+
+    values: Mapping[str, float]
+    """those that differ, SI"""
+    instead_of: Mapping[str, float]
+    """the optimum's"""
+    less: float
+    """by how much their log-likelihood is below that of the optimum"""
+
+
 class RelaxedOptimum(NamedTuple):
     """An optimum together with the noise that it shows."""
 
@@ -45,6 +57,8 @@ class RelaxedOptimum(NamedTuple):
     """what a reader should know of how the optimum was reached"""
     absent: tuple[str, ...] = ()
     """the parameters of those of several disturbances that do not show"""
+    as_likely: tuple[OtherValues, ...] = ()
+    """other values of the free parameters that explain the record as well"""
 
     def after(self, earlier: "RelaxedOptimum", *notes: str) -> "RelaxedOptimum":
         """The same with the rounds and notes of an earlier one before its own."""
@@ -97,7 +111,7 @@ def relax_noise_covariance(search: Search, noise: Noise, best: Optimum) -> Relax
             for sd, before in zip(new.sd, noise.sd, strict=True)
             for n in before
         )
-        change += slopes_changed(noise, new)
+        change += slopes_changed(noise, new) + float(own_changed(noise, new))
         # Residuals that overflowed show no noise.
         if not np.isfinite(change):
             break

@@ -227,7 +227,8 @@ def log_posterior(
         noise: that whitens the rows.
         z: the unknowns (q,), in the optimiser's coordinates.
     """
-    rows = rows_of(layout, data, noise, z)
+    # Draws are of all parameters together: nothing is taken up by those of the mean.
+    rows = rows_of(layout, data, noise._replace(own=()), z)
     rest = jnp.concatenate([prior_rows(layout, data, z), weak_rows(layout, z)])
     # The rows of the priors come last and have no scale to be integrated out.
     measured = layout.estimator.log_density(layout, data, rows[: rows.shape[0] - rest.shape[0]])

@@ -186,6 +186,10 @@ class Noise(NamedTuple):
     scale_slopes: Any = ()
     """filter error: derivatives of the sum of log(innovation variance) by the scale errors that are
     unknown (k,), see `noisy_scales`; () where the model has none"""
+    own: Any = ()
+    """filter error: by parameter of a sensor model's own process noise the derivative of what the
+    parameters of the mean take up by its logarithm, and that logarithm (2,), see
+    `restricted_likelihood`; () where there is none"""
 
 
 class Solution(NamedTuple):
