@@ -11,7 +11,7 @@ from heli_jax.flights.csv_dates import Dates, seconds_of_dates
 from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
-from heli_jax.flights.time_units import likely_unit
+from heli_jax.flights.time_units import likely_unit, split_unit, time_unit
 
 N, DT = 300, 0.01
 T = DT * np.arange(N)
@@ -151,3 +151,56 @@ def test_points_among_decimal_commas_that_end_no_thousands_are_refused(tmp_path)
 )
 def test_ticks_without_a_unit_are_of_the_one_that_makes_a_flight(step, rows, unit):
     assert likely_unit(step * np.arange(rows) + 12345.0) == unit
+
+
+@pytest.mark.parametrize("first", [45352.5, 60371.5, 739312.5, 2460372.5])
+def test_days_as_spreadsheets_and_matlab_count_them_are_guessed_by_their_size(tmp_path, first):
+    assert likely_unit(first + 0.01 * np.arange(6000) / 86400) == "day"
+    # Seconds of a day, and of an hour, in the same range.
+    assert likely_unit(first + 0.001 * np.arange(6000)) == "s"
+    assert likely_unit(1e3 + 0.01 * np.arange(6000) / 86400) == "s"
+    # Twice a second: the digits of Julian days end at 40 us.
+    times = 0.5 * np.arange(60)
+    rows = [f"{first + t / 86400:.12f},{np.sin(t)},{np.cos(t)}" for t in times]
+    path = written(tmp_path, ["datenum,u,p", *rows])
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.unit, info.time.guessed) == ("day", True)
+    assert (info.time.rate, info.time.duration) == (
+        pytest.approx(2.0),
+        pytest.approx(29.5, abs=1e-4),
+    )
+    flight = read(path, Signal("datenum", "day", "s"))
+    np.testing.assert_allclose(flight.dt, 0.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("days since 2024-03-01", "day"),
+        ("Hours since 2024-03-01 00:00:00", "h"),
+        ("minutes since takeoff", "min"),
+        ("milliseconds  Since 1970-01-01T00:00:00Z", "ms"),
+        ("d", "day"),
+        ("since 1970", None),
+        ("dayssince 1970", None),
+    ],
+)
+def test_the_unit_of_a_clock_with_its_epoch(text, unit):
+    assert time_unit(text) == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("Time [h]", ("Time", "h")),
+        ("t (d)", ("t", "day")),
+        ("elapsed_hours", ("elapsed", "h")),
+        ("time days", ("time", "day")),
+        # A position down, and the span of a tail.
+        ("pos_d", ("pos_d", "")),
+        ("t_h", ("t_h", "")),
+    ],
+)
+def test_the_unit_of_a_clock_behind_its_name(name, parts):
+    assert split_unit(name) == parts
