@@ -105,7 +105,8 @@ def open_csv(path: Path) -> "CsvTable":
     notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        return CsvTable(size, digest, names, body, head, notes)
+        above = dict(zip(names[1:], head.units, strict=False))
+        return CsvTable(size, digest, names, body, head, notes, above)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")
