@@ -1,6 +1,7 @@
 """Times and numbers as spreadsheets, loggers and people of several countries write them."""
 
 import datetime
+import zoneinfo
 
 import numpy as np
 import pytest
@@ -204,3 +205,23 @@ def test_the_unit_of_a_clock_with_its_epoch(text, unit):
 )
 def test_the_unit_of_a_clock_behind_its_name(name, parts):
     assert split_unit(name) == parts
+
+
+def test_an_offset_from_utc_that_changes_in_flight(tmp_path):
+    # Summer time begins at 01:00 UTC: 01:59:59.8 +01:00 is followed by 03:00:00 +02:00.
+    begin = datetime.datetime(2024, 3, 31, 0, 59, 59, tzinfo=datetime.UTC)
+    rows, berlin = [], zoneinfo.ZoneInfo("Europe/Berlin")
+    for k in range(60):
+        at = (begin + datetime.timedelta(seconds=0.1 * k)).astimezone(berlin)
+        rows.append(f"{at.isoformat(timespec='milliseconds')},{np.sin(k)},{np.cos(k)}")
+    assert "+01:00" in rows[0]
+    assert "+02:00" in rows[-1]
+    flight = read(written(tmp_path, ["Time,u,p", *rows]))
+    assert flight.dt == pytest.approx(0.1)
+    assert sum("offset from UTC changes" in n for n in flight.source.notes) == 1
+    # Z is an offset of 0; a row without any is of no known time.
+    cells = ["2024-03-31T01:59:59+01:00", "2024-03-31T01:00:00Z", "2024-03-31T01:00:01 UTC"]
+    found = seconds_of_dates(cells)
+    assert not isinstance(found, int)
+    np.testing.assert_allclose(np.diff(found.seconds), [1.0, 1.0])
+    assert seconds_of_dates([*cells, "2024-03-31T03:00:01"]) == 3
