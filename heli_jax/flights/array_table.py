@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from heli_jax.flights import mat_file, packed
+from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -114,7 +115,7 @@ def open_mat(path: Path) -> ArrayTable:
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
     try:
-        whole = mat_file.read_arrays(data)
+        whole, units, notes = labelled(*mat_file.read_mat(data))
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
     except mat_file.LargeMatFile as e:
@@ -122,10 +123,15 @@ def open_mat(path: Path) -> ArrayTable:
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     real = {name: np.real(array) for name, array in whole.items()}
-    arrays = {n: part for name, array in real.items() for n, part in _vectors(name, array)}
+    arrays, of_parts = {}, {}
+    for name, array in real.items():
+        parts = dict(_vectors(name, array))
+        arrays |= parts
+        of_parts |= dict.fromkeys(parts, units.get(name, ""))
     complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
     words = f"complex numbers, of which the real part is read: {complex_ones}"
-    return ArrayTable(str(path), "mat", data, arrays, notes=(words,) if complex_ones else ())
+    notes = (*notes, words) if complex_ones else notes
+    return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
