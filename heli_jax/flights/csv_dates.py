@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.time_units import SECONDS, time_unit
+from heli_jax.flights.time_units import LETTERS, SECONDS, time_unit
 
 _DAY, _HOUR = 86400.0, 3600.0
 _CLOCK = r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12}|:\d{3})?)\s?([AaPp]\.?[Mm]\.?)?"
@@ -165,7 +165,10 @@ def _of_counts(cells: Sequence[str]) -> Dates | int:
 def _unit_of_count(cell: str) -> str | None:
     """The unit of a time that has its unit behind it, as MATLAB writes durations: `0.01 sec`."""
     match = _COUNT.fullmatch(cell)
-    return time_unit(match[2]) if match else None
+    # 3D is what a receiver calls its fix, and no three days.
+    if match is None or match[2].casefold() in LETTERS:
+        return None
+    return time_unit(match[2])
 
 
 def _going_on(seconds: np.ndarray, turn: float) -> np.ndarray:

@@ -25,8 +25,8 @@ _AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])]
 _JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
 _SINCE = re.compile(r"\s+since\s+\S", re.IGNORECASE)
 """of 'days since 2024-03-01', as the CF conventions write the unit of a clock"""
-_LETTERS = ("h", "d")
-"""that are a height and a direction down at the end of a name, but for brackets around them"""
+LETTERS = ("h", "d")
+"""units that mean other things too, as pos_d a position down: with brackets around them alone"""
 _SERIAL_DAYS = ((30_000.0, 66_000.0), (710_000.0, 760_000.0), (2_440_000.0, 2_480_000.0))
 """days of our time as they count: Excel and modified Julian, MATLAB's datenum, Julian"""
 _SLOWEST = 5.0
@@ -55,7 +55,7 @@ def split_unit(name: str) -> tuple[str, str]:
     if match is None and (joined := _JOINED.fullmatch(name)):
         return joined[1], time_unit(joined[2]) or ""
     unit = time_unit(match[3]) if match else None
-    if match and unit and not match["open"] and match[3].casefold() in _LETTERS:
+    if match and unit and not match["open"] and match[3].casefold() in LETTERS:
         return name, ""
     return (match[1], unit) if match and unit else (name, "")
 

@@ -225,3 +225,13 @@ def test_an_offset_from_utc_that_changes_in_flight(tmp_path):
     assert not isinstance(found, int)
     np.testing.assert_allclose(np.diff(found.seconds), [1.0, 1.0])
     assert seconds_of_dates([*cells, "2024-03-31T03:00:01"]) == 3
+
+
+def test_a_receivers_fix_is_no_time(tmp_path):
+    rows = [
+        f"{t:.2f},{u},{p},3D,{k // 9}h" for k, (t, u, p) in enumerate(zip(T, U, P, strict=True))
+    ]
+    info = describe_log(written(tmp_path, ["Time,u,p,fix,2D", *rows]))
+    assert info.time is not None
+    assert info.time.column == "Time"
+    assert [c.kind for c in info.columns] == ["number"] * 3 + ["text"] * 2
