@@ -29,6 +29,8 @@ _MOST_CELLS = 3 * 10**8
 """of all arrays: 2.4 GB of numbers, which a few compressed bytes can claim"""
 _MOST_ELEMENTS = 100
 """columns of a matrix: more are data of another shape than a log's"""
+_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+"""the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -243,6 +245,8 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         def visit(name: str, item: Any) -> None:
             nonlocal cells, claimed
             if not isinstance(item, h5py.Dataset) or not _holds_numbers(item.dtype, item.ndim):
+                return
+            if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
                 return
             cells += int(item.size or 0) * _numbers_in(item.dtype)  # an empty dataset has none
             _require_few_cells(path, cells)

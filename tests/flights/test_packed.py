@@ -135,3 +135,9 @@ def test_tables_of_named_fields_in_hdf5(tmp_path):
     info = describe_log(path)
     assert info.time is not None
     assert (info.time.column, info.time.rate) == ("run/log/t", pytest.approx(50.0))
+
+
+def test_a_dimension_of_netcdf_4_without_values_is_no_channel(tmp_path):
+    name = "This is a netCDF dimension but not a netCDF variable.        50"
+    sets = PACKED | {"x": (np.zeros(N), {"NAME": np.bytes_(name)})}
+    assert set(open_log(written(tmp_path / "flight.nc", sets)).names) == set(PACKED)
