@@ -13,7 +13,7 @@ _EXPONENT = re.compile(r"(?<=[A-Za-zµ°])(-?[1-9])(?![0-9.])")
 _POINT = re.compile(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])")
 # In a name there is no stroke: deg_s. Of these no product with a second is logged.
 _UNDERLINED = re.compile(
-    r"(deg|degree|degrees|rad|radian|radians|mrad|m|meter|meters|metre|metres|cm|mm|ft|km)"
+    r"(deg|degree|degrees|rad|radian|radians|mrad|cdeg|m|meter|meters|metre|metres|cm|mm|ft|km)"
     r"_(s|sec|secs|second|seconds|h|min)(\^?2)?"
 )
 _WORDS = {

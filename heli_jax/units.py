@@ -36,6 +36,7 @@ inch = 0.0254 * meter = in
 foot = 0.3048 * meter = ft
 minute = 60 * second = min
 hour = 3600 * second = h
+day = 24 * hour
 pound = 0.45359237 * kilogram = lb
 newton = kilogram * meter / second ** 2 = N
 watt = newton * meter / second = W

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heli_jax import cli, load_config, yaml_file
+from heli_jax import cli, load_config, units, yaml_file
 from heli_jax.config import read_flights
 from heli_jax.config.problems import problem
 from heli_jax.config.schema import Config
@@ -15,6 +15,7 @@ from heli_jax.new_config.guess import (
     Series,
     by_motion,
     by_name,
+    by_number,
     full_travel,
     may_be,
     scaled,
@@ -420,3 +421,84 @@ def test_what_a_controller_puts_out_is_a_stick_and_its_rate_is_none() -> None:
     assert no_stick("RATE.ROut", "", "1", sure=True) == ""
     assert words_in("RATE.RDes") == ("rate", "r", "des")
     assert words_in("rollRate") == words_in("Roll Rate") == ("roll", "rate")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "signal"),
+    [
+        ("Querruder [%]", "inputs", "roll"),
+        ("Höhenruder", "inputs", "pitch"),
+        ("Seitenruder", "inputs", "yaw"),
+        ("Rollwinkel [°]", "outputs", "roll"),
+        ("RollRate", "outputs", "roll_rate"),
+        ("Nickwinkel_deg", "outputs", "pitch"),
+        ("nick", "outputs", "pitch"),
+        ("Nickrate", "outputs", "pitch_rate"),
+        ("Gierwinkel", "outputs", "yaw"),
+        ("gier_rate", "outputs", "yaw_rate"),
+        ("rollspeed", "outputs", "roll_rate"),
+        ("roll_cdeg", "outputs", "roll"),
+        ("climb_rate_cms", "outputs", "climb"),
+        ("vel_d_m_s", "outputs", "down_speed"),
+    ],
+)
+def test_german_names_and_those_of_autopilots(name: str, kind: str, signal: str) -> None:
+    listed = _names()[kind]
+    assert [s for s, called in listed.items() if by_name(called, [name])] == [signal]
+
+
+@pytest.mark.parametrize(
+    ("name", "stem", "unit"),
+    [
+        ("roll_cdeg", "roll", "cdeg"),
+        ("roll_cd", "roll", "cdeg"),
+        ("p_cds", "p", "cdeg/s"),
+        ("gyro_mrads", "gyro", "mrad/s"),
+        ("climb_rate_cms", "climb_rate", "cm/s"),
+        ("climb_cm_s", "climb", "cm/s"),
+        ("vel_d_m_s", "vel_d", "m/s"),
+        ("roll_rate_mrad_s", "roll_rate", "mrad/s"),
+    ],
+)
+def test_small_units_at_the_end_of_a_name(name: str, stem: str, unit: str) -> None:
+    assert without_unit(name) == (stem, unit)
+    assert units.is_unit(unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "stick"),
+    [
+        ("chan1_raw", "roll"),
+        ("servoRaw.servo2", "pitch"),
+        ("rcin_3", "collective"),
+        ("RC_Channel_4", "yaw"),
+        # Columns of an array are counted from 0.
+        ("rc[0]", "roll"),
+        ("chan12_raw", None),
+        ("ch", None),
+    ],
+)
+def test_channels_by_their_numbers(name: str, stick: str | None) -> None:
+    listed = _names()["numbered"]
+    assert [s for s, called in listed.items() if by_number(called, [name])] == [stick] * bool(stick)
+
+
+def test_numbered_channels_are_guesses_and_what_follows_one_goes_before(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).standard_normal((2, T.size))
+    columns = {"t": T, "chan1_raw": 1500 + 400 * STICK, "chan2_raw": 1500 + 30 * noise[0]}
+    columns |= {"rollspeed": RATE, "pitchspeed": 0.1 * noise[1]}
+    out = tmp_path / "two.yaml"
+    log = write(tmp_path / "two.csv", columns)
+    assert (
+        cli.main(["new", str(log), "--out", str(out), "--model", "linear:attitude-flybarless"]) == 0
+    )
+    lines = [line for line in out.read_text().splitlines() if "_raw" in line]
+    assert len(lines) == 2
+    assert all("GUESS: by its number" in line for line in lines)
+    # A receiver in another order: the rate tells.
+    swapped = {"chan2_raw": columns["chan1_raw"], "chan1_raw": columns["chan2_raw"]}
+    log, out = write(tmp_path / "one.csv", columns | swapped), tmp_path / "one.yaml"
+    assert cli.main(["new", str(log), "--out", str(out), "--model", "linear:roll-flybarless"]) == 0
+    taken = next(line for line in out.read_text().splitlines() if "lat: {" in line)
+    assert "chan2_raw" in taken
+    assert "rollspeed follows it" in taken

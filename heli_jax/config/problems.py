@@ -20,7 +20,7 @@ from heli_jax.dynamics.kinematics import is_kinematic
 from heli_jax.dynamics.model import Model
 from heli_jax.errors import InputError, nearest
 from heli_jax.flights.flight import Flight
-from heli_jax.flights.read import require_moving_outputs
+from heli_jax.flights.read import require_moving_outputs, require_some_time
 from heli_jax.identification.methods import estimator_of
 from heli_jax.identification.problem import Free, Nuisance, Prior, Problem
 from heli_jax.simulation.simulate import substeps_for
@@ -46,6 +46,7 @@ def problem(experiment: Experiment) -> Problem:
     flights = read_flights(experiment, gain=nuisance.input_gain)
     for flight in flights:
         if not flight.hold_out:  # which is simulated, and not fitted
+            require_some_time(flight)
             require_moving_outputs(flight)
     free = {name: _free(f) for name, f in config.fit.free.items()}
     free, guess = first_guesses(experiment, flights, free)

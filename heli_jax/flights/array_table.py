@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from heli_jax.flights import mat_file
+from heli_jax.flights import mat_file, packed
+from heli_jax.flights.mat_labels import labelled
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -28,6 +29,8 @@ _MOST_CELLS = 3 * 10**8
 """of all arrays: 2.4 GB of numbers, which a few compressed bytes can claim"""
 _MOST_ELEMENTS = 100
 """columns of a matrix: more are data of another shape than a log's"""
+_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+"""the name that NetCDF 4 gives to a dimension without values, which stands in the file as zeros"""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -99,9 +102,7 @@ class ArrayTable:
 
     def time_unit(self, name: str) -> str | None:
         """The unit that the file states, where it is one of time."""
-        # The CF conventions write a clock's unit as 'seconds since 1970-01-01', of which the epoch
-        # does not matter: times count from the first sample.
-        return time_unit(self.units.get(name, "").split(" since ")[0])
+        return time_unit(self.units.get(name, ""))
 
 
 def open_mat(path: Path) -> ArrayTable:
@@ -116,7 +117,7 @@ def open_mat(path: Path) -> ArrayTable:
     if data[:520].find(HDF5_MAGIC) >= 0 or data.startswith(b"MATLAB 7.3"):
         return _from_hdf5(path, "mat 7.3", data)
     try:
-        whole = mat_file.read_arrays(data)
+        whole, units, notes = labelled(*mat_file.read_mat(data))
     except mat_file.DamagedMatFile as e:
         raise wrong(str(path), f"is no whole MATLAB file: {e}") from e
     except mat_file.LargeMatFile as e:
@@ -124,10 +125,15 @@ def open_mat(path: Path) -> ArrayTable:
     # Before anything is made of the arrays: every value takes eight bytes once it is a float64.
     _require_few_cells(path, sum(array.size for array in whole.values()))
     real = {name: np.real(array) for name, array in whole.items()}
-    arrays = {n: part for name, array in real.items() for n, part in _vectors(name, array)}
+    arrays, of_parts = {}, {}
+    for name, array in real.items():
+        parts = dict(_vectors(name, array))
+        arrays |= parts
+        of_parts |= dict.fromkeys(parts, units.get(name, ""))
     complex_ones = ", ".join(shown(n) for n, array in whole.items() if array.dtype.kind == "c")
     words = f"complex numbers, of which the real part is read: {complex_ones}"
-    return ArrayTable(str(path), "mat", data, arrays, notes=(words,) if complex_ones else ())
+    notes = (*notes, words) if complex_ones else notes
+    return ArrayTable(str(path), "mat", data, arrays, of_parts, notes)
 
 
 def _vectors(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
@@ -163,22 +169,52 @@ def open_netcdf(path: Path) -> ArrayTable:
 
     import xarray
 
-    # Any: name -> array, and name -> unit.
-    def read() -> tuple[dict[str, Any], dict[str, str]]:
-        # Times stay numbers: `time_unit` knows what they are.
+    def read() -> _DataSets:
+        # Nothing is decoded: times stay numbers, of which `time_unit` knows what they are, and
+        # numbers are unpacked here as those of HDF5 are.
         # The engine is named, so that what else is installed does not decide which library reads
         # the file.
-        with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_times=False) as file:
+        with xarray.open_dataset(io.BytesIO(data), engine="scipy", decode_cf=False) as file:
             _require_few_cells(path, sum(v.size for v in file.variables.values()))
-            arrays, units = {}, {}
+            read = _DataSets()
             for name, variable in file.variables.items():
-                for part, values in _vectors(str(name), np.asarray(variable.values)):
-                    arrays[part] = values
-                    units[part] = str(variable.attrs.get("units", ""))
-            return arrays, units
+                read.add(str(name), np.asarray(variable.values), variable.attrs)
+            return read
 
-    arrays, units = _guarded(path, "NetCDF file", read)
-    return ArrayTable(str(path), "netcdf", data, arrays, units)
+    return _guarded(path, "NetCDF file", read).table(str(path), "netcdf", data)
+
+
+class _DataSets:
+    """What is read of a file whose data sets have attributes."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
+        self._units: dict[str, str] = {}
+        self._scaled: dict[str, None] = {}
+        self._missing: dict[str, int] = {}
+        self._left_out: dict[str, str] = {}
+
+    def add(self, name: str, stored: np.ndarray, attributes: Mapping[str, Any]) -> None:
+        """One data set, unpacked; `attributes` are all that it has, or those that count."""
+        packing = {n: attributes[n] for n in packed.ATTRIBUTES if n in attributes}
+        try:
+            values, is_scaled, missing = packed.unpack(stored, packing)
+        except packed.Packing as e:
+            self._left_out[name] = str(e)
+            return
+        if is_scaled:
+            self._scaled[name] = None
+        if missing:
+            self._missing[name] = missing
+        stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), "")
+        for part, vector in _vectors(name, values):
+            self._arrays[part] = vector
+            self._units[part] = packed.text_of(stated)
+
+    def table(self, path: str, kind: str, data: bytes) -> ArrayTable:
+        """All of them."""
+        notes = packed.notes_of(self._scaled, self._missing, self._left_out)
+        return ArrayTable(path, kind, data, self._arrays, self._units, notes)
 
 
 def open_hdf5(path: Path) -> ArrayTable:
@@ -201,38 +237,68 @@ def _from_hdf5(path: Path, kind: str, data: bytes) -> ArrayTable:
         problem = "is an HDF5 file inside, for which h5py is needed: pip install 'heli_jax[logs]'"
         raise wrong(str(path), problem) from e
 
-    def read() -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        arrays: dict[str, np.ndarray] = {}
-        units: dict[str, str] = {}
+    def read() -> _DataSets:
+        read = _DataSets()
         cells, claimed = 0, 0
 
         # Any: h5py's classes cannot be named where it is not installed.
         def visit(name: str, item: Any) -> None:
             nonlocal cells, claimed
-            if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim <= 2:
-                cells += int(item.size or 0)  # an empty dataset has none
-                _require_few_cells(path, cells)
-                claimed += int(item.size or 0) * item.dtype.itemsize
-                try:
-                    mat_file.require_few_bytes(claimed, len(data))
-                except mat_file.LargeMatFile as e:
-                    raise wrong(str(path), str(e)) from e
-                # A structure's path is as `open_mat` gives it for older versions, so that a
-                # configuration does not depend on the version in which a file was saved.
-                dotted = name.replace("/", ".") if kind == "mat 7.3" else name
-                for part, values in _vectors(dotted, np.asarray(item)):
-                    arrays[part] = values
-                    unit = item.attrs.get("units", "")
-                    units[part] = unit if isinstance(unit, str) else ""
+            if not isinstance(item, h5py.Dataset) or not _holds_numbers(item.dtype, item.ndim):
+                return
+            if packed.text_of(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE):
+                return
+            cells += int(item.size or 0) * _numbers_in(item.dtype)  # an empty dataset has none
+            _require_few_cells(path, cells)
+            claimed += int(item.size or 0) * item.dtype.itemsize
+            try:
+                mat_file.require_few_bytes(claimed, len(data))
+            except mat_file.LargeMatFile as e:
+                raise wrong(str(path), str(e)) from e
+            # A structure's path is as `open_mat` gives it for older versions, so that a
+            # configuration does not depend on the version in which a file was saved.
+            dotted = name.replace("/", ".") if kind == "mat 7.3" else name
+            # Of others nothing is read: they may be of types that h5py does not know.
+            counting = (*packed.ATTRIBUTES, *packed.UNIT_ATTRIBUTES)
+            attributes = {n: item.attrs[n] for n in counting if n in item.attrs}
+            for field, values, own in _fields(dotted, np.asarray(item), attributes):
+                read.add(field, values, own)
 
         with h5py.File(path, "r") as file:
             # This visits every object once and follows no links, of which a circle would never end
             # and one to another file would read that.
             file.visititems(visit)
-        return arrays, units
+        return read
 
-    arrays, units = _guarded(path, "HDF5 file", read)
-    return ArrayTable(str(path), kind, data, arrays, units)
+    return _guarded(path, "HDF5 file", read).table(str(path), kind, data)
+
+
+def _holds_numbers(kind: np.dtype, dimensions: int) -> bool:
+    """Whether a data set is an array of numbers, or a table of named fields that are."""
+    return dimensions <= (1 if kind.names else 2) and (bool(kind.names) or kind.kind in "biuf")
+
+
+def _numbers_in(kind: np.dtype) -> int:
+    """How many numbers an element has."""
+    if kind.names is None:
+        return int(np.prod(kind.shape))
+    return sum(_numbers_in(kind[name]) for name in kind.names)
+
+
+def _fields(
+    name: str, values: np.ndarray, attributes: Mapping[str, Any]
+) -> Iterator[tuple[str, np.ndarray, Mapping[str, Any]]]:
+    """A data set, or the fields of its table as data sets in a group of its name, each with the
+    attributes that are its own."""
+    names = values.dtype.names
+    if names is None:
+        yield name, values, attributes
+        return
+    # What stands beside a table is of none of its fields, unless it is as many texts.
+    stated = next((attributes[n] for n in packed.UNIT_ATTRIBUTES if n in attributes), ())
+    units = list(np.ravel(stated)) if np.size(stated) == len(names) else [""] * len(names)
+    for field, unit in zip(names, units, strict=True):
+        yield from _fields(f"{name}/{field}", values[field], {"units": unit})
 
 
 def _require_few_cells(path: Path, count: int) -> None:

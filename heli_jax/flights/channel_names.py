@@ -8,6 +8,9 @@ _PLAIN = {
     **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
     "mrad": "mrad",
+    **dict.fromkeys(("cdeg", "centideg", "centidegrees"), "cdeg"),
+    "cm": "cm",
+    "mm": "mm",
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("ft", "feet"), "ft"),
 }

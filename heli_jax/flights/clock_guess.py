@@ -11,6 +11,9 @@ from heli_jax.flights.table import Survey, Table, shown
 from heli_jax.flights.time_units import likely_unit, split_unit
 
 TIME_NAMES = {"zeit", "t", "time", "timestamp", "timestamps", "seconds", "sec", "elapsed", "clock"}
+_STAMP = ("header", "stamp")
+_ARRIVALS = ("%time", "__time", "rosbagTimestamp", "Time")
+"""as tools for logs of ROS call the column of arrival"""
 _COUNTERS = {
     *(
         "frame",
@@ -37,6 +40,10 @@ def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None,
     """
     values = {s.name: s.values for s in reversed(surveys) if s.values is not None}
     numeric = [s.name for s in surveys if s.values is not None]
+    # When a sample was taken, before when its message arrived: rostopic writes both.
+    for name in numeric:
+        if _is_of_sample(name) and _increases(values[name]):
+            return _with_unit(table, name, values[name])
     # A name decides before the numbers do: a counter or a distance may increase all along too.
     for name in numeric:
         stem, _ = split_unit(name)
@@ -53,6 +60,25 @@ def guess_clock(table: Table, surveys: Sequence[Survey]) -> tuple[Signal | None,
     for name in (*named, *others):
         return _with_unit(table, name, values[name])
     return None, False
+
+
+def arrival_notes(clock: str, names: Sequence[str]) -> tuple[str, ...]:
+    """That a clock was taken in place of another, where the other is that of a message's arrival.
+
+    Args:
+        clock: the column that is taken.
+        names: of a table's columns.
+    """
+    other = next((name for name in names if name in _ARRIVALS), None)
+    if other is None or not _is_of_sample(clock):
+        return ()
+    words = "is taken for the clock, since it says when a sample was taken"
+    return (f"{shown(clock)} {words}; {shown(other)} says when its message arrived",)
+
+
+def _is_of_sample(name: str) -> bool:
+    """Whether a path ends in the stamp of a message's header: field.header.stamp."""
+    return tuple(re.split(r"[./]", name.casefold())[-2:]) == _STAMP
 
 
 def counter_notes(surveys: Sequence[Survey]) -> tuple[str, ...]:

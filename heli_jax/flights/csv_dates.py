@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heli_jax.flights.time_units import SECONDS, time_unit
+from heli_jax.flights.time_units import LETTERS, SECONDS, time_unit
 
 _DAY, _HOUR = 86400.0, 3600.0
 _CLOCK = r"(\d{1,3}):(\d\d):(\d\d(?:[.,]\d{1,12}|:\d{3})?)\s?([AaPp]\.?[Mm]\.?)?"
@@ -57,7 +57,7 @@ def seconds_of_dates(
     """Seconds from the first midnight, of dates, times of day, minutes, or counts with a unit.
 
     Times of day go on behind midnight, minutes of an hour behind the hour. All cells have to be of
-    one kind, and dates of one zone.
+    one kind, and dates with a zone or without.
 
     Args:
         cells: N.
@@ -94,10 +94,11 @@ def _of_dates(form: re.Pattern[str], cells: Sequence[str]) -> Dates | int:
     matches: list[re.Match[str]] = []
     for i, cell in enumerate(cells):
         match = form.fullmatch(cell)
-        # The zone is the last group.
-        if not match or (matches and match[match.re.groups] != matches[0][match.re.groups]):
+        # With a zone all have one, or none.
+        if not match or (matches and (_zone(match) is None) != (_zone(matches[0]) is None)):
             return i
         matches.append(match)
+    zones = np.array([_zone(match) or 0.0 for match in matches])
     days = _ordinals([match["date"] for match in matches])
     if isinstance(days, int):
         return days
@@ -108,7 +109,20 @@ def _of_dates(form: re.Pattern[str], cells: Sequence[str]) -> Dates | int:
         if time is None:
             return i
         seconds[i] = time
-    return Dates(seconds + _DAY * (days.seconds - days.seconds[0]), days.note)
+    # As where summer time begins within a log: the clock of the first row goes on.
+    turned = "" if np.ptp(zones) == 0 else "the offset from UTC changes, times go on in the first"
+    said = "; ".join(filter(None, (days.note, turned)))
+    seconds -= zones - zones[0]
+    return Dates(seconds + _DAY * (days.seconds - days.seconds[0]), said)
+
+
+def _zone(match: re.Match[str]) -> float | None:
+    """The offset from UTC [s] of a date's zone, which is the last group; None without one."""
+    zone = match[match.re.groups]
+    if zone is None or not zone.startswith(("+", "-")):
+        return None if zone is None else 0.0
+    sign, digits = (-1.0 if zone[0] == "-" else 1.0), zone[1:].replace(":", "")
+    return sign * (_HOUR * int(digits[:2]) + 60.0 * int(digits[2:]))
 
 
 def _of_clocks(cells: Sequence[str], days: Sequence[str] | None) -> Dates | int:
@@ -151,7 +165,10 @@ def _of_counts(cells: Sequence[str]) -> Dates | int:
 def _unit_of_count(cell: str) -> str | None:
     """The unit of a time that has its unit behind it, as MATLAB writes durations: `0.01 sec`."""
     match = _COUNT.fullmatch(cell)
-    return time_unit(match[2]) if match else None
+    # 3D is what a receiver calls its fix, and no three days.
+    if match is None or match[2].casefold() in LETTERS:
+        return None
+    return time_unit(match[2])
 
 
 def _going_on(seconds: np.ndarray, turn: float) -> np.ndarray:

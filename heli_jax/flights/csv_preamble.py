@@ -40,6 +40,9 @@ _NUMBER = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*(?:[eEdD][+-]?[0-9]
 """with any decimal sign, and with marks between thousands"""
 _TYPE = re.compile(r"\s*(?:u?int|long|float|double|single|real|string|bool|boolean)\d*\s*", re.I)
 _SEPARATOR = re.compile(r'"?sep=([,;|:\t ])"?\s*', re.IGNORECASE)
+_RULE = re.compile(r"([*=#~_-])\1+.*\1\1")
+"""a word between signs, such as ***End_of_Header***: for people, and no group of columns"""
+_UNIT_LABEL = re.compile(r".*(?:unit|einheit).*", re.IGNORECASE)
 _IDENTITY = re.compile(r"[0-9A-Fa-f{}-]{8,}|[0-9]+")
 """of a body, in place of its name"""
 
@@ -54,6 +57,7 @@ class Head(NamedTuple):
         first_line: the number of the first line of rows or units.
         note: what stands above, in words; empty of a table that begins with its names.
         is_fitting: whether rows of as many cells were found right below.
+        units: of the columns behind the first, where a line above names them.
     """
 
     header: Line
@@ -62,6 +66,7 @@ class Head(NamedTuple):
     first_line: int
     note: str = ""
     is_fitting: bool = True
+    units: tuple[str, ...] = ()
 
 
 def find_head(path: str, data: bytes, blanks: bool) -> Head | None:
@@ -166,7 +171,21 @@ def _head_above(
         tuple(line.text for line in reversed(lines[top:header])),
         lines[begin - 1].number + 1,
         note,
+        units=_units_above(cells[:top], cells[header]),
     )
+
+
+def _units_above(above: Sequence[Sequence[str]], names: Sequence[str]) -> tuple[str, ...]:
+    """The units in the last line above that begins with such a word, as LabVIEW's Y_Unit_Label:
+    those of the columns behind the first, empty where there is no such line."""
+    # Where each signal has a column of times of its own, it is not known which has which.
+    if names.count(names[0]) > 1:
+        return ()
+    for cells in reversed(above):
+        if len(cells) > 1 and _UNIT_LABEL.fullmatch(cells[0].strip()):
+            found = row_of_units(cells[1 : len(names)])
+            return found or ()
+    return ()
 
 
 def _is_group(lines: Sequence[Line], cells: Sequence[list[str]], at: int, width: int) -> bool:
@@ -174,7 +193,8 @@ def _is_group(lines: Sequence[Line], cells: Sequence[list[str]], at: int, width:
     filled = [cell for cell in cells[at] if cell.strip()]
     together = lines[at].number + 1 == lines[at + 1].number
     alike = len(cells[at]) == width and not _are_units(cells[at])
-    return together and alike and bool(filled) and not is_date(filled[0])
+    is_rule = len(filled) == 1 and _RULE.fullmatch(filled[0].strip()) is not None
+    return together and alike and bool(filled) and not is_rule and not is_date(filled[0])
 
 
 def _fits(names: Sequence[str], row: Sequence[str]) -> bool:

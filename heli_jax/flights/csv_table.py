@@ -36,6 +36,7 @@ from heli_jax.flights.csv_texts import (
     text_floats,
 )
 from heli_jax.flights.digest import Digest
+from heli_jax.flights.gzipped import inner_ending, is_gzipped, unpacked
 from heli_jax.flights.table import (
     Survey,
     column,
@@ -70,13 +71,15 @@ def open_csv(path: Path) -> "CsvTable":
         OSError: it cannot be read.
     """
     where = str(path)
-    plain = plain_beginning(path, _LARGEST)
+    plain = None if is_gzipped(path) else plain_beginning(path, _LARGEST)
     # Of a plain file the beginning stands for all of it in what follows.
     data = plain.data if plain else read_regular(path, "a log in CSV", _LARGEST)
     digest, size = (Digest(path), plain.size) if plain else (Digest(data), len(data))
+    if is_gzipped(path):
+        data = unpacked(where, data)
     data, notes = as_utf8(where, data)
     check_text(where, data)
-    blanks = path.suffix.lower() not in (".csv", ".tsv")
+    blanks = inner_ending(path) not in (".csv", ".tsv")
     head = find_head(where, data, blanks)
     if head is None:
         raise wrong(where, "holds no header, expected names of columns and rows of numbers")
@@ -105,7 +108,8 @@ def open_csv(path: Path) -> "CsvTable":
     notes = (*notes, head.note) if head.note else notes
     notes, units = (*notes, *cut), _units_below(body, names)
     if units is None:
-        return CsvTable(size, digest, names, body, head, notes)
+        above = dict(zip(names[1:], head.units, strict=False))
+        return CsvTable(size, digest, names, body, head, notes, above)
     body, number_of_line = _below(body)
     listed = ", ".join(f"{n} [{u}]" for n, u in list(zip(names, units, strict=True))[:6])
     notes = (*notes, f"line {number_of_line} was taken for units and not for a sample: {listed}")

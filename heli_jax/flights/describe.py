@@ -11,7 +11,7 @@ import numpy as np
 from heli_jax import units
 from heli_jax.errors import nearest
 from heli_jax.flights.array_clocks import clock_notes
-from heli_jax.flights.clock_guess import counter_notes, guess_clock
+from heli_jax.flights.clock_guess import arrival_notes, counter_notes, guess_clock
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.grid import (
     LATEST,
@@ -257,7 +257,11 @@ def describe_table(table: Table, time: str | Signal | None, unit: str | None) ->
             *table.notes,
             *_other_lengths(surveys),
             *clock_notes(table),
-            *(counter_notes(surveys) if clock is None else ()),
+            *(
+                counter_notes(surveys)
+                if clock is None
+                else arrival_notes(clock.column, table.names)
+            ),
             *marks,
         ),
     )

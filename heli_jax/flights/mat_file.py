@@ -1,8 +1,8 @@
 """MATLAB files to version 7.2, read with NumPy alone.
 
 Source: 'MAT-File Format' of The MathWorks, levels 4 and 5. SciPy's reader is not used: of a file
-with a few flipped bytes it ends the process. What is read are numbers, structures and cells; text,
-sparse arrays and objects are passed over.
+with a few flipped bytes it ends the process. What is read are numbers, structures and cells, and
+short texts; sparse arrays and objects are passed over.
 """
 
 import struct
@@ -19,8 +19,12 @@ _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 6, 15
+_CELL, _STRUCT, _CHAR, _FIRST_NUMERIC, _LAST_NUMERIC = 1, 2, 4, 6, 15
 _COMPLEX = 0x800
+_LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"}
+"""encodings by the number that the format has for each type of text"""
+_LONGEST_TEXT = 1000
+"""bytes of a name or a unit: longer texts are passed over"""
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
 _MOST_BYTES = 2 * 10**9
 """of all arrays once they are unpacked"""
@@ -51,8 +55,16 @@ class _Element(NamedTuple):
     end: int
 
 
-def read_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of numbers of a file, by path: `log.roll.data`, `runs[0].phi`.
+class MatFile(NamedTuple):
+    """The arrays of numbers of a file by path, `log.roll.data`, `runs[0].phi`, and its short texts
+    in structures and cells, `runs[0].label`."""
+
+    arrays: dict[str, np.ndarray]
+    texts: dict[str, str]
+
+
+def read_mat(data: bytes) -> MatFile:
+    """The arrays and texts of a file.
 
     Raises:
         DamagedMatFile: it cannot be read.
@@ -63,13 +75,22 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
         # wrote it, so their order tells that of all bytes. Level 4 has no header.
         mark = data[126:128]
         if len(data) > 128 and mark in (b"IM", b"MI"):
-            return dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
-        return dict(_level_4(memoryview(data)))
+            found = dict(_level_5(memoryview(data), "<" if mark == b"IM" else ">"))
+        else:
+            found = dict(_level_4(memoryview(data)))
+        return MatFile(
+            {name: x for name, x in found.items() if not isinstance(x, str)},
+            {name: text for name, text in found.items() if isinstance(text, str)},
+        )
     except (struct.error, ValueError, UnicodeDecodeError, zlib.error) as e:
         raise DamagedMatFile("a piece of it is no array") from e
 
 
-def _level_5(data: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
+type _Content = tuple[str, np.ndarray | str]
+"""the path of an array or a text, and what it is"""
+
+
+def _level_5(data: memoryview, order: str) -> Iterator[_Content]:
     at, unpacked = 128, 0
     while at + 8 <= len(data):
         element = _element(data, at, order)
@@ -133,9 +154,7 @@ def _element(data: memoryview, at: int, order: str) -> _Element:
     return _Element(kind, data[begin : begin + size], end)
 
 
-def _matrix(
-    data: memoryview, order: str, prefix: str, depth: int
-) -> Iterator[tuple[str, np.ndarray]]:
+def _matrix(data: memoryview, order: str, prefix: str, depth: int) -> Iterator[_Content]:
     """The arrays in one matrix; `prefix` is its path, empty where it has a name of its own."""
     if not data or depth > _DEEPEST:
         return
@@ -158,6 +177,9 @@ def _matrix(
             raise DamagedMatFile(f"an array of {values.size} values claims {np.prod(shape)}")
         # The real part comes first, and is what is read; the type says that there is another.
         yield name, (values + 0j if is_complex else values).reshape(shape, order="F")
+    elif kind == _CHAR and shape.size == 2 and shape[0] == 1:
+        if text := _text(_element(data, label.end, order), order):
+            yield name, text
     elif kind == _CELL:
         yield from _members(data, label.end, order, [_indexed(name, shape)], depth)
     elif kind == _STRUCT:
@@ -169,6 +191,16 @@ def _matrix(
         names = _field_names(bytes(fields.data), int(width[0]))
         paths = [[f"{each}.{field}" for field in names] for each in _indexed(name, shape)]
         yield from _members(data, fields.end, order, paths, depth)
+
+
+def _text(element: _Element, order: str) -> str:
+    """A line of text; empty where it is long, or of no encoding that is known."""
+    encoding = _LETTERS.get(element.kind, "")
+    if not encoding or len(element.data) > _LONGEST_TEXT:
+        return ""
+    if encoding == "utf-16":
+        encoding += "-le" if order == "<" else "-be"
+    return bytes(element.data).decode(encoding, "replace").strip("\0 ")
 
 
 def _field_names(text: bytes, width: int) -> list[str]:
@@ -184,7 +216,7 @@ def _indexed(name: str, shape: np.ndarray) -> list[str]:
 
 def _members(
     data: memoryview, at: int, order: str, paths: list[list[str]], depth: int
-) -> Iterator[tuple[str, np.ndarray]]:
+) -> Iterator[_Content]:
     """The arrays in matrices that follow each other, by their paths."""
     for path in (path for row in paths for path in row):
         element = _element(data, at, order)
@@ -204,7 +236,7 @@ def _numbers(data: memoryview, at: int, order: str) -> tuple[np.ndarray, int]:
     return np.frombuffer(element.data, kind).astype(kind.newbyteorder("=")), element.end
 
 
-def _level_4(data: memoryview) -> Iterator[tuple[str, np.ndarray]]:
+def _level_4(data: memoryview) -> Iterator[_Content]:
     at = 0
     # The first word is a number below 5000 whose digits say how the array is stored. So its fourth
     # byte is zero if it was written lowest byte first, and hardly otherwise.

@@ -14,6 +14,7 @@ from heli_jax.flights import (
 )
 from heli_jax.flights.blackbox import open_blackbox
 from heli_jax.flights.csv_table import open_csv
+from heli_jax.flights.gzipped import inner_ending, is_gzipped
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.parquet_table import open_parquet
 from heli_jax.flights.table import Table, shown, wrong
@@ -129,6 +130,11 @@ def _reader(path: Path) -> _Reader:
     # read as text.
     if ending == ".parquet":
         return open_parquet
+    if is_gzipped(path):
+        if inner_ending(path) not in _TEXTS:
+            problem = f"is packed by gzip, which is read of texts alone ({', '.join(_TEXTS[:3])})"
+            raise wrong(str(path), f"{problem}; expected it unpacked")
+        return open_csv
     with open_regular(path, "a log", sys.maxsize) as file:
         head = file.read(_SNIFFED)
     marked = _by_content(head)

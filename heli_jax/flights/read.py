@@ -25,6 +25,8 @@ from heli_jax.flights.sources import Opened, beyond, clocked, flight_from, opene
 from heli_jax.flights.table import wrong
 
 _DEFAULT = ReadOptions()
+_SHORTEST = 0.05
+"""s: no machine answers a stick sooner"""
 _STILL = 1e-100
 """SI: an output that moves by no more does not move"""
 
@@ -239,6 +241,19 @@ def require_moving_inputs(flight: Flight) -> None:
         " can be learnt from it; expected an input that moves",
         f"input {name!r}",
     )
+
+
+def require_some_time(flight: Flight) -> None:
+    """Refuse a flight in which no machine can have moved.
+
+    Raises:
+        InputError: with its length, and where to look.
+    """
+    if flight.duration >= _SHORTEST:
+        return
+    path = flight.source.path if flight.source else flight.name or "flight"
+    problem = f"{flight.n_samples} samples in {flight.duration:.3g} s, expected {_SHORTEST:g} s"
+    raise wrong(path, f"{problem} at least: look at the window, and at the time's unit")
 
 
 def require_moving_outputs(flight: Flight) -> None:

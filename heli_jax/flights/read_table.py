@@ -28,6 +28,7 @@ from heli_jax.flights.grid import (
 )
 from heli_jax.flights.holds import Decision
 from heli_jax.flights.joined import joined_log
+from heli_jax.flights.known_inputs import rows_of_known_inputs
 from heli_jax.flights.log import ChannelLog
 from heli_jax.flights.marks import Marked
 from heli_jax.flights.onto_grid import (
@@ -114,6 +115,8 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     # wrong as it likes.
     with clock.hinting():
         rows, notes = _rows(table.path, clock.elapsed, options.window)
+    rows, more = rows_of_known_inputs(request, loaded.numbers, clock.elapsed, rows)
+    notes = (*notes, *more)
     signals = _to_si(table, request, loaded.numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     # Before the grid, whose rounding is a part of a step: steps of a wrong unit would make it
@@ -164,6 +167,7 @@ def clocked_table(loaded: LoadedTable, request: Request) -> dict[Key, ClockedSig
     assert request.time is not None  # or `load_table` would have refused it
     with clock.hinting():
         rows, _ = _rows(table.path, clock.elapsed, request.options.window)
+    rows, _ = rows_of_known_inputs(request, loaded.numbers, clock.elapsed, rows)
     signals = _to_si(table, request, loaded.numbers, rows)
     stamps = _Stamps(table, request.time.name, clock.elapsed[rows], rows.start)
     _check_step(stamps)

@@ -6,7 +6,7 @@ import numpy as np
 
 from heli_jax.flights.table import column, wrong
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
 """of the units that clocks have: pint, which knows all, takes a quarter of a second to load"""
 _WORDS = {
     "s": ("s", "sec", "secs", "second", "seconds"),
@@ -14,6 +14,8 @@ _WORDS = {
     "us": ("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
     "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
     "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+    "day": ("d", "day", "days"),
 }
 _UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
 # A unit stands behind a name as time_ms, 'time ms', time[ms] or time(ms); the group tells whether a
@@ -21,6 +23,14 @@ _UNITS = {word: unit for unit, words in _WORDS.items() for word in words}
 _AT_END = re.compile(r"^(.*?)\s*(?:_|\s|(?P<open>[\[(]))([^\W\d_]+)(?(open)[\])])$")
 # TimeUS, timestampMs: joined by a capital alone.
 _JOINED = re.compile(r"^(.*(?:[Tt]ime|[Ss]tamp|TIME))(US|Us|MS|Ms|NS|Ns|Sec|Secs|S)$")
+_SINCE = re.compile(r"\s+since\s+\S", re.IGNORECASE)
+"""of 'days since 2024-03-01', as the CF conventions write the unit of a clock"""
+LETTERS = ("h", "d")
+"""units that mean other things too, as pos_d a position down: with brackets around them alone"""
+_SERIAL_DAYS = ((30_000.0, 66_000.0), (710_000.0, 760_000.0), (2_440_000.0, 2_480_000.0))
+"""days of our time as they count: Excel and modified Julian, MATLAB's datenum, Julian"""
+_SLOWEST = 5.0
+"""s: no flight is logged once in more"""
 _LONGEST_FLIGHT, _LONGEST_SLOW = 6 * 3600.0, 2 * 3600.0
 """s: ticks that would make a longer one are more likely of the next smaller unit, and those of a
 slow log sooner: 20 s at 1 kHz in ms would be hours at 1 Hz in s"""
@@ -31,6 +41,8 @@ def time_unit(text: str) -> str | None:
 
     Of a clock, a capital is a way of writing: megaseconds nobody logs.
     """
+    # Of which the epoch does not matter: times count from the first sample.
+    text = _SINCE.split(text, maxsplit=1)[0]
     # The micro sign, and the Greek letter that looks the same.
     word = text.strip().casefold().replace("µ", "u").replace("μ", "u")
     return _UNITS.get(word)
@@ -43,6 +55,8 @@ def split_unit(name: str) -> tuple[str, str]:
     if match is None and (joined := _JOINED.fullmatch(name)):
         return joined[1], time_unit(joined[2]) or ""
     unit = time_unit(match[3]) if match else None
+    if match and unit and not match["open"] and match[3].casefold() in LETTERS:
+        return name, ""
     return (match[1], unit) if match and unit else (name, "")
 
 
@@ -68,14 +82,18 @@ def require_likely(path: str, name: str, unit: str, stamps: np.ndarray) -> None:
 
 def likely_unit(stamps: np.ndarray | None) -> str:
     """The unit of stamps (N,) by their usual step and their length: no flight is logged once in
-    5 s, or lasts a day."""
+    5 s, or lasts a day. Counted days, as spreadsheets and MATLAB have them, show by their size."""
     if stamps is None or stamps.size < 2:
         return "s"
     with np.errstate(all="ignore"):
         step = float(np.median(np.diff(stamps)))
         length = float(stamps[-1] - stamps[0])
+    # In seconds they would be at tens of thousands a second.
+    is_day = any(low <= stamps[0] and stamps[-1] <= high for low, high in _SERIAL_DAYS)
+    if is_day and step * SECONDS["day"] < _SLOWEST and length * SECONDS["day"] <= _LONGEST_FLIGHT:
+        return "day"
     # From the coarsest unit on: the first in which the usual step is that of a log is taken.
-    for unit, most, slow in (("s", 5.0, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
+    for unit, most, slow in (("s", _SLOWEST, 0.5), ("ms", 1e3, 100.0), ("us", 1e6, np.inf)):
         longest = _LONGEST_SLOW if step >= slow else _LONGEST_FLIGHT
         # Of parts of a second nothing is finer.
         whole = unit == "ms" or step >= slow

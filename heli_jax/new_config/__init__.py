@@ -189,6 +189,7 @@ def _by_what_moves(log: Log, path: str) -> str:
     moving = {}
     for stick, (model, measured) in _AXES.items():
         by_name = guess.by_name(called["inputs"][stick], names, called["commands"][stick])
+        by_name = by_name or guess.by_number(called["numbered"][stick], names)
         sticks = _moving(log, [n for n in by_name if not guess.is_excitation(n)])
         outputs = [n for m in measured for n in _outputs(log, called["outputs"][m], _UNITS[m])]
         if sticks and _moving(log, outputs):
@@ -223,6 +224,7 @@ def _signals(model: Any, log: Log) -> text.Signals:
     """Channels for inputs and outputs of the model, and which of the log's are left."""
     called, taken = _names(), []
     inputs: dict[str, Guess | None] = {}
+    numbered: dict[str, list[str]] = {}
     excitations: dict[str, str] = {}
     sticks = [n for n in log.series if not guess.is_excitation(n)]
     for name in naming.names(model.Inputs):
@@ -232,6 +234,7 @@ def _signals(model: Any, log: Log) -> text.Signals:
         if own is not None and name != "Omega":
             stick = own.command.removeprefix("cyclic_").replace("tail", "yaw")
             known, commands = called["inputs"][stick], called["commands"][stick]
+            numbered[name] = guess.by_number(called["numbered"][stick], sticks)
         unit, known = naming.unit(model.Inputs, name) or "1", [_own(name), *known]
         allowed = [n for n in sticks if guess.may_move(n, log.series[n], unit)]
         inputs[name] = _found(log, guess.by_name(known, allowed, commands), unit, taken)
@@ -245,7 +248,11 @@ def _signals(model: Any, log: Log) -> text.Signals:
         found = _found(log, _outputs(log, [_own(name), *known], unit), unit, taken)
         if found is not None:
             outputs[name] = found
+    # What an output follows is the better reason where one input makes it move.
+    if len(inputs) > 1:
+        _by_number(model, log, inputs, numbered, taken)
     _by_correlation(model, log, inputs, outputs, taken)
+    _by_number(model, log, inputs, numbered, taken)
     speed = guess.by_name(called["rotor_speed"], tuple(log.series))
     known = {}
     if speed and "Omega" in naming.names(model.Params):
@@ -305,6 +312,23 @@ def _found(log: Log, names: Sequence[str], si: str, taken: list[str]) -> Guess |
 
 def _full_travel(log: Log) -> float | None:
     return guess.full_travel({n: s for n, s in log.series.items() if names_a_stick(n)})
+
+
+def _by_number(
+    model: Any,
+    log: Log,
+    inputs: dict[str, Guess | None],
+    numbered: Mapping[str, list[str]],
+    taken: list[str],
+) -> None:
+    """Inputs whose channels have numbers for names, in the usual order."""
+    for name, found in inputs.items():
+        si = naming.unit(model.Inputs, name) or "1"
+        names = [n for n in numbered.get(name, ()) if guess.may_move(n, log.series[n], si)]
+        made = None if found is not None else _found(log, names, si, taken)
+        if made is not None:
+            why = "GUESS: by its number, in the order roll, pitch, throttle, yaw"
+            inputs[name] = made._replace(remarks=(why, *made.remarks))
 
 
 def _by_correlation(

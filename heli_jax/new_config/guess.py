@@ -7,46 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
-from heli_jax.flights.channel_names import no_stick, rate_at_end
+from heli_jax.flights.channel_names import no_stick
+from heli_jax.new_config.name_units import FILLERS, without_unit
 from heli_jax.yaml_file import EDIT
 
-# Longest first, so that deg/s is not read as deg.
-_UNIT_WORDS = {
-    "deg/s": "deg/s", "deg per s": "deg/s", "degs": "deg/s", "dps": "deg/s", "rad/s": "rad/s",
-    "rads": "rad/s", "radps": "rad/s", "deg": "deg", "degree": "deg", "degrees": "deg",
-    "rad": "rad", "mrad": "mrad", "rpm": "rpm", "percent": "%", "pct": "%", "mps": "m/s",
-    "m/s": "m/s", "cm": "cm", "mm": "mm", "kt": "kt", "kn": "kt", "kts": "kt", "knot": "kt",
-    "knots": "kt", "fps": "ft/s", "ft/s": "ft/s", "kmh": "km/h", "km/h": "km/h", "volt": "V",
-    "volts": "V", "amp": "A", "amps": "A", "degc": "degC", "hz": "Hz",
-}  # fmt: skip
-# Where a name has no mark between the unit and what is before it: rollDeg.
-_JOINED_UNIT = re.compile(
-    r"(.*[a-z0-9XYZ])(Deg|Rad|Dps|Degs|Rads|Radps|Rpm|Mps|Pct|Percent)((?:_?[A-Z]?[a-z]+)?)"
-)
-# As people write them: a small v or a is a speed or an acceleration.
-_LETTERS = ("V", "A", "%")
-_BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*$")
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
+_NUMBERED = re.compile(r"(?<=[a-z])(?=[0-9])")
+"""between a word and its number: chan1"""
 _STICK_COMMANDS = {"cmd", "command", "commanded"}
 _COMMANDS = _STICK_COMMANDS | {
     *("des", "desired", "sp", "setpoint", "ref", "target", "err", "error"),
-}
-# What may stand behind a name and change nothing; roll_rate is no roll.
-_FILLERS = {
-    "pwm",
-    "us",
-    "raw",
-    "filt",
-    "filtered",
-    "meas",
-    "measured",
-    "value",
-    "norm",
-    "in",
-    "input",
-    "body",
-    "imu",
-    "est",
-    "out1",
 }
 # Words of what is neither a rate, an angle nor a speed, whatever stands behind them: Batt_v.
 _OTHER = {
@@ -108,37 +78,8 @@ def words_of(name: str) -> tuple[str, ...]:
         name: such as `gyro.x`, `rollRate_deg/s`, `Roll (deg)`.
     """
     stem = without_unit(name)[0]
-    stem = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", stem)
+    stem = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", stem).translate(_UMLAUTS)
     return tuple(w for w in re.split(r"[^a-z0-9]+", stem.lower()) if w)
-
-
-def without_unit(name: str) -> tuple[str, str]:
-    """A name without the unit at its end, and this unit, empty where there is none."""
-    match = _BRACKETS.fullmatch(name)
-    if match and (unit := _UNIT_WORDS.get(match[2].strip().lower())):
-        return match[1], unit
-    # gyroADC[1] is one of several, and no plain number.
-    if match and not match[2].strip().isdigit() and units.is_unit(match[2].strip()):
-        return match[1], match[2].strip()
-    if (rate := rate_at_end(name)) is not None:
-        return rate
-    for letter in _LETTERS:
-        if name.endswith((f"_{letter}", f" {letter}")):
-            return name[:-2], letter
-    for word, unit in _UNIT_WORDS.items():
-        for mark in ("_", " ", ".", "-", ","):
-            if name.lower().endswith(mark + word):
-                return name[: -len(word) - 1], unit
-    match = _JOINED_UNIT.fullmatch(name)
-    # rollDegFilt, but not rollDegree: what stands behind has to be a word by itself.
-    if match and match[3].strip("_").lower() in {"", *_FILLERS}:
-        return match[1], _UNIT_WORDS[match[2].lower()]
-    # q_dps_meas: behind the unit a word that changes nothing.
-    stem, _, last = name.rpartition("_")
-    if stem and last.lower() in _FILLERS:
-        before, unit = without_unit(stem)
-        return (f"{before}_{last}", unit) if unit else (name, "")
-    return name, ""
 
 
 def by_name(
@@ -158,7 +99,7 @@ def by_name(
         words = words_of(name)
         # Behind the sticks themselves: what a stick commands may have passed through a controller.
         if commands and _STICK_COMMANDS & set(words):
-            left = tuple(w for w in words if w not in _STICK_COMMANDS | _FILLERS)
+            left = tuple(w for w in words if w not in _STICK_COMMANDS | FILLERS)
             if left in commands:
                 scored.append((3, 0, place, name))
             continue
@@ -176,8 +117,29 @@ def by_name(
     return [name for *_, name in sorted(scored)]
 
 
+def by_number(called: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The channels that a number alone gives away, as `chan1_raw` and `servoRaw.servo1`.
+
+    Args:
+        called: what they are called, word and number by a blank.
+        names: of the log's channels.
+    """
+    forms = {tuple(c.split()) for c in called}
+    return [n for n in names if _numbered(n) in forms]
+
+
+def _numbered(name: str) -> tuple[str, ...]:
+    """The last word of a name that is followed by a number, and the number: of rcin_1, rcin1."""
+    words = [part for word in words_of(name) for part in _NUMBERED.split(word)]
+    words = list(_without_fillers(tuple(words)))
+    if len(words) < 2 or not words[-1].isdigit():
+        return ()
+    # Of an array's columns the first is number 0.
+    return words[-2], str(int(words[-1]) + name.endswith("]"))
+
+
 def _without_fillers(words: tuple[str, ...]) -> tuple[str, ...]:
-    end = next((i for i in range(len(words), 0, -1) if words[i - 1] not in _FILLERS), 0)
+    end = next((i for i in range(len(words), 0, -1) if words[i - 1] not in FILLERS), 0)
     return words[:end]
 
 
@@ -212,7 +174,7 @@ def excitations(called: Sequence[str], names: Sequence[str]) -> list[str]:
         name
         for name in names
         if is_excitation(name)
-        and tuple(w for w in words_of(name) if w not in _EXCITATIONS | _FILLERS) in forms
+        and tuple(w for w in words_of(name) if w not in _EXCITATIONS | FILLERS) in forms
     ]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from heli_jax.flights.array_clocks import by_clocks
 from heli_jax.flights.array_table import ArrayTable
+from heli_jax.flights.clock_guess import arrival_notes
 from heli_jax.flights.describe import LogInfo, describe_table
 from heli_jax.flights.log import as_floats
 from heli_jax.flights.marks import without_marks
@@ -93,10 +94,10 @@ def _read_table(table: Table) -> Log:
         for n in names
         if n != clock and _is_known(values[n])
     }
-    notes = ()
+    notes = arrival_notes(clock, names)
     if others:
         listed = ", ".join(map(shown, others[:6]))
-        notes = (f"left out, since they are not as long as {shown(clock)}: {listed}",)
+        notes += (f"left out, since they are not as long as {shown(clock)}: {listed}",)
     return Log(table.path, table.format, series, info.time, None, False, notes)
 
 

@@ -10,7 +10,7 @@ import xarray
 
 from heli_jax.errors import InputError
 from heli_jax.flights import Signal, describe_log, read_flight
-from heli_jax.flights.open_log import open_log
+from heli_jax.flights.open_log import open_log, open_table
 
 N = 50
 T = 3.0 + 0.02 * np.arange(N)
@@ -123,3 +123,40 @@ def test_a_matlab_file_that_claims_much(tmp_path):
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match=r"claims the shape \[1073741824, 1073741824\]"):
         open_log(path)
+
+
+def signals_of(labels, fields=("values", "label", "unit"), units=("deg", "deg/s", "")):
+    """As Simulink saves structures with time: an array of structures, each with its label."""
+    made = np.empty((1, 3), [(f, object) for f in (*fields, "dimensions")])
+    for i, (label, unit) in enumerate(zip(labels, units, strict=True)):
+        made[0, i] = (np.sin((i + 1) * T), label, unit, 1)
+    return made
+
+
+@pytest.mark.parametrize("fields", [("values", "label", "unit"), ("Data", "Name", "Unit")])
+@pytest.mark.parametrize("packed", [False, True])
+def test_labels_in_arrays_of_structures_are_names(tmp_path, fields, packed):
+    path = tmp_path / "flight.mat"
+    out = {"time": T, "signals": signals_of(["phi", "Rollrate", "Knüppel"], fields)}
+    scipy.io.savemat(path, {"out": out}, do_compression=packed)
+    table = open_table(path)
+    wanted = {"out.signals.phi": "deg", "out.signals.Rollrate": "deg/s", "out.signals.Knüppel": ""}
+    for i, (name, unit) in enumerate(wanted.items()):
+        np.testing.assert_array_equal(table.numbers([name])[name], np.sin((i + 1) * T))
+        assert table.units[name] == unit
+    assert f"'out.signals.phi' for 'out.signals[0].{fields[0]}'" in " ".join(table.notes)
+    info = describe_log(path)
+    assert info.time is not None
+    assert info.time.column == "out.time"
+
+
+def test_labels_that_tell_nothing_apart_are_no_names(tmp_path):
+    path = tmp_path / "flight.mat"
+    signals = signals_of(["x", "x", "lat"])
+    # Two arrays beside one label, which may be that of either.
+    two = {"imu": {"t": T, "gyro": T**2, "unit": "rad/s", "label": "gyro"}}
+    scipy.io.savemat(path, {"out": {"time": T, "signals": signals}, **two})
+    table = open_table(path)
+    assert {"out.signals[0].values", "out.signals[1].values", "out.signals.lat"} < set(table.names)
+    assert {"imu.t", "imu.gyro"} < set(table.names)
+    assert not table.units["imu.t"]

@@ -290,7 +290,7 @@ def test_comments_above_the_header(tmp_path, text, names):
 def test_an_unknown_unit_of_time_names_those_of_time(tmp_path, capsys):
     path = written(tmp_path, b"t,u\n0,1\n1,2\n", "log.csv")
     asked = ["info", path, "--time-unit"]
-    refused(capsys, [*asked, "foo"], "unknown unit of time 'foo'; known are min, ms, ns, s")
+    refused(capsys, [*asked, "foo"], "unknown unit of time 'foo'; known are day, h, min, ms, ns, s")
     refused(capsys, [*asked, "deg"], "unit 'deg' is an angle, expected a time")
 
 

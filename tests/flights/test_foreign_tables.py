@@ -200,3 +200,21 @@ def test_a_last_line_that_is_cut_off_is_left_out_and_told(tmp_path, monkeypatch,
     whole = open_csv(path)
     assert whole.notes == ()
     assert len(whole.numbers(["t"])["t"]) == 101
+
+
+def test_the_stamp_of_a_sample_goes_before_that_of_its_arrival(tmp_path):
+    stamps = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(40)
+    late = stamps + np.random.default_rng(0).integers(1_000_000, 9_000_000, 40).cumsum()
+    rows = [f"{a},{s},0,{k % 7}" for k, (a, s) in enumerate(zip(late, stamps, strict=True))]
+    path = written(tmp_path, ["%time,field.header.stamp,field.header.seq,field.p", *rows])
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.column, info.time.unit) == ("field.header.stamp", "ns")
+    assert (info.time.uniform, info.time.rate) == (True, pytest.approx(100.0))
+    assert any("'%time' says when its message arrived" in note for note in info.notes)
+    # One that was never set is none.
+    path = written(tmp_path, ["%time,header.stamp,p", *(f"{a},0,{a % 7}" for a in late)])
+    info = describe_log(path)
+    assert info.time is not None
+    assert info.time.column == "%time"
+    assert not any("arrived" in note for note in info.notes)

@@ -103,3 +103,35 @@ def test_a_stick_that_lacks_a_sample_here_and_there_is_refused_as_before(tmp_pat
     whole.to_csv(tmp_path / "log.csv")
     with pytest.raises(InputError, match="line 502, column 'lat': got nothing"):
         flight(tmp_path / "log.csv", outputs=("p",))
+
+
+def filled(path, lat):
+    """A table in which every cell has the last value, but where there is none yet."""
+    rows = pd.DataFrame({"t": 0.01 * np.arange(200), "lat": lat, "p": np.arange(200.0)})
+    rows.to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(("begin", "end"), [(3, 200), (0, 190), (3, 190)])
+def test_a_flight_is_where_its_inputs_are_known(tmp_path, begin, end):
+    lat = np.sin(np.arange(200.0))
+    lat[:begin], lat[end:] = np.nan, np.nan
+    read = flight(filled(tmp_path / "log.csv", lat), outputs=("p",))
+    np.testing.assert_array_equal(read.inputs["lat"], lat[begin:end])
+    np.testing.assert_array_equal(read.outputs["p"], np.arange(begin, end))
+    assert read.t0 == pytest.approx(0.01 * begin)
+    count = 200 - end + begin
+    said = f"'lat' has no value before or behind, and {count} rows are left out"
+    assert sum(said in note for note in read.source.notes) == 1
+    # A window within needs no word.
+    within = flight(tmp_path / "log.csv", outputs=("p",), window=(0.1, 1.5))
+    assert not any("left out" in note for note in within.source.notes)
+
+
+def test_an_input_that_is_empty_within_or_everywhere_is_refused(tmp_path):
+    lat = np.sin(np.arange(200.0))
+    lat[[0, 100]] = np.nan
+    with pytest.raises(InputError, match="line 102, column 'lat': got nothing, expected a finite"):
+        flight(filled(tmp_path / "log.csv", lat), outputs=("p",))
+    with pytest.raises(InputError, match="holds 0 samples"):
+        flight(filled(tmp_path / "all.csv", np.full(200, np.nan)), outputs=("p",))

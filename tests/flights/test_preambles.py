@@ -105,6 +105,34 @@ def test_a_table_is_found_below_what_stands_above_it(tmp_path, name, above, body
     assert [c.name for c in describe_log(path).columns] == [n for n in names if n]
 
 
+@pytest.mark.parametrize(
+    ("row", "units"),
+    [
+        ("Y_Unit_Label\tV\tdeg/s\t", ("", "V", "deg/s")),
+        ("Y_Unit_Label\tV\tdeg/s", ("", "V", "deg/s")),
+        ("Einheit\t\tdeg/s\t", ("", "", "deg/s")),
+        # Words that are no units are none.
+        ("Y_Unit_Label\tsome\tthing\t", ("", "", "")),
+    ],
+)
+def test_a_line_of_units_among_the_settings_and_a_mark_of_their_end(tmp_path, row, units):
+    # Where no cell stands alone, the mark would be a group of all columns.
+    mark = "***End_of_Header***\t\t\t"
+    path = tmp_path / "a.lvm"
+    path.write_text("\n".join((*LABVIEW[:11], row, mark, LABVIEW[-1], *rows("\t", "\t"))) + "\n")
+    table = open_csv(path)
+    assert table.names == ("X_Value", "Stick", "Rate", "Comment")
+    assert tuple(table.units.get(n, "") for n in table.names[:3]) == units
+
+
+def test_units_of_columns_that_have_clocks_of_their_own_are_left(tmp_path):
+    labels = ["Y_Unit_Label\tV\tdeg/s\t\t", "X_Value\tStick\tX_Value\tRate\tComment"]
+    path = tmp_path / "a.lvm"
+    body = rows("\t", "\t", (T, U, T, P))
+    path.write_text("\n".join((*LABVIEW[:6], *labels, *body)) + "\n")
+    assert not any(open_csv(path).units.values())
+
+
 def test_two_tables_in_a_file_and_samples_without_names_are_refused(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("\n".join(("Devices", "t,u,p", *rows(), "", "Markers", "t,x,y", *rows())))

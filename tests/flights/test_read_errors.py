@@ -19,9 +19,16 @@ from heli_jax.flights import (
     require_moving_outputs,
 )
 from heli_jax.flights.describe import describe_log
+from heli_jax.flights.read import require_some_time
 
 STICK = Signal("stick", "mm", "m")
 PHI = Signal("phi", "deg", "rad")
+
+
+def test_a_record_too_short_for_any_machine_names_the_unit_of_its_time():
+    flight = Flight(1e-7, {"u": np.arange(7000.0)}, {"p": np.arange(7000.0)}, name="flight 1")
+    with pytest.raises(InputError, match=r"flight 1: 7000 samples in 0.0007 s, .* time's unit"):
+        require_some_time(flight)
 
 
 def rows(n: int = 20, dt: float = 0.02) -> list[list[str]]:

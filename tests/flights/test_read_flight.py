@@ -160,7 +160,7 @@ def test_window_beyond_the_log_is_noted(tmp_path):
 
 def test_what_is_wrong_outside_the_window_is_no_matter(tmp_path):
     path = tmp_path / "bench.csv"
-    path.write_text(DIALECTS["plain"].replace("\n5.0,0.0,", "\n5.0,nan,"))
+    path.write_text(DIALECTS["plain"].replace("\n5.0,0.0,", "\n5.0,inf,"))
     with pytest.raises(InputError, match="line 2"):
         read_flight(path, **ASKED)
     assert read_flight(path, **ASKED, window=(0.02, 1.0)).n_samples == 11

@@ -1,6 +1,7 @@
 """Times and numbers as spreadsheets, loggers and people of several countries write them."""
 
 import datetime
+import zoneinfo
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from heli_jax.flights.csv_dates import Dates, seconds_of_dates
 from heli_jax.flights.csv_table import open_csv
 from heli_jax.flights.flight import Signal
 from heli_jax.flights.read import read_flight
-from heli_jax.flights.time_units import likely_unit
+from heli_jax.flights.time_units import likely_unit, split_unit, time_unit
 
 N, DT = 300, 0.01
 T = DT * np.arange(N)
@@ -151,3 +152,86 @@ def test_points_among_decimal_commas_that_end_no_thousands_are_refused(tmp_path)
 )
 def test_ticks_without_a_unit_are_of_the_one_that_makes_a_flight(step, rows, unit):
     assert likely_unit(step * np.arange(rows) + 12345.0) == unit
+
+
+@pytest.mark.parametrize("first", [45352.5, 60371.5, 739312.5, 2460372.5])
+def test_days_as_spreadsheets_and_matlab_count_them_are_guessed_by_their_size(tmp_path, first):
+    assert likely_unit(first + 0.01 * np.arange(6000) / 86400) == "day"
+    # Seconds of a day, and of an hour, in the same range.
+    assert likely_unit(first + 0.001 * np.arange(6000)) == "s"
+    assert likely_unit(1e3 + 0.01 * np.arange(6000) / 86400) == "s"
+    # Twice a second: the digits of Julian days end at 40 us.
+    times = 0.5 * np.arange(60)
+    rows = [f"{first + t / 86400:.12f},{np.sin(t)},{np.cos(t)}" for t in times]
+    path = written(tmp_path, ["datenum,u,p", *rows])
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.unit, info.time.guessed) == ("day", True)
+    assert (info.time.rate, info.time.duration) == (
+        pytest.approx(2.0),
+        pytest.approx(29.5, abs=1e-4),
+    )
+    flight = read(path, Signal("datenum", "day", "s"))
+    np.testing.assert_allclose(flight.dt, 0.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("days since 2024-03-01", "day"),
+        ("Hours since 2024-03-01 00:00:00", "h"),
+        ("minutes since takeoff", "min"),
+        ("milliseconds  Since 1970-01-01T00:00:00Z", "ms"),
+        ("d", "day"),
+        ("since 1970", None),
+        ("dayssince 1970", None),
+    ],
+)
+def test_the_unit_of_a_clock_with_its_epoch(text, unit):
+    assert time_unit(text) == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("Time [h]", ("Time", "h")),
+        ("t (d)", ("t", "day")),
+        ("elapsed_hours", ("elapsed", "h")),
+        ("time days", ("time", "day")),
+        # A position down, and the span of a tail.
+        ("pos_d", ("pos_d", "")),
+        ("t_h", ("t_h", "")),
+    ],
+)
+def test_the_unit_of_a_clock_behind_its_name(name, parts):
+    assert split_unit(name) == parts
+
+
+def test_an_offset_from_utc_that_changes_in_flight(tmp_path):
+    # Summer time begins at 01:00 UTC: 01:59:59.8 +01:00 is followed by 03:00:00 +02:00.
+    begin = datetime.datetime(2024, 3, 31, 0, 59, 59, tzinfo=datetime.UTC)
+    rows, berlin = [], zoneinfo.ZoneInfo("Europe/Berlin")
+    for k in range(60):
+        at = (begin + datetime.timedelta(seconds=0.1 * k)).astimezone(berlin)
+        rows.append(f"{at.isoformat(timespec='milliseconds')},{np.sin(k)},{np.cos(k)}")
+    assert "+01:00" in rows[0]
+    assert "+02:00" in rows[-1]
+    flight = read(written(tmp_path, ["Time,u,p", *rows]))
+    assert flight.dt == pytest.approx(0.1)
+    assert sum("offset from UTC changes" in n for n in flight.source.notes) == 1
+    # Z is an offset of 0; a row without any is of no known time.
+    cells = ["2024-03-31T01:59:59+01:00", "2024-03-31T01:00:00Z", "2024-03-31T01:00:01 UTC"]
+    found = seconds_of_dates(cells)
+    assert not isinstance(found, int)
+    np.testing.assert_allclose(np.diff(found.seconds), [1.0, 1.0])
+    assert seconds_of_dates([*cells, "2024-03-31T03:00:01"]) == 3
+
+
+def test_a_receivers_fix_is_no_time(tmp_path):
+    rows = [
+        f"{t:.2f},{u},{p},3D,{k // 9}h" for k, (t, u, p) in enumerate(zip(T, U, P, strict=True))
+    ]
+    info = describe_log(written(tmp_path, ["Time,u,p,fix,2D", *rows]))
+    assert info.time is not None
+    assert info.time.column == "Time"
+    assert [c.kind for c in info.columns] == ["number"] * 3 + ["text"] * 2

@@ -172,3 +172,9 @@ def replace_axes(model):
     from heli_jax.dynamics.model import Axis
 
     return replace(model, axes=(Axis("roll", rate="p", angle="phi", stick="da"),))
+
+
+def test_a_record_of_less_than_a_block_tells_nothing():
+    times = 1e-7 * np.arange(6000)
+    flight = Flight(1e-7, {"u": np.sin(1e4 * times)}, {"p": np.cos(1e4 * times)})
+    assert feedback(flight) == ()

@@ -371,9 +371,14 @@ def _decimated(
     # Of a very long record a part will do, and its regressors fit into memory.
     inputs = {n: u[:_MOST] for n, u in inputs.items()}
     outputs = {n: y[:_MOST] for n, y in outputs.items()}
+    # A record of less than one block leaves none.
     return (
-        {n: u for n, u in inputs.items() if np.ptp(u) > 0},
-        {n: y for n, y in outputs.items() if np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0},
+        {n: u for n, u in inputs.items() if u.size and np.ptp(u) > 0},
+        {
+            n: y
+            for n, y in outputs.items()
+            if y.size and np.mean(np.isfinite(y)) >= _SEEN and np.nanstd(y) > 0
+        },
         flight.dt * every,
     )
 

@@ -1,0 +1,143 @@
+"""Packed numbers of NetCDF and HDF5, beside what xarray makes of them and the conventions' text."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+from heli_jax import cli
+from heli_jax.flights import Signal, describe_log, read_flight
+from heli_jax.flights.open_log import open_log
+from heli_jax.flights.packed import Packing, unpack
+
+N = 50
+T = 0.02 * np.arange(N)
+ROLL = np.round(100.0 * (np.degrees(0.3 * np.sin(T)) - 5.0)).astype(np.int16)
+RATE = np.round(1000.0 * np.cos(T)).astype(np.int32)
+RATE[[3, 7]] = -999999
+COUNT = np.arange(200, 200 + N).astype(np.uint8).view(np.int8)
+SPEED = np.float32(T)
+SPEED[4] = np.float32(-9999.9)
+PACKED = {
+    "time": (T, {"units": "s"}),
+    "aileron": (np.sin(T), {"units": "1"}),
+    "roll": (ROLL, {"units": "degrees", "scale_factor": 0.01, "add_offset": 5.0}),
+    "p": (RATE, {"units": "rad/s", "scale_factor": 0.001, "_FillValue": np.int32(-999999)}),
+    "count": (COUNT, {"_Unsigned": "true", "_FillValue": np.int8(-56)}),
+    "speed": (SPEED, {"units": "m/s", "missing_value": np.float32(-9999.9)}),
+}
+
+
+def written(path: Path, sets=PACKED) -> Path:
+    """The stored numbers and attributes as they are, in NetCDF 3 or HDF5."""
+    if path.name.endswith("3.nc"):
+        raw = {n: ("time", x, attributes) for n, (x, attributes) in sets.items()}
+        xarray.Dataset(raw).to_netcdf(path, engine="scipy")
+        return path
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    with h5py.File(path, "w") as file:
+        for name, (values, attributes) in sets.items():
+            file[name] = values
+            file[name].attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize("name", ["flight3.nc", "flight4.nc", "flight.h5"])
+def test_all_files_are_unpacked_as_xarray_does(tmp_path, name):
+    path = written(tmp_path / name)
+    raw = {n: ("time", x, dict(attributes)) for n, (x, attributes) in PACKED.items()}
+    wanted = xarray.decode_cf(xarray.Dataset(raw), decode_times=False)
+    table = open_log(path)
+    for name in PACKED:
+        np.testing.assert_allclose(table.numbers([name])[name], wanted[name].values, rtol=1e-14)
+    info = describe_log(path)
+    units = {c.name: c.unit for c in info.columns}
+    assert (units["roll"], units["p"]) == ("degrees", "rad/s")
+    assert any("'roll'" in n and "unpacked" in n for n in info.notes)
+    assert any("missing samples" in n and "'p' (2)" in n for n in info.notes)
+    # In radians at last, as a fit reads it; and as `new` guesses and `convert` writes it.
+    signals = {"inputs": {}, "outputs": {"phi": Signal("roll", "deg", "rad")}}
+    flight = read_flight(path, time="time", **signals)
+    np.testing.assert_allclose(flight.outputs["phi"], 0.3 * np.sin(T), atol=1e-4)
+    out = tmp_path / "out.csv"
+    assert cli.main(["convert", str(path), str(out), "--signals", "roll"]) == 0
+    made = open_log(out).numbers(["roll"])["roll"]
+    np.testing.assert_allclose(made, np.degrees(0.3 * np.sin(T)), atol=0.006)
+
+
+RANGES = [
+    # The range of packed numbers has their type.
+    ({"valid_range": np.int16([-100, 100])}, [-100, 0, 100]),
+    ({"valid_min": np.int16(0)}, [0, 100, 101]),
+    ({"valid_max": np.int16(0)}, [-101, -100, 0]),
+    ({"valid_range": np.int16([-100, 100]), "scale_factor": 0.1}, [-10, 0, 10]),
+    # In the wider type of the scale it is one of unpacked numbers.
+    ({"valid_range": [-10.0, 10.0], "scale_factor": 0.1}, [-10, 0, 10]),
+    ({"valid_min": np.float32(0.0), "scale_factor": np.float32(0.5)}, [0, 50, 50.5]),
+]
+
+
+@pytest.mark.parametrize(("attributes", "left"), RANGES)
+def test_values_outside_the_valid_range_are_missing(attributes, left):
+    found = unpack(np.int16([-101, -100, 0, 100, 101]), attributes).values
+    np.testing.assert_allclose(found[np.isfinite(found)], left)
+
+
+def test_marks_of_all_kinds_and_a_range_of_unsigned_numbers():
+    several = unpack(np.int16([1, -1, -9, 4]), {"missing_value": np.int16([-1, -9])})
+    np.testing.assert_array_equal(several.values, [1, np.nan, np.nan, 4])
+    # A mark that is no number of the type is none of its values; a NaN needs no mark.
+    assert unpack(np.int8([0, 1]), {"_FillValue": np.nan, "missing_value": 300.5}).n_missing == 0
+    assert unpack(np.float64([0, np.nan]), {"_FillValue": np.nan}).n_missing == 0
+    assert unpack(np.int16([0, 1]), {"missing_value": "none"}).n_missing == 0
+    signs = {"_Unsigned": "true", "valid_range": np.int8([1, -2])}
+    found = unpack(np.int8([0, 1, -2, -1]), signs)
+    np.testing.assert_array_equal(found.values, [np.nan, 1, 254, np.nan])
+
+
+@pytest.mark.parametrize("scale", ["a tenth", 0.0, np.nan, [0.1, 0.2]])
+def test_a_scale_that_is_none_leaves_its_data_set_out(tmp_path, scale):
+    with pytest.raises(Packing, match="scale_factor is no number that packs"):
+        unpack(ROLL, {"scale_factor": scale})
+    sets = PACKED | {"roll": (ROLL, {"scale_factor": scale})}
+    table = open_log(written(tmp_path / "flight.h5", sets))
+    assert "roll" not in table.names
+    assert any(n.startswith("left out: 'roll', since its scale_factor") for n in table.notes)
+
+
+@pytest.mark.parametrize("attribute", ["unit", "Units", "units"])
+def test_the_attribute_of_a_unit_in_all_spellings(tmp_path, attribute):
+    sets = {
+        "clock": (np.arange(N) * 20_000, {attribute: np.bytes_("us")}),
+        "phi": (T, {attribute: "deg"}),
+    }
+    info = describe_log(written(tmp_path / "flight.h5", sets))
+    assert info.time is not None
+    assert (info.time.column, info.time.guessed) == ("clock", False)
+    assert (info.time.rate, info.columns[1].unit) == (pytest.approx(50.0), "deg")
+
+
+def test_tables_of_named_fields_in_hdf5(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    kind = [("t", "f8"), ("phi", "f4"), ("gyro", "f8", (3,)), ("mode", "S4")]
+    rows = np.zeros(N, kind)
+    rows["t"], rows["phi"], rows["gyro"] = T, np.sin(T), np.c_[T, T**2, T**3]
+    path = tmp_path / "flight.h5"
+    with h5py.File(path, "w") as file:
+        file["run/log"] = rows
+        file["run/log"].attrs["units"] = ["s", "deg", "rad/s", ""]
+        file["run/log"].attrs["scale_factor"] = 7.0  # of which field nobody knows
+    table = open_log(path)
+    assert table.names == ("run/log/t", "run/log/phi", *(f"run/log/gyro[{i}]" for i in range(3)))
+    assert table.units["run/log/gyro[1]"] == "rad/s"
+    np.testing.assert_array_equal(table.numbers(["run/log/gyro[2]"])["run/log/gyro[2]"], T**3)
+    info = describe_log(path)
+    assert info.time is not None
+    assert (info.time.column, info.time.rate) == ("run/log/t", pytest.approx(50.0))
+
+
+def test_a_dimension_of_netcdf_4_without_values_is_no_channel(tmp_path):
+    name = "This is a netCDF dimension but not a netCDF variable.        50"
+    sets = PACKED | {"x": (np.zeros(N), {"NAME": np.bytes_(name)})}
+    assert set(open_log(written(tmp_path / "flight.nc", sets)).names) == set(PACKED)
