@@ -20,6 +20,8 @@ _UNSET = {"kappa": "a stand that does not spring", "zeta": "a stand that does no
 # Short words of YAML (on, y, null) and numbers are none of these.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
+_ROWS_OF_TOPICS = "# Hz; the rows are those of several topics, the outputs slower"
+
 
 class Chosen(NamedTuple):
     """The model, what a configuration calls it, and whether it is linear from a file."""
@@ -65,7 +67,8 @@ def configuration(
         signals: by the model's names.
         vehicle: the vehicle file, as the configuration names it.
         free: starts by parameter; None at the vehicle's value.
-        rate: [Hz] onto which topics with clocks of their own are brought.
+        rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
+            those of several topics.
         others: models that fit the signals too, each with what it is for.
 
     Raises:
@@ -81,8 +84,8 @@ def configuration(
     lines += ["flights:", f"  - log: {_value(log)}"]
     if flight is not None:
         lines.append(f"    flight: {flight}")
-    lines += _clock(time)
-    if rate is not None:
+    lines += _clock(time, rate)
+    if time is None and rate is not None:
         lines.append(f"    rate: {rate:g}".ljust(33) + "# Hz; the grid of all signals")
     if preset is not None:
         lines += [
@@ -150,7 +153,7 @@ def _axes(model: Any) -> tuple[str, ...]:
     return tuple(axis.name for axis in axes_of(model))
 
 
-def _clock(time: TimeInfo | None) -> list[str]:
+def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     if time is None:
         return []
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
@@ -159,7 +162,8 @@ def _clock(time: TimeInfo | None) -> list[str]:
         words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s"
         lines += [
             f"    gaps: split                  # {words}; fail refuses long ones",
-            f"    rate: {two_digits(time.rate):g}".ljust(33) + "# Hz; the log has no even steps",
+            f"    rate: {rate or two_digits(time.rate):g}".ljust(33)
+            + ("# Hz; the log has no even steps" if rate is None else _ROWS_OF_TOPICS),
         ]
     return lines
 
