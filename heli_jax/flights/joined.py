@@ -1,7 +1,8 @@
 """Tables whose rows hold the values of one topic each, the other cells empty: an outer join.
 
 PlotJuggler, MAVExplorer and pandas' outer merges write such. The columns that are filled in the
-same rows are a topic, and their clock is that of these rows: an empty cell is no lost sample.
+same rows are a topic, and their clock is that of these rows: an empty cell is no lost sample. Where
+such a join was filled forward the cells between hold the last value again, and are no samples.
 """
 
 import itertools
@@ -11,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heli_jax import units
+from heli_jax.flights.grid import Uneven, rounding_of, uniform_grid
 from heli_jax.flights.log import ChannelLog, Topic
+from heli_jax.flights.repeats import carried_on, first_of_each
 from heli_jax.flights.request import Request
 from heli_jax.flights.slower import SLOWER, usual_step
 from heli_jax.flights.table import Table, shown
@@ -62,6 +65,9 @@ def is_joined(
         columns: that are asked for (N,), NaN where a cell is empty.
         needed: those of them that no sample may be missing of, such as inputs.
     """
+    # Before a column's first value, and behind its last, there is nothing to fill forward with.
+    inside = _all_begun(columns)
+    seconds, columns = seconds[inside], {n: x[inside] for n, x in columns.items()}
     lacking = [name for name in needed if np.isnan(columns[name]).any()]
     if not lacking:
         return False
@@ -73,6 +79,16 @@ def is_joined(
     step = usual_step(seconds)
     slower = any(usual_step(seconds[~np.isnan(columns[n])]) > SLOWER * step for n in lacking)
     return slower or takes_turns(groups)
+
+
+def _all_begun(columns: Mapping[str, np.ndarray]) -> slice:
+    """The rows from where all columns (N,) have begun to where the first one ends; all rows where
+    there are hardly any."""
+    seen = [np.flatnonzero(~np.isnan(x)) for x in columns.values()]
+    seen = [rows for rows in seen if rows.size]
+    begin = max((int(rows[0]) for rows in seen), default=0)
+    end = min((int(rows[-1]) + 1 for rows in seen), default=0)
+    return slice(begin, end) if end - begin >= _FEWEST else slice(None)
 
 
 def joined_log(
@@ -94,14 +110,35 @@ def joined_log(
     inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
     scale = units.factor(table.time_unit(request.time.name) or request.time.unit, "s")
     seconds = stamps * scale
-    if not is_joined(seconds, signals, inputs):
-        return None
-    topics = topics_of(seconds, signals, table.units, request.time.name)
-    notes = (*table.notes, joined_note(topics))
+    if is_joined(seconds, signals, inputs):
+        topics = topics_of(seconds, signals, table.units, request.time.name)
+        notes = (*table.notes, joined_note(topics))
+    else:
+        carried = _carried(request, seconds, signals, rounding_of(stamps) * scale)
+        if not carried:
+            return None
+        topics = topics_of(seconds, {**signals, **carried}, table.units, request.time.name)
+        notes = (*table.notes, _carried_note(topics, carried))
     start = float(seconds[0])
     return ChannelLog(
         table.path, table.format, table.size, table.sha256, topics, notes=notes, start=start
     )
+
+
+def _carried(
+    request: Request, seconds: np.ndarray, signals: Mapping[str, np.ndarray], rounding: float
+) -> dict[str, np.ndarray]:
+    """The outputs (N,) of a join that was filled forward, at the rows with a new value alone; none
+    where the rows are one clock's, or are wanted as they are."""
+    stated = {s.name: s.repeats for (_, kind), s in request.signals.items() if kind == "output"}
+    inputs = {s.name for (_, kind), s in request.signals.items() if kind == "input"}
+    asked = [n for n, repeats in stated.items() if repeats != "keep" and n not in inputs]
+    # Without a rate the rows are the grid, and a repeated value is a missing sample of it.
+    if request.options.rate is None or seconds.size < _FEWEST or np.any(np.diff(seconds) <= 0):
+        return {}
+    if not isinstance(uniform_grid(seconds - seconds[0], rounding), Uneven):
+        return {}
+    return {n: first_of_each(signals[n]) for n in asked if carried_on(seconds, signals[n])}
 
 
 def topics_of(
@@ -134,6 +171,21 @@ def joined_note(topics: Sequence[Topic]) -> str:
     return (
         f"its rows hold one topic each and leave other cells empty: each column is taken at the "
         f"rows that hold it ({rates}{more})"
+    )
+
+
+def _carried_note(topics: Sequence[Topic], carried: Collection[str]) -> str:
+    """What was made of values that are carried on."""
+    rates = ", ".join(
+        f"{shown(name)} at about {1 / usual_step(t.times):.4g} Hz"
+        for t in topics
+        for name in t.columns
+        if name in carried
+    )
+    return (
+        "its rows are those of several topics, and between its own each column repeats the last "
+        f"value (a join that was filled forward): each is taken where it has a new one ({rates}); "
+        "`repeats: keep` beside an output takes the repeats for measurements"
     )
 
 

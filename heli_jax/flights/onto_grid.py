@@ -140,12 +140,13 @@ def _where(seconds: np.ndarray, missing: np.ndarray) -> str:
 
 
 def measured_once(
-    request: Request, values: Mapping[Key, np.ndarray]
+    request: Request, signals: Mapping[Key, Timed]
 ) -> tuple[dict[Key, np.ndarray], list[str]]:
     """The signals (N,), repeated values of slow outputs taken as missing, and notes."""
-    outputs = request.of_kind("output", values)
+    outputs = request.of_kind("output", signals)
     stated = {name: request.signals[name, "output"].repeats for name in outputs}
     made, notes = repeats_removed(outputs, stated)
+    values = {key: signal.values for key, signal in signals.items()}
     return {**values, **{(name, "output"): y for name, y in made.items()}}, notes
 
 

@@ -130,7 +130,7 @@ def read_table(loaded: LoadedTable, request: Request) -> Flight:
     signals = {key: timed.values for key, timed in logged.signals.items()}
     # Before any resampling, which moves an input at more samples than the log shows it to.
     holds = decided_holds(request, signals)
-    signals, repeated = measured_once(request, signals)
+    signals, repeated = measured_once(request, logged.signals)
     with clock.hinting():
         dt, (samples, holds, more) = _on_grid(stamps, request, signals, grid, holds)
     timed = {key: Timed(stamps.seconds, x) for key, x in signals.items()}

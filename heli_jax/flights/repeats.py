@@ -8,6 +8,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from heli_jax.flights.slower import Timed, usual_step
+
 REPEATS = ("auto", "keep", "missing")
 """What is made of repeated values: missing samples where that is unmistakable, or as stated."""
 
@@ -22,6 +24,19 @@ _FEWEST_SINGLE = 0.8
 _ONE_COUNT = 0.5
 """part of the jumps that are one count of the resolution, from which on a slow motion that is
 coarsely resolved looks the same"""
+_SURE = 50
+"""clear runs from which on nothing else has to show that values are repeated"""
+_CLEAR = 8.0
+"""steps of the resolution: where a signal moves by more than that before a value and after it, two
+measurements in a row agree by chance at one of 20 at most"""
+_REPEATED = 0.3
+"""part of the clear runs that are longer than one sample, from which on they are repeats"""
+_EXACT = 0.98
+"""part of so many runs that are of one length to the sample, from which on that is a clock"""
+_RECUR = 0.5
+"""distinct values for each run at least: a command in steps comes back to its values"""
+_LATE = 0.25
+"""of the time between two measurements, by which one of a regular clock is off"""
 _MOVES = 0.5
 """part of its samples at which another output moves, which shows that the machine did"""
 
@@ -45,6 +60,54 @@ def usual_run(values: np.ndarray) -> int | None:
     return usual
 
 
+def carried_on(seconds: np.ndarray, values: np.ndarray) -> bool:
+    """Whether rows between the measurements of an output carry the last one on, beyond doubt.
+
+    So a forward-filled join does it, whose rows lie anywhere between: its runs are of any length.
+    What tells is the resolution. A signal that moves by many of its steps before a value and after
+    it does not measure the same value twice in a row; and new values come at a clock of their own.
+
+    Args:
+        seconds: stamps (N,) [s], increasing.
+        values: samples (N,), NaN where one is missing.
+    """
+    lengths, jumps = _runs(values)
+    if lengths.size < _SURE:
+        return False
+    seen = ~np.isnan(values)
+    y, s = values[seen], seconds[seen]
+    levels = np.unique(y).size
+    # Rounding makes jumps that are smaller than the resolution: levels tell it too.
+    step = max(float(jumps.min()), float(np.ptp(y)) / (4.0 * levels))
+    clear = np.minimum(jumps[:-1], jumps[1:]) >= _CLEAR * step
+    if np.count_nonzero(clear) < _SURE or np.mean(lengths[clear] > 1) < _REPEATED:
+        return False
+    if levels < _RECUR * lengths.size:
+        return False
+    begins = np.diff(s[np.flatnonzero(y[1:] != y[:-1]) + 1])[clear]
+    usual = float(np.median(begins))
+    # By a row: a join onto the clock of another topic shows a new value at that one's next row.
+    near = _LATE * usual + float(np.median(np.diff(s))) * (1 + 1e-6)
+    regular = np.abs(begins - usual) <= near
+    double = np.abs(begins - 2 * usual) <= near
+    return bool(np.mean(regular | double) >= _REGULAR)
+
+
+def _is_exact(values: np.ndarray, usual: int) -> bool:
+    """Whether hardly any run has another length than the usual one, or a multiple of it."""
+    lengths, _ = _runs(values)
+    return lengths.size >= _SURE and bool(np.mean(lengths % usual == 0) >= _EXACT)
+
+
+def first_of_each(values: np.ndarray) -> np.ndarray:
+    """An output (N,) with the first sample of each value alone, the others missing."""
+    seen = np.flatnonzero(~np.isnan(values))
+    again = seen[1:][values[seen[1:]] == values[seen[:-1]]]
+    made = values.copy()
+    made[again] = np.nan
+    return made
+
+
 def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
     """An output (N,) with the first sample of each value alone, the others missing.
 
@@ -61,7 +124,7 @@ def without_repeats(values: np.ndarray, usual: int) -> np.ndarray:
 
 
 def repeats_removed(
-    outputs: Mapping[str, np.ndarray], stated: Mapping[str, str]
+    outputs: Mapping[str, Timed], stated: Mapping[str, str]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Outputs (N,), each on its own clock, with repeated values as missing samples, and notes.
 
@@ -69,11 +132,19 @@ def repeats_removed(
         outputs: by name, NaN where a sample is missing.
         stated: one of `REPEATS` by name.
     """
-    made, notes = dict(outputs), []
-    runs = {n: usual_run(y) for n, y in outputs.items()}
-    moving = [n for n, y in outputs.items() if runs[n] is None and _moves(y)]
-    for name, y in outputs.items():
+    made, notes = {n: y.values for n, y in outputs.items()}, []
+    runs = {n: usual_run(y) for n, y in made.items()}
+    moving = [n for n, y in made.items() if runs[n] is None and _moves(y)]
+    for name, (seconds, y) in outputs.items():
+        if stated[name] == "keep":
+            continue
         usual = runs[name]
+        exact = usual is not None and _is_exact(y, usual)
+        sure = exact or carried_on(seconds, y)
+        if sure and not exact:
+            made[name] = first_of_each(y)
+            notes.append(_carried_note(name, seconds, made[name]))
+            continue
         if stated[name] == "missing":
             lengths, _ = _runs(y)
             # Stated by somebody who knows: then no further sign is asked for.
@@ -81,9 +152,9 @@ def repeats_removed(
             if usual is None or usual < 2:
                 notes.append(f"{name}: no value is repeated, though `repeats: missing` is stated")
                 continue
-        elif stated[name] == "keep" or usual is None:
+        elif usual is None:
             continue
-        elif not moving:
+        elif not (moving or sure):
             # Nothing else shows that the machine moved while this signal stood still.
             notes.append(
                 f"{name} keeps each value for {usual} samples; if it was measured so slowly, state "
@@ -96,6 +167,16 @@ def repeats_removed(
             "and missing at the others (`repeats: keep` leaves them)"
         )
     return made, notes
+
+
+def _carried_note(name: str, seconds: np.ndarray, made: np.ndarray) -> str:
+    seen = ~np.isnan(made)
+    hz = 1.0 / usual_step(seconds[seen])
+    return (
+        f"{name} is carried on from row to row, with a new value at about {hz:.4g} Hz: taken as "
+        f"measured at the {np.count_nonzero(seen)} rows with a new one and missing at the others "
+        "(`repeats: keep` leaves them)"
+    )
 
 
 def _runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -70,9 +70,10 @@ from heli_jax.identification.validation.feedback import (
 )
 from heli_jax.identification.validation.held_out import validate
 from heli_jax.identification.validation.inputs_explain import unless_inputs_explain_nothing
+from heli_jax.identification.validation.late_stick import late_stick, with_late_stick
 from heli_jax.identification.validation.metrics import Whiteness, metrics
 from heli_jax.identification.validation.missing_dynamics import Left, missing_dynamics
-from heli_jax.identification.validation.unmodelled import unmodelled, with_unmodelled
+from heli_jax.identification.validation.unmodelled import unasked, unmodelled, with_unmodelled
 from heli_jax.identification.validation.weak_instrument import weak_by_instrument, weak_note
 
 # The parameters of a model are a class of the user's: `Any` here stands for them alone.
@@ -229,7 +230,7 @@ def assemble(
     )
     if layout.estimator.noise_spectrum:
         adequacy = unless_unrelated(problem, adequacy)
-    verdict, lacking = unless_explains_nothing(errors.verdict, adequacy), ()
+    verdict, lacking, late = unless_explains_nothing(errors.verdict, adequacy), (), None
     if bool(best.converged) and verdict is not errors.verdict:
         errors = errors._replace(verdict=verdict, limits={})
         numbers = _numbers(problem, solution, e, errors, absent)
@@ -239,7 +240,10 @@ def assemble(
         in_colour = errors.coloured and not layout.estimator.noise_spectrum
         sds = {n: estimate.sd for n, estimate in numbers.of_interest.items()}
         lacking = unmodelled(solution, e, sds, coloured=in_colour)
-        adequacy = with_unmodelled(adequacy, lacking)
+        adequacy = with_unmodelled(adequacy, lacking, unasked(solution))
+        named = {n: (x.value, x.sd) for n, x in numbers.of_interest.items()}
+        late = late_stick(problem, solution, e, named)
+        adequacy = with_late_stick(adequacy, late)
     adequacy = adequacy.doubted(delay_doubts(problem, estimates))
     if adequacy.by_chance:
         # Of an optimum of chance nothing is to be told, of who holds the machine either.
@@ -288,6 +292,7 @@ def assemble(
         weak_instrument=weak,
         instruments=instruments,
         disturbed_loop=not all_white and known_no_gusts(problem, found),
+        late_stick=late,
         seed=run.seed,
         timing=run.timing,
     )

@@ -53,6 +53,7 @@ from heli_jax.identification.validation.excited_band import bands
 from heli_jax.identification.validation.expected_accuracy import guessed_gusts
 from heli_jax.identification.validation.feedback import feedback_notes, feedback_of
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.late_stick import slow_sticks
 from heli_jax.identification.validation.logging_rate import logging_rate
 from heli_jax.identification.validation.misread import record_doubts
 from heli_jax.identification.validation.other_hold import other_hold
@@ -156,6 +157,8 @@ def check(problem: Problem) -> Check:
     )
     sds = noise_by_name(problem, guess.noise, scales_of(guess.layout, guess.z))
     findings = is_it_enough(problem, at, guess.e, feedback)
+    slow = slow_sticks(problem, at, guess.e, skip=not_identifiable)
+    findings = (*(f for f in findings if f.bad), *slow, *(f for f in findings if not f.bad))
     return Check(verdict, sds, tuple(notes), guessed, findings)
 
 

@@ -18,6 +18,7 @@ from heli_jax.identification.validation.closed_loop_trust import Loop, Moved, un
 from heli_jax.identification.validation.excitation import ALIASED
 from heli_jax.identification.validation.feedback import Feedback
 from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.late_stick import LateStick
 from heli_jax.identification.validation.metrics import Metrics, Whiteness
 
 if TYPE_CHECKING:
@@ -164,6 +165,8 @@ class Fit:
     disturbed_loop: bool = False
     """in time without process noise: whether inputs follow the response and the residuals are not
     white, so that a disturbance comes back through the inputs"""
+    late_stick: LateStick | None = None
+    """by how much inputs look later than they acted, where that is clear and matters"""
     seed: int = 0
     timing: dict[str, float] = field(default_factory=dict)
 
@@ -256,6 +259,8 @@ class Fit:
     @property
     def interval(self) -> str:
         """What to call the intervals."""
+        if self.status != "not-converged" and self.late_stick is not None:
+            return "95 % (stick late)"
         if self.status != "not-converged" and self.coloured:
             return "95 % (autocorrelated residuals)"
         # Where no optimum was reached there are none.

@@ -17,7 +17,7 @@ from heli_jax.linear_models import read as linear_models
 from heli_jax.new_config import guess, text
 from heli_jax.new_config.guess import Guess
 from heli_jax.new_config.logs import Log, read_log
-from heli_jax.new_config.rate import channels_of_preset, common_rate
+from heli_jax.new_config.rate import channels_of_preset, common_rate, rate_of_outputs
 from heli_jax.numerics.white_noise import wanders, without_noise
 from heli_jax.run_directory import require_place, whole_file
 from heli_jax.vehicle import read_vehicle
@@ -90,7 +90,7 @@ def write_config(
         signals=signals,
         vehicle=place,
         free=_free(chosen, constants, paths),
-        rate=None if read.time is not None else common_rate(read.series, used),
+        rate=_rate(read, used, signals),
         others=[f"{name}: {meaning}" for name, meaning in others],
         preset_outputs=tuple(_only_turn(chosen.model).values()),
     )
@@ -124,6 +124,16 @@ def _used(preset: str | None, model: Any, log: Log, signals: text.Signals | None
     assert preset is not None
     wanted = (*naming.names(model.Inputs), *naming.names(model.Outputs))
     return channels_of_preset(preset, tuple(log.series), wanted)
+
+
+def _rate(log: Log, used: Sequence[str], signals: text.Signals | None) -> float | None:
+    """The grid's rate [Hz]: of topics with clocks of their own, or of a table whose rows are not
+    the outputs' own; None where the rows themselves are the grid."""
+    if log.time is None:
+        return common_rate(log.series, used)
+    assert signals is not None  # presets are of logs with topics
+    outputs = [g.channel for g in signals.outputs.values() if g is not None]
+    return rate_of_outputs(log.series, outputs)
 
 
 def _also(name: str | dict[str, str]) -> tuple[tuple[str, str], ...]:

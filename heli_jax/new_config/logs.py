@@ -87,8 +87,7 @@ def _read_table(table: Table) -> Log:
     others = [n for n in names if rows[n] != rows[clock]]
     names = [n for n in names if n not in others]
     values, _ = numbers_once(table, clock, [clock, *(n for n in names if n != clock)])
-    # Seconds from the first stamp: their count does not matter to a guess.
-    times = np.linspace(0.0, info.time.duration, values[clock].size)
+    times = _from_first(values[clock], info.time.duration)
     series = {
         n: Series(times, without_marks(values[n]), table.units.get(n, ""))
         for n in names
@@ -99,6 +98,17 @@ def _read_table(table: Table) -> Log:
         listed = ", ".join(map(shown, others[:6]))
         notes += (f"left out, since they are not as long as {shown(clock)}: {listed}",)
     return Log(table.path, table.format, series, info.time, None, False, notes)
+
+
+def _from_first(stamps: np.ndarray, duration: float) -> np.ndarray:
+    """Stamps (N,) in seconds from the first, which is all that a guess needs of their unit; evenly
+    spread over the duration [s] where they are no clock yet."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        elapsed = stamps - stamps[0]
+        rises = elapsed.size > 1 and bool(np.all(np.diff(elapsed) > 0))
+    if not (rises and np.isfinite(elapsed[-1])):
+        return np.linspace(0.0, duration, stamps.size)
+    return elapsed * (duration / float(elapsed[-1]))
 
 
 def _without_time(info: LogInfo) -> str:

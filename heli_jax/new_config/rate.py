@@ -2,9 +2,12 @@
 
 from collections.abc import Collection, Mapping
 
+import numpy as np
+
 from heli_jax.flights.derived import sources
 from heli_jax.flights.preset import model_inputs, model_outputs, preset
-from heli_jax.flights.slower import usual_step
+from heli_jax.flights.repeats import carried_on, first_of_each
+from heli_jax.flights.slower import SLOWER, usual_step
 from heli_jax.new_config.guess import Series
 
 _FASTEST = 100.0
@@ -32,6 +35,24 @@ def common_rate(series: Mapping[str, Series], used: Collection[str]) -> float | 
     rates = [1.0 / usual_step(series[n].times) for n in used if n in series]
     rates = [rate for rate in rates if rate >= _SLOW] or rates
     return two_digits(min(_FASTEST, *rates)) if rates else None
+
+
+def rate_of_outputs(series: Mapping[str, Series], outputs: Collection[str]) -> float | None:
+    """The rate [Hz] of the fastest output by its own samples, 100 at most, where a table's rows
+    come faster than that since they are those of several topics; else None.
+
+    Args:
+        series: of the table by channel.
+        outputs: names of channels.
+    """
+    rates, rows = [], 0.0
+    for times, values, *_ in (series[n] for n in outputs if n in series):
+        seen = ~np.isnan(first_of_each(values) if carried_on(times, values) else values)
+        rates.append(1.0 / usual_step(times[seen]))
+        rows = max(rows, 1.0 / usual_step(times), (times.size - 1) / float(np.ptp(times)))
+    if not rates or rows < SLOWER * max(rates):
+        return None
+    return two_digits(min(_FASTEST, max(rates)))
 
 
 def channels_of_preset(name: str, series: Collection[str], signals: Collection[str]) -> list[str]:

@@ -28,6 +28,8 @@ _SMOOTH = (
 # Short words of YAML (on, y, null) and numbers are none of these.
 _PLAIN = re.compile(r"(?!(?i:on|off|yes|no|y|n|true|false|null)\Z)[A-Za-z][\w./%^-]*")
 
+_ROWS_OF_TOPICS = "# Hz; the rows are those of several topics, the outputs slower"
+
 
 class Chosen(NamedTuple):
     """The model, what a configuration calls it, and whether it is linear from a file."""
@@ -78,7 +80,8 @@ def configuration(
         signals: by the model's names.
         vehicle: the vehicle file, as the configuration names it.
         free: starts by parameter; None at the vehicle's value.
-        rate: [Hz] onto which topics with clocks of their own are brought.
+        rate: [Hz] onto which topics with clocks of their own are brought, or a table whose rows are
+            those of several topics.
         others: models that fit the signals too, each with what it is for.
         preset_outputs: those to take from the preset; all unless given.
 
@@ -95,8 +98,8 @@ def configuration(
     lines += ["flights:", f"  - log: {_value(log)}"]
     if flight is not None:
         lines.append(f"    flight: {flight}")
-    lines += _clock(time)
-    if rate is not None:
+    lines += _clock(time, rate)
+    if time is None and rate is not None:
         lines.append(f"    rate: {rate:g}".ljust(33) + "# Hz; the grid of all signals")
     if preset is not None:
         lines += [
@@ -166,7 +169,7 @@ def _axes(model: Any) -> tuple[str, ...]:
     return tuple(axis.name for axis in axes_of(model))
 
 
-def _clock(time: TimeInfo | None) -> list[str]:
+def _clock(time: TimeInfo | None, rate: float | None) -> list[str]:
     if time is None:
         return []
     lines = [f"    # {time.duration:.4g} s at {time.rate:.4g} Hz"]
@@ -175,7 +178,8 @@ def _clock(time: TimeInfo | None) -> list[str]:
         words = f"{len(time.gaps)} gaps, the longest {longest:.3g} s"
         lines += [
             f"    gaps: split                  # {words}; fail refuses long ones",
-            f"    rate: {two_digits(time.rate):g}".ljust(33) + "# Hz; the log has no even steps",
+            f"    rate: {rate or two_digits(time.rate):g}".ljust(33)
+            + ("# Hz; the log has no even steps" if rate is None else _ROWS_OF_TOPICS),
         ]
     return lines
 

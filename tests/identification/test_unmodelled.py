@@ -80,16 +80,27 @@ def saturated(u):
     return found.y[0]
 
 
-def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0):
+def fitted(made, method, *, seed=3, noise=0.1, coloured=0.0, seen=slice(None)):
     rng = np.random.default_rng(seed)
     u = steps(rng)
     disturbed = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal(N)) * coloured
     p = made(u) + noise * rng.standard_normal(N) + disturbed
-    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": p})
+    measured = np.full(N, np.nan)
+    measured[seen] = p[seen]
+    flight = Flight(dt=DT, inputs={"lat": u}, outputs={"p": measured})
     return fit(
         Problem(
             roll, Params(-3.0, 15.0), [flight], {"Lp": Free(-3.0), "Ll": Free(15.0)}, method=method
         )
+    )
+
+
+def test_what_was_not_asked_leaves_no_plain_yes():
+    some = np.flatnonzero(np.random.default_rng(8).random(N) < 0.5)
+    right = fitted(lambda u: linear(np.array([[-4.0]]), np.array([[20.0]]), u), "output-error",
+                   seen=some)  # fmt: skip
+    assert right.adequacy.summary == (
+        "in size only (what p may lack was not asked, since samples are missing)"
     )
 
 

@@ -14,6 +14,7 @@ import scipy.special
 
 from heli_jax.dynamics.kinematics import FORCES
 from heli_jax.identification.validation.metrics import cross_correlation
+from heli_jax.identification.validation.own_samples import own_samples
 
 _SECONDS = 0.4
 """lags of an input that are looked at"""
@@ -81,8 +82,11 @@ def missing_dynamics(
     # By output and input over all flights, so that one missing servo is one sentence.
     found: dict[tuple[str, str], Explained] = {}
     for flight, output, name in pairs:
-        signals = (flight.residuals[output], flight.inputs[name])
-        one = explained_by(*signals, flight.dt, by_chance=_BY_CHANCE / len(pairs))
+        e, u, dt = flight.residuals[output], flight.inputs[name], flight.dt
+        own = own_samples(np.isfinite(e))
+        if own is not None and own.every > 1:
+            e, u, dt = e[own.rows], own.of_input(u), own.every * dt
+        one = explained_by(e, u, dt, by_chance=_BY_CHANCE / len(pairs))
         if one is None or one.share < _WORTH_IT:
             continue
         known = found.get((output, name))
@@ -101,7 +105,12 @@ def missing_dynamics(
         sentences.append(_sentence(output, name, one, remedy + away * _OF_AN_ACCELERATION))
         # The remedy of all of them is the same: the first one says it.
         remedy = remedy if one.lag < 0 else ""
-    gappy = {n: None for f in flights for n, r in f.residuals.items() if not np.isfinite(r).all()}
+    gappy = {
+        n: None
+        for f in flights
+        for n, r in f.residuals.items()
+        if own_samples(np.isfinite(r)) is None
+    }
     if gappy:
         sentences.append(
             f"Whether the model lacks dynamics was not asked of {', '.join(gappy)}, of which "

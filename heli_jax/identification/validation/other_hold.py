@@ -47,7 +47,7 @@ def other_hold(
         return []
     # Other inputs to the same program in place of another program: compiling costs far more than an
     # evaluation.
-    if not _feeds_through(problem):
+    if not feeds_through(problem):
         other = evaluate(at.layout, _averaged(at.layout, at.data, moving), at.noise, at.z)
     elif not in_doubt:
         other = evaluate(_flipped(at.layout, moving), at.data, at.noise, at.z)
@@ -84,7 +84,7 @@ def _change(e: Evaluation, other: Evaluation, q: int) -> np.ndarray:
     # One Gauss-Newton step from the same point, with r and r' the residuals with the hold taken and
     # with the other: -J'^+ (r' - r). The difference, not r' itself: so it tells the change at any
     # point, also far from an optimum, as if the record were that of the model there.
-    change = _pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
+    change = pseudoinverse(np.asarray(other.J))[:q] @ (np.asarray(e.r) - np.asarray(other.r))
     # From the optimiser's coordinates to the parameters' units.
     return change * np.asarray(e.slopes)
 
@@ -92,10 +92,10 @@ def _change(e: Evaluation, other: Evaluation, q: int) -> np.ndarray:
 def _white_sd(e: Evaluation, q: int) -> np.ndarray:
     """Standard deviations (q,) of the first unknowns with white noise, SI."""
     # The rows of a pseudoinverse of whitened residuals are as long as the sds.
-    return np.linalg.norm(_pseudoinverse(np.asarray(e.J))[:q], axis=1) * np.abs(e.slopes)
+    return np.linalg.norm(pseudoinverse(np.asarray(e.J))[:q], axis=1) * np.abs(e.slopes)
 
 
-def _feeds_through(problem: Problem) -> bool:
+def feeds_through(problem: Problem) -> bool:
     """Whether an input acts on an output at once, without the dynamics."""
     # At the start values and zero inputs: a term that vanishes there is taken for none.
     return bool(np.any(np.asarray(jacobians(problem.model, problem.start_params()).D)))
@@ -137,8 +137,8 @@ def _other(hold: str) -> str:
     return "zero-order" if hold == "linear" else "linear"
 
 
-def _pseudoinverse(J: np.ndarray) -> np.ndarray:
-    """(q, n), with columns brought to one size first."""
+def pseudoinverse(J: np.ndarray) -> np.ndarray:
+    """Of sensitivities (n, q), with columns brought to one size first: (q, n)."""
     # The cut is on singular values, and units of the unknowns must not decide what it takes.
     norms = np.linalg.norm(J, axis=0)
     norms = np.where(norms > 0, norms, 1.0)

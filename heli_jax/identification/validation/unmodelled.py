@@ -23,6 +23,7 @@ from heli_jax.identification.estimation.measured_signals import signals
 from heli_jax.identification.estimation.output_error import ESTIMATOR as OUTPUT_ERROR
 from heli_jax.identification.unknowns.layout import Solution
 from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.own_samples import OwnSamples, own_samples
 from heli_jax.identification.validation.score_test import (
     BROAD,
     NARROW,
@@ -124,8 +125,9 @@ def unmodelled(
 ) -> tuple[Unmodelled, ...]:
     """What the residuals follow beyond chance, by output at most one.
 
-    Of outputs with gaps, of a simulation that left the record, of windows and of sensors compared
-    with each other nothing is asked. Whoever asks has seen to it that inputs do not follow the
+    An output that is slower than the grid is asked at its own samples. Of others with gaps, of a
+    simulation that left the record, of windows and of sensors compared with each other nothing is
+    asked. Whoever asks has seen to it that inputs do not follow the
     response: through a loop disturbances are in the inputs, and any residual follows these.
 
     Args:
@@ -185,13 +187,36 @@ def _where_least(at: Solution, asked: _Asked, name: str, level: float) -> _Asked
     return asked
 
 
-def with_unmodelled(adequacy: Adequacy, found: tuple[Unmodelled, ...]) -> Adequacy:
-    """The adequacy, no plain yes where something that matters is missing.
+def unasked(at: Solution) -> tuple[str, ...]:
+    """The outputs of which so many samples are missing that nothing could be asked.
+
+    Args:
+        at: where the fit ended.
+    """
+    layout, flights = at.layout, at.data.flights
+    asked: dict[str, bool] = {}
+    for i, outputs in enumerate(layout.outputs):
+        for n in outputs:
+            seen = np.isfinite(np.asarray(flights[i].outputs[n]))
+            # What never moves is judged elsewhere, and one flight that can be asked is enough.
+            asked[n] = asked.get(n, False) or own_samples(seen) is not None or not seen.any()
+    return tuple(n for n, could in asked.items() if not could)
+
+
+def with_unmodelled(
+    adequacy: Adequacy, found: tuple[Unmodelled, ...], gappy: tuple[str, ...] = ()
+) -> Adequacy:
+    """The adequacy, no plain yes where something that matters is missing, or was not asked for.
 
     Args:
         adequacy: as judged by size and whiteness, or in frequency.
         found: of `unmodelled`.
+        gappy: the outputs of which that was not asked.
     """
+    if gappy:
+        words = f"what {', '.join(gappy)} may lack was not asked, since samples are missing"
+        limited = [adequacy.limited] if adequacy.limited else []
+        adequacy = adequacy._replace(limited="; ".join([*limited, words]))
     if not found:
         return adequacy
     adequacy = adequacy._replace(remarks=(*adequacy.remarks, *(f.sentence for f in found)))
@@ -212,12 +237,26 @@ def _longest(at: Solution) -> list[int]:
 def _usable(at: Solution, e: Evaluation, i: int, name: str) -> bool:
     if name not in at.layout.outputs[i]:
         return False
-    y, left = np.asarray(at.data.flights[i].outputs[name]), np.asarray(e.raw[i][name])
-    if not (np.isfinite(y).all() and np.isfinite(left).all() and np.std(y) > 0):
+    own = _own(at, i, name)
+    if own is None:
+        return False
+    y = np.asarray(at.data.flights[i].outputs[name])[own.rows]
+    left = np.asarray(e.raw[i][name])[own.rows]
+    if not (np.isfinite(left).all() and np.std(y) > 0):
         return False
     with np.errstate(over="ignore"):
         size = float(np.std(left) / np.std(y))
     return _ROUNDING < size < np.sqrt(1.0 - _DIVERGED)
+
+
+def _own(at: Solution, i: int, name: str) -> OwnSamples | None:
+    """Where a flight's output was sampled."""
+    return own_samples(np.isfinite(np.asarray(at.data.flights[i].outputs[name])))
+
+
+def _every(at: Solution, i: int, name: str) -> int:
+    own = _own(at, i, name)
+    return own.every if own is not None else 0
 
 
 def _sensitivities(at: Solution, e: Evaluation) -> dict[tuple[int, str], np.ndarray]:
@@ -269,15 +308,19 @@ def _of_output(
     be asked."""
     moving = _moving(at)
     flights = [i for i in _longest(at) if _usable(at, e, i, name)]
-    changing = _changing(at, J, name, flights)
-    each = [
-        lines_of(
-            np.asarray(e.raw[i][name]),
-            J[i, name],
-            np.concatenate([_drives(at, e, i, name, moving), changing[i]], axis=1),
-        )
-        for i in flights
-    ]
+    # The bank's filters are of samples: those of one clock go together.
+    flights = [i for i in flights if _every(at, i, name) == _every(at, flights[0], name)]
+    changing, each = _changing(at, J, name, flights), []
+    for i in flights:
+        own = _own(at, i, name)
+        assert own is not None  # or the flight were not usable
+        drives = _drives(at, e, i, name, moving)
+        if own.every > 1:
+            drives = np.stack([own.of_input(v) for v in drives.T], axis=1)
+        else:
+            drives = drives[own.rows]
+        drives = np.concatenate([drives, changing[i][own.rows]], axis=1)
+        each.append(lines_of(np.asarray(e.raw[i][name])[own.rows], J[i, name][own.rows], drives))
     lines = [one for one in each if one is not None]
     if not lines or not moving:
         return None
@@ -342,7 +385,8 @@ def _said(
         sd = sds.get(parameter)
         if sd:
             moved[parameter] = float(strong.shift[k] * slope / sd)
-    dt = float(at.data.flights[_longest(at)[0]].dt)
+    first = next(i for i in _longest(at) if _usable(at, e, i, name))
+    dt = float(at.data.flights[first].dt) * _every(at, first, name)
     return Unmodelled(
         name,
         moving[strong.drive] if strong.drive < len(moving) else "",

@@ -1,0 +1,259 @@
+"""Whether the inputs look later than they acted, by less than the motion itself would show.
+
+A logger that reads a stick at 50 Hz stamps a step at the sample after it: half a sample late on
+average. `late_inputs` sees an input that moves after its answer; a few ms hide in the estimates,
+which take them up as a faster machine. So the derivative of the residuals by a shift of the inputs
+is asked for (a score test, Rao, 1948): what is left of it beside the sensitivities says how late
+they are, and what it has in common with them by how much that moves the estimates.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heli_jax import naming
+from heli_jax.dynamics.kinematics import is_kinematic
+from heli_jax.flights.flight import Flight
+from heli_jax.flights.holds import is_low_passed
+from heli_jax.identification.estimation.evaluation import Evaluation, evaluate
+from heli_jax.identification.problem import Problem
+from heli_jax.identification.unknowns.layout import Data, Solution
+from heli_jax.identification.validation.adequacy import Adequacy
+from heli_jax.identification.validation.finding import Finding
+from heli_jax.identification.validation.other_hold import feeds_through, pseudoinverse
+from heli_jax.identification.validation.signal_quality import facts_of
+
+_CLEAR = 5.0
+"""sds from zero, from which on a shift is spoken of"""
+_MATTERS = 1.0
+"""sds of an estimate by which it has to move it"""
+_LARGE = 0.1
+"""of a parameter, by which half a sample of the stick has to move it for a doubt before any fit"""
+_NULL = 1e-8
+"""directions of the scaled sensitivities below this part of the largest are left out"""
+_LEFT = 1e-3
+"""part of the derivative by the shift that has to be left beside the sensitivities"""
+_BLOCK = 1.0
+"""[s] over which rows may be correlated"""
+_MOST = 3
+"""parameters that are named"""
+
+
+class LateStick(NamedTuple):
+    """A shift of the inputs that the residuals ask for."""
+
+    inputs: tuple[str, ...]
+    seconds: float
+    """by which they look late"""
+    sd: float
+    moved: Mapping[str, tuple[float, float]]
+    """by parameter how far a free shift moves it: part of its value, and sds"""
+    freed: bool = False
+    """whether a shift was free, and is what stands here"""
+
+    @property
+    def words(self) -> str:
+        """For the verdict."""
+        verb = "look" if len(self.inputs) > 1 else "looks"
+        return f"{' and '.join(self.inputs)} {verb} {1e3 * self.seconds:.2g} ms late"
+
+    @property
+    def sentence(self) -> str:
+        """For the notes of a fit."""
+        if self.freed:
+            return (
+                f"By {1e3 * self.seconds:.2g} ms {', '.join(self.inputs)} acted before it was "
+                "logged: a step stands at the stamp after it. The shift makes up for the mean of "
+                "that alone; each step was late by a time of its own, for which no interval allows."
+            )
+        each = [f"{n} by about {100 * part:+.2g} %" for n, (part, _) in _largest(self.moved)]
+        return (
+            f"{self.words} (sd {1e3 * self.sd:.2g} ms): the response comes earlier than the model "
+            f"makes it. A free shift, nuisance.time_shift: true, would move {', '.join(each)}; "
+            "no interval allows for that."
+        )
+
+
+def late_stick(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    estimates: Mapping[str, tuple[float, float | None]],
+) -> LateStick | None:
+    """The inputs' lateness where it is clear and matters; None where it does not show.
+
+    Args:
+        problem: what was fitted.
+        at: where the fit ended.
+        e: the evaluation there.
+        estimates: value and sd of those of interest, among them a free `time_shift` [s], SI.
+    """
+    if "time_shift" in estimates:
+        return _freed(problem, *estimates["time_shift"])
+    slope = _by_shift(problem, at)
+    if slope is None:
+        return None
+    names, s = slope
+    J, r = np.asarray(e.J), np.asarray(e.r)
+    Q = _basis(J)
+    left = s - Q @ (Q.T @ s)
+    power = float(left @ left)
+    if not power > _LEFT**2 * float(s @ s):
+        return None  # a free delay stands for it already
+    # The residuals are s times the lateness, and fall by as much with a shift of that size.
+    seconds = float(left @ r) / power
+    own = left * (r - left * seconds)
+    count = max(1, round(_BLOCK / float(at.data.flights[0].dt)))
+    sums = np.add.reduceat(own, np.arange(0, own.size, count))
+    # Rows that are not white tell less than as many that are.
+    sd = max(1.0 / np.sqrt(power), float(np.linalg.norm(sums)) / power)
+    moved = _moved(at, e, pseudoinverse(J) @ s * seconds, estimates)
+    matters = any(abs(by) > _MATTERS for _, by in moved.values())
+    if not (seconds > _CLEAR * sd and matters):
+        return None
+    return LateStick(names, seconds, sd, moved)
+
+
+def _freed(problem: Problem, value: float, sd: float | None) -> LateStick | None:
+    """A free shift [s] that says that inputs in steps acted before they were logged."""
+    names = _stepped(problem.training)
+    if not names or not sd or not -value > _CLEAR * sd:
+        return None
+    return LateStick(names, -value, sd, {}, freed=True)
+
+
+def with_late_stick(adequacy: Adequacy, late: LateStick | None) -> Adequacy:
+    """The adequacy, no plain yes where inputs look late."""
+    if late is None:
+        return adequacy
+    words = [adequacy.limited] if adequacy.limited else []
+    words.append(f"steps of {', '.join(late.inputs)} fall between stamps" if late.freed else "")
+    words[-1] = words[-1] or late.words
+    return adequacy._replace(limited="; ".join(words), remarks=(late.sentence, *adequacy.remarks))
+
+
+def slow_sticks(
+    problem: Problem, at: Solution, e: Evaluation, *, skip: Collection[str] = ()
+) -> list[Finding]:
+    """A doubt where half a sample of an input that was commanded in steps moves a parameter far.
+
+    Args:
+        problem: what is to be fitted.
+        at: the start values.
+        e: the evaluation there.
+        skip: parameters that the data do not determine.
+    """
+    periods = _periods(problem.training)
+    if not periods or not np.all(np.isfinite(e.J)):
+        return []
+    slope = _by_shift(problem, at, tuple(periods))
+    if slope is None:
+        return []
+    longest = max(periods.values())
+    change = pseudoinverse(np.asarray(e.J)) @ slope[1] * (0.5 * longest)
+    moved = {n: one for n, one in _moved(at, e, change, {}).items() if n not in skip}
+    # What is late makes an estimate wrong by as much as a shift would have to take back.
+    most = max((abs(part) for part, _ in moved.values()), default=0.0)
+    if most < _LARGE:
+        return []
+    each = [f"{n} by about {-100 * part:+.2g} %" for n, (part, _) in _largest(moved)]
+    words = (
+        f"{', '.join(periods)} moves in steps and was sampled at {1 / longest:.3g} Hz: a step "
+        f"stands at the sample after it, up to {1e3 * longest:.2g} ms late. Half of that moves "
+        f"{', '.join(each)}, beside which intervals say little: log it faster; "
+        "nuisance.time_shift: true makes up for the mean of it."
+    )
+    criterion = f"part of a parameter that half a sample of the stick moves, {_LARGE:g}"
+    return [Finding("slow stick", "doubt", words, most, criterion)]
+
+
+def _largest(moved: Mapping[str, tuple[float, float]]) -> list[tuple[str, tuple[float, float]]]:
+    return sorted(moved.items(), key=lambda item: -abs(item[1][0]))[:_MOST]
+
+
+def _stepped(flights: Sequence[Flight]) -> tuple[str, ...]:
+    """The inputs that move in steps in their logs."""
+    names = [
+        n
+        for f in flights
+        for n, u in f.inputs.items()
+        if np.ptp(u) > 0 and f.hold[n] == "zero-order" and n in f.hold_reason
+    ]
+    return tuple(dict.fromkeys(names))
+
+
+def _periods(flights: Sequence[Flight]) -> dict[str, float]:
+    """By input that moves in steps the time between its samples as they were logged [s]."""
+    longest: dict[str, float] = {}
+    for name in _stepped(flights):
+        usual = [facts_of(f)[name, "input"].usual for f in flights if name in f.inputs]
+        longest[name] = max(usual)
+    return longest
+
+
+def _by_shift(
+    problem: Problem, at: Solution, names: Sequence[str] | None = None
+) -> tuple[tuple[str, ...], Float[np.ndarray, " n"]] | None:
+    """The inputs that move, and the derivative (n,) of the rows by how much later they come [1/s];
+    None where a shift is free, or makes no sense."""
+    layout, flights = at.layout, problem.training
+    if is_kinematic(layout.model) or layout.shift or not layout.estimator.rows_are_samples:
+        return None
+    moving = tuple(
+        n
+        for n in naming.names(layout.model.Inputs)
+        # Whoever simulates an input knows when it acted.
+        if any(np.ptp(f.inputs[n]) > 0 and (f.source or n in f.hold_reason) for f in flights)
+        and not any(is_low_passed(f.hold_reason.get(n, "")) for f in flights)
+        and (names is None or n in names)
+    )
+    # The mean of two samples is another value where an input acts on an output at once.
+    if not moving or feeds_through(problem):
+        return None
+    by = 0.5 * min(float(f.dt) for f in at.data.flights)
+    both = [evaluate(layout, _shifted(at.data, moving, s * by), at.noise, at.z) for s in (1, -1)]
+    # Both ways, so that what the means smooth is the same in both.
+    s = (np.asarray(both[0].r) - np.asarray(both[1].r)) / (2.0 * by)
+    return (moving, s) if np.all(np.isfinite(s)) and np.any(s) else None
+
+
+def _shifted(data: Data, names: Collection[str], seconds: float) -> Data:
+    """The inputs of these names later by so much, or earlier; half a sample at most."""
+    flights = []
+    for flight in data.flights:
+        part = abs(seconds) / float(flight.dt)
+        inputs = {}
+        for n, u in naming.asdict(flight.inputs).items():
+            first, last = (u[:1], u[:-1]) if seconds > 0 else (u[1:], u[-1:])
+            beside = jnp.concatenate([first, last])
+            inputs[n] = (1.0 - part) * u + part * beside if n in names else u
+        flights.append(flight._replace(inputs=type(flight.inputs)(**inputs)))
+    return data._replace(flights=jax.device_put(tuple(flights)))
+
+
+def _moved(
+    at: Solution,
+    e: Evaluation,
+    step: np.ndarray,
+    estimates: Mapping[str, tuple[float, float | None]],
+) -> dict[str, tuple[float, float]]:
+    """By parameter what a step of the unknowns (q,) does to it: part of its value, and sds."""
+    values, slopes = np.asarray(e.named), np.asarray(e.slopes)
+    moved = {}
+    for k, name in enumerate(at.layout.of_interest):
+        change, value = float(step[k] * slopes[k]), float(values[k])
+        sd = estimates.get(name, (value, None))[1]
+        if name in at.layout.free and name not in at.layout.disturbance and value:
+            moved[name] = (change / value, change / sd if sd else 0.0)
+    return moved
+
+
+def _basis(J: np.ndarray) -> Float[np.ndarray, "n k"]:
+    """Orthonormal columns that span those of J (n, q)."""
+    sizes = np.linalg.norm(J, axis=0)
+    U, values, _ = np.linalg.svd(J / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    return U[:, values > _NULL * values[0]]

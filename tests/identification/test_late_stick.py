@@ -1,0 +1,120 @@
+"""A stick whose steps stand at the stamp after them is said to be late, and by how much.
+
+Records are made by SciPy at 1 kHz and logged at 50 Hz.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from heli_jax import Flight, Free, Model, Nuisance, Problem, check, fit
+from heli_jax.flights.holds import decide
+from heli_jax.identification.validation.own_samples import own_samples
+
+FINE, EVERY = 0.001, 20
+LOGGED = FINE * EVERY
+N = 40_000
+
+
+class Params(NamedTuple):
+    Lp: float
+    Ll: float
+
+
+class State(NamedTuple):
+    p: float
+
+
+class Inputs(NamedTuple):
+    lat: float
+
+
+class Outputs(NamedTuple):
+    p: float
+
+
+roll = Model(
+    "first order",
+    lambda q, x, u: State(p=q.Lp * x.p + q.Ll * u.lat),
+    lambda q, x, u: Outputs(p=x.p),
+    Params, State, Inputs, Outputs, linear=True,
+)  # fmt: skip
+
+
+def problem(grid, *, shift=False, start=(-6.0, 20.0)):
+    """Steps at multiples of `grid` [ms], the stick read at the logger's samples."""
+    rng = np.random.default_rng(5)
+    u, k = np.zeros(N), 0
+    while k < N:
+        n = grid * int(rng.integers(150 // grid, 600 // grid))
+        u[k : k + n] = rng.uniform(-0.1, 0.1)
+        k += n
+    a = np.exp(-12.0 * FINE)
+    p = scipy.signal.lfilter([0.0, 60.0 * (1 - a) / 12.0], [1.0, -a], u)[::EVERY]
+    p = p + 0.002 * rng.standard_normal(p.size)
+    stick = u[::EVERY]
+    taken = decide(stick)
+    flight = Flight(
+        dt=LOGGED, inputs={"lat": stick}, outputs={"p": p},
+        hold={"lat": taken.hold}, hold_reason={"lat": taken.reason},
+    )  # fmt: skip
+    free = {"Lp": Free(start[0]), "Ll": Free(start[1])}
+    return Problem(
+        roll, Params(*start), [flight], free, method="output-error",
+        nuisance=Nuisance(time_shift=shift),
+    )  # fmt: skip
+
+
+def test_a_stick_that_is_late_is_no_plain_yes():
+    found = fit(problem(1))
+    late = found.late_stick
+    assert late is not None
+    # Half of the logger's 20 ms on average, of the derivative at the optimum.
+    assert 0.005 < late.seconds < 0.014
+    assert "lat looks" in found.adequacy.summary
+    assert found.adequacy.summary.startswith("in size only")
+    assert found.interval == "95 % (stick late)"
+    [note] = [n for n in found.notes if "nuisance.time_shift: true, would move" in n]
+    assert "Lp by about" in note
+
+
+def test_a_free_shift_leaves_what_each_step_was_late_by():
+    found = fit(problem(1, shift=True))
+    assert found.nuisance["time_shift"].value == pytest.approx(-0.01, abs=0.002)
+    assert found.late_stick is not None
+    assert found.late_stick.freed
+    assert "steps of lat fall between stamps" in found.adequacy.summary
+    assert found.interval == "95 % (stick late)"
+
+
+def test_a_stick_whose_steps_fall_on_samples_is_not():
+    found = fit(problem(EVERY))
+    assert found.late_stick is None
+    assert found.adequacy.summary == "yes"
+    assert found.interval == "95 % interval"
+    assert found.estimates["Lp"].value == pytest.approx(-12.0, rel=0.02)
+
+
+def test_check_says_what_half_a_sample_of_the_stick_does():
+    [finding] = [
+        f for f in check(problem(1, start=(-14.0, 70.0))).findings if f.topic == "slow stick"
+    ]
+    assert finding.severity == "doubt"
+    assert "lat moves in steps and was sampled at 50 Hz" in finding.sentence
+    assert "up to 20 ms late" in finding.sentence
+
+
+def test_own_samples_of_a_slower_clock():
+    seen = np.zeros(100, bool)
+    seen[3::4] = True
+    own = own_samples(seen)
+    assert own is not None
+    assert own.every == 4
+    u = np.arange(100.0)
+    np.testing.assert_allclose(own.of_input(u), u[3::4] - 1.5)
+    assert own_samples(np.random.default_rng(1).random(100) < 0.5) is None
+    whole = own_samples(np.ones(9, bool))
+    assert whole is not None
+    assert whole.every == 1
