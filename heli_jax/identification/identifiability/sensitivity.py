@@ -290,6 +290,9 @@ def verdict_of(
     S, N = R[:, :q], R[:, q:]
     sensitivity = _with_weak_priors(rows, S, N)
     without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, null_below)
+    if not around.combined:
+        # Initial states of a chance optimum may tell what no input does: at rest they would not.
+        without = without._replace(switched_off={})
     if reported is not None:
         references = references_of(problem, unknowns)
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)
