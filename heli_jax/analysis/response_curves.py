@@ -24,6 +24,8 @@ _PRECISE = 0.03
 octave"""
 _LEAST_BINS = 7
 """in a local fit, which reaches further where there are fewer"""
+_AROUND = 3
+"""bins to either side that say where the phase of one is"""
 _COHERENT = 0.6
 """mean coherence over an octave from which on a response is taken for the input's: Tischler and
 Remple, Aircraft and Rotorcraft System Identification (2012)"""
@@ -134,7 +136,8 @@ def measured_curve(
     large, each bin by its random error.
     Errors of bins that one window hardly tells apart are correlated: independent ones are 1.95
     lines of the window apart. The band is the widest one of coherence 0.6 in the mean over an
-    octave.
+    octave in which no bin leaps by more than a right angle from those around it: that is noise,
+    and past it the number of whole turns is not known.
 
     Args:
         omega: (k,) [rad/s], rising.
@@ -144,9 +147,14 @@ def measured_curve(
         window: length of the Hann windows [s].
     """
     known = (octave_mean(omega, coherence) >= _COHERENT) & np.isfinite(H) & (np.abs(H) > 0)
+    coherent = _widest(np.log(omega), known)
+    if coherent.size < _LEAST_BINS:
+        return f"its coherence stays below {_COHERENT} in the mean over an octave"
+    # Unwrapped past a bin that leaps, all that follows may be a turn off.
+    known[coherent] &= ~_leaps(H[coherent], sd[coherent])
     run = _widest(np.log(omega), known)
     if run.size < _LEAST_BINS:
-        return f"its coherence stays below {_COHERENT} in the mean over an octave"
+        return "its phase leaps from bin to bin"
     w, H, relative = omega[run], H[run], sd[run] / np.abs(H[run])
     x = np.log(w)
     y = np.stack([np.log(np.abs(H)), np.unwrap(np.angle(H))], axis=1)
@@ -167,6 +175,16 @@ def measured_curve(
         )
 
     return Curve(at, (float(w[0]), float(w[-1])))
+
+
+def _leaps(H: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Which bins (k,) lie more than a right angle off the phase of those around them."""
+    relative = sd / np.abs(H)
+    # By the errors, but not so that one bin has it all: its own may be too small by chance.
+    weights = 1.0 / (relative**2 + np.median(relative) ** 2)
+    phasors = weights * H / np.abs(H)
+    around = np.convolve(phasors, np.ones(2 * _AROUND + 1), mode="same") - phasors
+    return np.real(H * np.conj(around)) < 0.0
 
 
 def _widest(x: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -141,7 +141,7 @@ def _numbers(
     """The estimates; `absent`: the parameters of disturbances that do not show."""
     layout = at.layout
     verdict, wider, quantiles = errors.verdict, errors.wider, errors.quantiles
-    of_interest = estimates_of(problem, layout, e, verdict, quantiles, wider)
+    of_interest = estimates_of(problem, layout, errors.by or e, verdict, quantiles, wider)
     of_interest = with_limits(of_interest, errors.limits)
     nuisance = {k: v for k, v in of_interest.items() if k not in layout.free}
     # A method that does not see initial states and biases has no interval of them.
@@ -196,7 +196,7 @@ def assemble(
         solution,
         e,
         run.before,
-        white=all_white,
+        white=all(w.white for w in white.values()) if e.innovations else all_white,
         aliased=aliased,
         twins=twins,
         optimum=bool(best.converged),

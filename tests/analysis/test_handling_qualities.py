@@ -82,6 +82,19 @@ def test_what_the_band_does_not_reach_has_no_number():
     )
 
 
+@pytest.mark.parametrize("turn", [2.0, np.pi, -2.0])
+def test_past_a_bin_whose_phase_leaps_nothing_is_known(turn):
+    # Unwrapped through it the phase from 20 rad/s on may be a turn off: a delay below zero.
+    i = int(np.searchsorted(OMEGA, 19.0))
+    H = plant(OMEGA) * np.exp(1j * np.where(np.arange(OMEGA.size) > i, -0.6 * turn, 0.0))
+    H[i] *= 4.0 * np.exp(1j * turn)
+    found = handling_qualities(measured(H))
+    assert found.band[1] < 19.0
+    assert "phase_delay" not in found.numbers
+    assert any("phase delay: not determined" in s for s in found.sentences)
+    assert found.numbers["w180"].value == pytest.approx(10.0, rel=1e-3)
+
+
 def test_a_loop_has_the_margins_of_its_matrices():
     A, b, c = scipy.signal.tf2ss([40.0], np.polymul([1.0, 5.0, 0.0], [1.0, 8.0]))[:3]
     theirs = margins(A[None], b[:, 0][None], c, np.zeros(1), 3.0)

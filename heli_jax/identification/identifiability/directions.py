@@ -1,14 +1,19 @@
 """Directions of the unknowns: what the data say along them, and what they are exchanged with."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from heli_jax.identification.identifiability.combinations import TAKES_PART
-from heli_jax.identification.identifiability.verdict import Unknown
+from heli_jax.identification.identifiability.verdict import FACTOR, Z95, Unknown
 
 _SHARPER = 3.0
 """weak priors hold a direction that is this many times as sharp with them: 8/9 of what is known"""
+
+_DETERMINES = Z95 / math.log(FACTOR)
+"""1 / sd in relative coordinates of a direction whose 95 % interval reaches just as far as the
+factor: what leaves it wider is no way out"""
 
 
 class WithoutWeakPriors(NamedTuple):
@@ -149,7 +154,11 @@ class Exchange(NamedTuple):
             for name, other in self.without_weak.switched_off.items()
             if all(
                 np.linalg.norm(other @ v)
-                > max(self.least, _SHARPER * np.linalg.norm(self.without_weak.sensitivity @ v))
+                > max(
+                    self.least,
+                    _DETERMINES,
+                    _SHARPER * np.linalg.norm(self.without_weak.sensitivity @ v),
+                )
                 for v in rows
             )
         )

@@ -234,6 +234,8 @@ class Around(NamedTuple):
     """by parameter the ends of its 95 % interval by the likelihood, where the slopes have others"""
     open_combinations: frozenset[str] = frozenset()
     """names of combinations whose intervals, as they are reported, determine nothing"""
+    combined: bool = True
+    """whether combinations have numbers at all"""
 
     @property
     def tied(self) -> Tied:
@@ -243,7 +245,7 @@ class Around(NamedTuple):
         def tied(
             null: list[np.ndarray], covariance: np.ndarray, unknowns: tuple[Unknown, ...]
         ) -> tuple[Combination, ...]:
-            found = asked(null, covariance, unknowns)
+            found = asked(null, covariance, unknowns) if self.combined else ()
             return tuple(c for c in found if c.name not in self.open_combinations)
 
         return tied
@@ -288,6 +290,9 @@ def verdict_of(
     S, N = R[:, :q], R[:, q:]
     sensitivity = _with_weak_priors(rows, S, N)
     without = _without_weak_priors(problem, weak_unknowns(problem, layout), S, N, null_below)
+    if not around.combined:
+        # Initial states of a chance optimum may tell what no input does: at rest they would not.
+        without = without._replace(switched_off={})
     if reported is not None:
         references = references_of(problem, unknowns)
         to_relative = np.asarray(e.slopes, np.float64) / references * _signs(unknowns)

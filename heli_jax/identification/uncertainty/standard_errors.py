@@ -17,6 +17,12 @@ from heli_jax.identification.identifiability.beyond_slopes import (
     beyond_slopes,
 )
 from heli_jax.identification.identifiability.sensitivity import Around, verdict_of
+from heli_jax.identification.identifiability.through_inputs import (
+    not_by_inputs,
+    not_counted,
+    resting_on_disturbance,
+    through_inputs,
+)
 from heli_jax.identification.identifiability.valley import Valley
 from heli_jax.identification.identifiability.verdict import Z95, Combination, Verdict
 from heli_jax.identification.problem import Problem
@@ -27,6 +33,9 @@ from heli_jax.identification.uncertainty.autocorrelated_residuals import (
 )
 from heli_jax.identification.unknowns.layout import Layout, Solution
 
+_MORE = 1.5
+"""factor on the standard deviation of a parameter from which on most of what is known of it comes
+from the colour of the innovations"""
 _LARGEST = 700.0
 """log of the largest end of an interval: exp overflows at 709"""
 
@@ -44,6 +53,8 @@ class StandardErrors(NamedTuple):
     limits: Limits = MappingProxyType({})
     """by parameter the ends of its 95 % interval by the likelihood, in its unit, where the slopes
     have others"""
+    by: Evaluation | None = None
+    """what the standard deviations go by where it is not the optimum's own Jacobian"""
 
 
 def standard_errors(
@@ -64,12 +75,16 @@ def standard_errors(
         at: the optimum.
         e: what it tells.
         before: the verdict at the first guess, which stands where the optimum has no Jacobian.
-        white: whether the residuals are white and independent between outputs.
+        white: whether the residuals are white and independent between outputs; of a method with
+            process noise whether the innovations are.
         aliased: the parameters that move a mode which the samples do not tell from its aliases.
         twins: the pairs of parameters whose values may be exchanged.
         optimum: whether the point is one, about which the likelihood may be asked.
     """
     around = Around(frozenset(aliased), twins, Valley(problem, at, e))
+    inputs = through_inputs(at, e) if optimum else None
+    if inputs is not None:
+        return _with_process_noise(problem, at, e, inputs, around, white=white)
     errors = _by_slopes(problem, at, e, before, around, white=white)
     if not optimum:
         return errors
@@ -79,6 +94,68 @@ def standard_errors(
     around = around._replace(**beyond._asdict())
     errors = _by_slopes(problem, at, e, before, around, white=white)
     return errors._replace(limits=beyond.limits)
+
+
+def _with_process_noise(
+    problem: Problem,
+    at: Solution,
+    e: Evaluation,
+    inputs: Evaluation,
+    around: Around,
+    *,
+    white: bool,
+) -> StandardErrors:
+    """Cramér-Rao's bound of a filter's innovations, or where these are not white that of the
+    responses in them alone.
+
+    Args:
+        problem: what was fitted.
+        at: the optimum.
+        e: what it tells.
+        inputs: what inputs and initial states tell there, of `through_inputs`.
+        around: what is known of points other than the optimum.
+        white: whether the innovations are white.
+    """
+    layout = at.layout
+    # Neither names combinations, which take time to look for.
+    slopes = around._replace(combined=False)
+    by_all = verdict_of(problem, layout, e, around=slopes)
+    by_inputs = verdict_of(problem, layout, inputs, around=slopes)
+    resting = not_by_inputs(by_all, by_inputs)
+    errors = _by_slopes(problem, at, e, by_all, around, white=white)
+    asked = errors.verdict
+    if not white:
+        lacking = dict.fromkeys((*asked.undetermined, *by_inputs.undetermined))
+        asked = replace(asked, undetermined=tuple(lacking))
+    beyond = beyond_slopes(problem, at, e, asked, errors.wider * errors.quantiles)
+    if white:
+        if beyond is not AS_SLOPES:
+            around = around._replace(**beyond._asdict())
+            errors = _by_slopes(problem, at, e, by_all, around, white=True)
+        said = [resting_on_disturbance(resting)] if resting else []
+        return _saying(said, errors)._replace(limits=beyond.limits)
+    # The likelihood has the colour in it: its ends are those of parameters that rest on responses.
+    wider = _deviations(by_inputs) > _MORE * _deviations(by_all)
+    limits = {n: v for n, v in beyond.limits.items() if not wider[by_all.names.index(n)]}
+    around = around._replace(**beyond._replace(limits=limits)._asdict())
+    said = []
+    if resting or len(by_inputs.null_directions) > len(by_all.null_directions):
+        # The colour has put the optimum where it is along directions that no input shows: slopes
+        # there name combinations that do not hold where the machine is.
+        around = around._replace(combined=False)
+        said = [not_counted(resting or by_inputs.undetermined)]
+    errors = _by_slopes(problem, at, inputs, by_all, around, white=False)
+    return _saying(said, errors)._replace(limits=limits, by=inputs)
+
+
+def _saying(sentences: list[str], errors: StandardErrors) -> StandardErrors:
+    """With further sentences at the end of the verdict."""
+    verdict = replace(errors.verdict, sentences=(*errors.verdict.sentences, *sentences))
+    return errors._replace(verdict=verdict)
+
+
+def _deviations(verdict: Verdict) -> np.ndarray:
+    return np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
 
 
 def _by_slopes(
