@@ -16,7 +16,7 @@ from heli_jax.identification.estimation.levenberg_marquardt import (
     descend,
     residual_and_jacobian,
 )
-from heli_jax.identification.estimation.measured_signals import measured_count
+from heli_jax.identification.estimation.measured_signals import measured_counts
 from heli_jax.identification.estimation.optimiser_step import BATCHED, constants_of
 from heli_jax.identification.estimation.residual import differentiate
 from heli_jax.identification.estimation.scaling import Scaling, scaling, trusted_columns
@@ -89,7 +89,8 @@ def optimise_many(
         def evaluate(z: Array, numbers: Data = numbers) -> tuple[Array, Array]:
             return _batch(layout, numbers, noise, z) if fused is None else fused(numbers, z)
 
-        count = measured_count(numbers) // batch
+        # Each record's own: of one another may lack most samples.
+        count = measured_counts(numbers)
         ends = descend(evaluate, constants, evaluate(z0), count, _MANY_STEPS, BATCHED).optimum
         optima.append(jax.tree.map(lambda v, n=min(batch, k - i): np.asarray(v)[:n], ends))
         stages.advance(min(batch, k - i))

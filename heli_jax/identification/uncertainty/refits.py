@@ -10,6 +10,7 @@ import numpy as np
 from heli_jax import naming
 from heli_jax.flights.flight import Flight
 from heli_jax.identification.estimation.many_runs import optimise_many
+from heli_jax.identification.problem import FEWEST_SEEN
 from heli_jax.identification.result import Fit
 from heli_jax.identification.unknowns.layout import Data, value_of
 
@@ -22,10 +23,12 @@ class Refits(NamedTuple):
     values: dict[str, np.ndarray]
     """by free parameter, (records,); NaN where a record did not converge"""
     converged: np.ndarray
-    """(records,)"""
+    """(records,); False too of a record that `fit` would refuse, since an output of it has fewer
+    than 8 measured samples: of nothing measured the start would be the optimum"""
     cost: np.ndarray
-    """(records,) sum of squares over the number of measurements, by the noise of the fit: 1 where a
-    record is as noisy, more where the model explains it less"""
+    """(records,) sum of squares over the record's number of measured samples, by the noise of the
+    fit: 1 where a record is as noisy, more where the model explains it less; NaN of a record with
+    too few"""
 
 
 def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any = None) -> Refits:
@@ -77,13 +80,22 @@ def refit(fit: Fit, records: Sequence[Sequence[Flight] | Flight], *, device: Any
 
     starts = jnp.tile(at.z[None, :], (len(flights), 1))
     optima = optimise_many(at, data, starts, each, batch=_BATCH, device=device)
-    converged = np.asarray(optima.converged)
+    enough = np.array([_enough(record) for record in flights])
+    converged = np.asarray(optima.converged) & enough
     z = jnp.asarray(optima.z)
     values = {
         name: np.where(converged, np.asarray(value_of(at.layout, at.data, i, z[:, i])), np.nan)
         for i, name in enumerate(at.layout.free)
     }
-    return Refits(values, converged, np.asarray(optima.cost))
+    return Refits(values, converged, np.where(enough, np.asarray(optima.cost), np.nan))
+
+
+def _enough(record: list[Flight]) -> bool:
+    """Whether of every output as many samples are measured as `fit` asks for."""
+    # Of the fit's outputs alone there are records, see `_check`.
+    return all(
+        np.isfinite(y).sum() >= FEWEST_SEEN for flight in record for y in flight.outputs.values()
+    )
 
 
 def _inputs(model: Any, flight: Flight) -> Any:
