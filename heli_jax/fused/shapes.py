@@ -158,6 +158,58 @@ def _reduction(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]]
     return made
 
 
+def _anywhere(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """Over all axes. Equinox asks so whether any of a batch needs something; here each vehicle asks
+    for itself, and gets the same."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        axes = tuple(range(len(inputs[0].shape)))
+        return _reduction(operation)(code, inputs, {"axes": axes})
+
+    return made
+
+
+def _running(operation: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """cumsum and the like."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        source = np.moveaxis(elements(code, inputs[0]), params["axis"], 0)
+        source = source[::-1] if params["reverse"] else source
+        result = np.array(source)
+        for k in range(1, len(source)):
+            for at in np.ndindex(source.shape[1:]):
+                result[(k, *at)] = OPERATIONS[operation](
+                    code, result[(k - 1, *at)], source[(k, *at)]
+                )
+        return np.moveaxis(result[::-1] if params["reverse"] else result, 0, params["axis"])
+
+    return made
+
+
+def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """argmax and argmin: the first of the best, or the first that is not a number."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        (axis,), dtype = params["axes"], np.dtype(params["index_dtype"])
+        source = np.moveaxis(elements(code, inputs[0]), axis, 0)
+        result = np.empty(source.shape[1:], object)
+        for at in np.ndindex(result.shape):
+            best, place = source[(0, *at)], constant(0, dtype)
+            for k in range(1, len(source)):
+                value = source[(k, *at)]
+                keep = code.operation(
+                    "or",
+                    OPERATIONS[order](code, best, value),
+                    OPERATIONS["ne"](code, best, best),
+                )
+                place = code.choose(keep, place, constant(k, dtype))
+                best = code.choose(keep, best, value)
+            result[at] = place
+        return result
+
+    return made
+
+
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     a, b = (elements(code, v) for v in inputs)
@@ -198,4 +250,12 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "reduce_and": _reduction("and"),
     "reduce_or": _reduction("or"),
     "dot_general": _product,
+    "cumsum": _running("add"),
+    "cumprod": _running("mul"),
+    "cummax": _running("max"),
+    "cummin": _running("min"),
+    "argmax": _where_extreme("ge"),
+    "argmin": _where_extreme("le"),
+    "unvmap_any": _anywhere("or"),
+    "unvmap_all": _anywhere("and"),
 }
