@@ -210,6 +210,33 @@ def test_records_unlike_the_fits_are_refused(fitted):
             refit(fitted, [good, flight])
     with pytest.raises(ValueError, match="one record at least"):
         refit(fitted, [])
+    with pytest.raises(TypeError, match=r"^refit, record 0: expected a Flight or a list of them"):
+        refit(fitted, [None])
+
+
+def test_a_device_that_is_none_is_refused_before_anything_is_fitted(fitted):
+    for wrong in ("gpu", 0):
+        said = re.escape(
+            f"device: expected a device of JAX, such as jax.devices('gpu')[0], got {wrong!r}"
+        )
+        with pytest.raises(TypeError, match=said):
+            bootstrap(fitted, 24, device=wrong)
+        with pytest.raises(TypeError, match=said):
+            refit(fitted, [None], device=wrong)
+    with pytest.raises(ValueError, match="expected at least 1 run, got 0"):
+        bootstrap(fitted, 0)
+
+
+def test_many_records_that_are_no_program_say_why(fitted, monkeypatch):
+    few = bootstrap(fitted, 2)
+    assert few.note == ""
+    monkeypatch.setattr(many_runs, "_MANY", 2)
+    monkeypatch.setattr(fused_runs, "_refused", lambda _: "a model of straw (at straw.py:3)")
+    said = "there is no translation of a model of straw (at straw.py:3)"
+    again = bootstrap(fitted, 2)
+    assert said in again.note
+    np.testing.assert_array_equal(again.values["Ixx"], few.values["Ixx"])
+    assert said in refit(fitted, [record(BENCH, seed=5, n=150)] * 2).note
 
 
 class Device:
