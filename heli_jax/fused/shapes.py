@@ -210,6 +210,34 @@ def _where_extreme(order: str) -> Callable[[Code, list[Operand], dict[str, Any]]
     return made
 
 
+def _put(operation: str | None) -> Callable[[Code, list[Operand], dict[str, Any]], Operand]:
+    """scatter, of one window of length one along the axes that are indexed: `.at[i, j].set(v)`."""
+
+    def made(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
+        old, where, new = (elements(code, v) for v in inputs)
+        numbers = params["dimension_numbers"]
+        axes = tuple(numbers.scatter_dims_to_operand_dims)
+        plain = where.shape == (len(axes),) and set(axes) == set(numbers.inserted_window_dims)
+        # Whatever is asked for, GatherScatterMode.CLIP moves it into the array; all others leave
+        # out what is beyond it.
+        if not plain or "CLIP" in str(params["mode"]):
+            raise UnsupportedError("several places of an array that are written at once")
+        result = np.empty(old.shape, object)
+        for at in np.ndindex(old.shape):
+            # Any: an element, of which NumPy's types make an array as well.
+            before: Any = old[at]
+            value: Any = new[tuple(i for d, i in enumerate(at) if d not in axes)]
+            if operation is not None:
+                value = OPERATIONS[operation](code, before, value)
+            for index, axis in zip(where, axes, strict=True):
+                here = code.compare("icmp eq", index, constant(at[axis], index.dtype))
+                value = code.choose(here, value, before)
+            result[at] = value
+        return result
+
+    return made
+
+
 def _product(code: Code, inputs: list[Operand], params: dict[str, Any]) -> Operand:
     """dot_general, of small arrays: sums of products written out."""
     a, b = (elements(code, v) for v in inputs)
@@ -250,6 +278,9 @@ SHAPED: dict[str, Callable[[Code, list[Operand], dict[str, Any]], Operand]] = {
     "reduce_and": _reduction("and"),
     "reduce_or": _reduction("or"),
     "dot_general": _product,
+    "scatter": _put(None),
+    "scatter-add": _put("add"),
+    "scatter_add": _put("add"),
     "cumsum": _running("add"),
     "cumprod": _running("mul"),
     "cummax": _running("max"),

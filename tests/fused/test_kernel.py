@@ -142,6 +142,7 @@ _PAIRS = {
     "atan2": lambda v: jnp.arctan2(_M, v[None, :]),
     "where": lambda v: jnp.where(_M > 0, v, v[:, None]),
     "sums": lambda v: jnp.cumsum(v) + jax.lax.cumsum(v, reverse=True) + jax.lax.cummax(v),
+    "put": lambda v: jnp.zeros((2, 2)).at[1].set(v).at[0, 1].add(v[0]) + v.at[1].set(0.5),
     "best": lambda v: jnp.argmax(v) + 0.5 * jnp.argmin(jnp.outer(v, v), axis=1),
 }
 
